@@ -78,7 +78,7 @@ else:
     }
 
     def __getattr__(name):
-        # torch takes seconds to import; until then the command line has to be able to say that it was interrupted
+        # torch takes seconds to import; an interrupt before that must still reach the command line's handler
         if name == "__version__":
             from importlib.metadata import version
 

@@ -10,9 +10,9 @@ smooth at ``kappa = 0``, where it is exactly the Gaussian ``z^2 / 2``. All funct
 order), forward-mode differentiation, ``vmap`` and ``torch.compile``. Half and bfloat16 are computed in float32.
 
 :func:`mkc_energy`, :func:`mkc_weight`, :func:`log_normalizer` and :func:`mkc_nll` refuse a ``sigma``, ``d`` or
-``bound`` out of range: a number always, and a tensor on the CPU, in eager code and outside of ``vmap``, where looking
-at it waits for nothing. Elsewhere, and in :func:`energy`, :func:`log_partition` and :func:`inverse_square`, which they
-are made of, values go through the formulas as they are. A NaN among the errors comes out as NaN: it is one of many.
+``bound`` out of range. Numbers are always checked. Tensors are checked on the CPU in eager code outside ``vmap``, where
+reading a value does not wait for a device. Elsewhere values are not checked, nor are they in the building blocks
+:func:`energy`, :func:`log_partition` and :func:`inverse_square`. A NaN error gives a NaN result.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ __all__ = [
 ]
 
 _SIGMA_TINY = 1e-18
-"""Of the energy: the ``kappa`` of a smaller one is infinite in float32."""
+"""Smallest ``sigma`` that the energy accepts: ``kappa`` of a smaller value is infinite in float32."""
 
 
 def _checked(least_sigma: float = _SIGMA_TINY, **given: object) -> tuple[Tensor, ...]:
-    """Errors and parameters as :func:`as_computed` gives them, with the parameters in range."""
+    """Errors and parameters converted by :func:`as_computed`, after a range check of the parameters."""
     for name, value in given.items():
         if name == "sigma":
             refuse_out_of_range(name, value, least_sigma, math.inf, "[]", "inf is the Gaussian")
@@ -62,7 +62,7 @@ def _checked(least_sigma: float = _SIGMA_TINY, **given: object) -> tuple[Tensor,
 def mkc_energy(
     error: Float[Tensor, "*batch"], sigma: Float[Tensor, "*batch"] | float, d: Float[Tensor, "*batch"] | float
 ) -> Float[Tensor, "*batch"]:
-    """The MKC loss of each error, ``sigma^2 (1 - exp(-e^2 / (2 d^2 sigma^2)))``, a term of (9) of the paper.
+    """The MKC loss of each error, ``sigma^2 (1 - exp(-e^2 / (2 d^2 sigma^2)))``: a term of (9) of the paper.
 
     Args:
         error: errors ``e``, any shape, in the unit of ``d``.
@@ -74,9 +74,9 @@ def mkc_energy(
         The energy, of the broadcast shape.
 
     Raises:
-        TypeError: complex values, or an argument that is no number and no tensor.
-        ValueError: ``sigma`` or ``d`` out of range, where it can be seen; the module says where. Shapes that do not
-            broadcast.
+        TypeError: complex values, or an argument that is neither a number nor a tensor.
+        ValueError: ``sigma`` or ``d`` out of range, where values are checked (see the module's docstring); shapes that
+            do not broadcast.
 
     Example:
         >>> mkc_energy(torch.tensor([0.0, 1.0, 100.0]), sigma=2.0, d=1.0)
@@ -145,8 +145,8 @@ def mkc_nll(
 ) -> Float[Tensor, "*batch"]:
     """The negative log-density of each error, ``mkc_energy + log_normalizer``.
 
-    Beyond ``bound`` the density is 0; the formula is continued there, so that a stray error keeps a finite value and
-    gradient. :meth:`mkc_torch.MKCDistribution.log_prob` is the strict one.
+    Beyond ``bound`` the density is 0. This function continues the formula there, so that an error out of bounds has a
+    finite value and gradient. :meth:`mkc_torch.MKCDistribution.log_prob` returns -inf there.
 
     Args:
         error, d: as in :func:`mkc_energy`.

@@ -1,4 +1,4 @@
-"""The negative log-likelihood of a loss as a metric of torchmetrics, which adds up over batches and processes."""
+"""Negative log-likelihood under a loss as a torchmetrics metric: sums add up over batches and processes."""
 
 from __future__ import annotations
 
@@ -29,20 +29,22 @@ __all__ = ["MKCNegativeLogLikelihood"]
 class MKCNegativeLogLikelihood(Metric):
     """Mean negative log-density of errors under an :class:`MKCLoss`, in nats per element.
 
-    Sums and weights are kept in float64 and added over processes, so that the mean over a set of data does not depend
-    on how it was cut into batches. σ, d and the bound are those of the loss when a batch comes in: the metric refers to
-    the loss and does not own it. It has no parameters, and a clone of it refers to the same loss; copied together with
-    the loss, in one module after it, it refers to the copy.
+    Sums and weights are float64 and are added over processes, so the mean does not depend on the batch size.
 
-    Values compare only at equal bounds. Beyond the bound the formula of :func:`mkc_torch.functional.mkc_nll` goes on.
+    The metric refers to the loss and does not own it. Each batch is evaluated at the loss's σ, d and bound at that
+    time. The metric has no parameters. A clone refers to the same loss; a deep copy of a module that contains the loss,
+    followed by the metric, refers to the copied loss.
+
+    Compare values at equal bounds only. Beyond the bound the formula of :func:`mkc_torch.functional.mkc_nll` is
+    continued.
 
     Args:
-        loss: the loss; its own ``normalize`` and ``reduction`` do not matter.
-        per_channel: whether ``compute`` returns the mean of each channel, (m,), or one over all elements.
+        loss: the loss; its ``normalize`` and ``reduction`` are ignored.
+        per_channel: whether ``compute`` returns the mean of each channel, (m,), or the mean over all elements, ().
         kwargs: options of :class:`torchmetrics.Metric`.
 
     Raises:
-        TypeError: ``loss`` is no MKCLoss.
+        TypeError: ``loss`` is not an MKCLoss.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -82,7 +84,7 @@ class MKCNegativeLogLikelihood(Metric):
         target: Float[Tensor, "*shape"],
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
     ) -> None:
-        """Adds a batch.
+        """Add a batch.
 
         Args:
             input: predictions, as for the loss.
@@ -108,19 +110,19 @@ class MKCNegativeLogLikelihood(Metric):
             others = [i for i in range(error.dim()) if i != axis]
             nll = energy_value(error / d.view(shape), kappa.view(shape))
             nll = nll + (torch.log(d) + log_partition(kappa, bound / d)).view(shape)
-            total, elements = ((one.sum(others) if others else one) for one in (weights * nll, weights))
+            total, elements = ((value.sum(others) if others else value) for value in (weights * nll, weights))
         self.total += total.to(self.total)
         self.weight += elements.to(self.weight)
 
     def compute(self) -> Float[Tensor, ""] | Float[Tensor, " m"]:
-        """Nats per element in float64: the weighted mean, NaN where nothing counted."""
+        """Weighted mean in nats per element, float64; NaN without any element of positive weight."""
         if self.per_channel:
             return self.total / self.weight
         return self.total.sum() / self.weight.sum()
 
 
 class _Reference:
-    """Keeps a module out of its holder's parameters and state, and shared by the holder's copies."""
+    """Reference to a module: outside the holder's parameters and state, and shared by the holder's copies."""
 
     def __init__(self, loss: MKCLoss) -> None:
         self.loss = loss

@@ -16,7 +16,7 @@ def case():
 
 def says(folder, key, *effects):
     (folder / key.name).mkdir(exist_ok=True)
-    findings = [{"effect": effect, "grade": "left out", "channels": ["angle"]} for effect in effects]
+    findings = [{"effect": effect, "grade": "left_out", "channels": ["angle"]} for effect in effects]
     told = {"verdict": "explained", "p_value": 0.01, "findings": findings}
     (folder / key.name / "diagnosis.json").write_text(json.dumps(told), encoding="utf-8")
 

@@ -22,7 +22,7 @@ CASES = {one.name: one.expected for one in known.cases()}
 ROCKET, PENDULUM = "real rocket juno Rocket", "real pendulum_encoder run Pendulum"
 
 
-def finding(effect, grade="left out", *, at=("rate of speed",), alternatives=(), **parameters):
+def finding(effect, grade="left_out", *, at=("rate of speed",), alternatives=(), **parameters):
     return {
         "effect": effect,
         "grade": grade,
@@ -60,7 +60,7 @@ def test_a_right_answer_is_right_and_each_fault_of_a_wrong_one_is_named():
     assert [fault.split(" is ")[0] for fault in wrong] == ["drag of quadratic_drag", "the residual of altitude"]
     (unnamed, *_) = judged(row(verdict="unexplained"), REAL[ROCKET])["wrong"]
     assert unnamed == "quadratic_drag is not claimed but nothing"
-    (unconfirmed, *_) = judged(row(drag(grade="not confirmed"), after={"altitude": 2.0}), REAL[ROCKET])["wrong"]
+    (unconfirmed, *_) = judged(row(drag(grade="unconfirmed"), after={"altitude": 2.0}), REAL[ROCKET])["wrong"]
     assert unconfirmed == "quadratic_drag is not claimed but nothing"
     (failed,) = judged(row(verdict="", failed="over the limit of 9 s"), REAL[ROCKET])["wrong"]
     assert failed == "no diagnosis: over the limit of 9 s"
@@ -161,7 +161,7 @@ def test_pairs_differ_in_verdict_names_sizes_and_residuals():
     found = {
         "same": row(drag(), after={"altitude": 2.01}, cpu_seconds=1.0),
         "verdict": row(verdict="unfit", right=False),
-        "grade": row(drag(grade="not confirmed")),
+        "grade": row(drag(grade="unconfirmed")),
         "size": row(drag(9.1e-5, 1e-6)),
         "within": row(drag(9.04e-5, 1e-6)),
         "residual": row(after={"altitude": 17.0}),
@@ -243,8 +243,8 @@ def test_draws_are_scored_by_their_keys(tmp_path):
     assert again.truths[hidden] == family.truths[hidden]
 
 
-def test_worlds_are_scored_by_their_keys(tmp_path):
-    (_, family) = drawn.all_worlds(tmp_path, match="world magnetometer", empty=1, hidden=0)
+def test_scenarios_are_scored_by_their_keys(tmp_path):
+    (_, family) = drawn.all_scenarios(tmp_path, match="scenario magnetometer", empty=1, hidden=0)
     assert len(family.jobs) == 6
     useless = next(name for name in family.truths if "useless" in name)
     rows = {job.name: row(verdict="unfit" if job.name == useless else "adequate") for job in family.jobs}
@@ -255,7 +255,7 @@ def test_worlds_are_scored_by_their_keys(tmp_path):
 
 
 def test_what_one_run_cannot_tell_is_counted_apart(tmp_path):
-    (family, _) = drawn.all_worlds(tmp_path, match="world dynamics lasting_push empty", empty=2, hidden=0)
+    (family, _) = drawn.all_scenarios(tmp_path, match="scenario dynamics lasting_push empty", empty=2, hidden=0)
     assert len(family.jobs) == 2
     rival = finding("backlash", alternatives=("dead_zone",))
     rows = {job.name: row(one) for job, one in zip(family.jobs, (finding("backlash"), rival), strict=True)}

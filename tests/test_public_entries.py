@@ -31,7 +31,6 @@ ELSEWHERE = {
     "nonlinear.NoFitError": "an error",
     "nonlinear.NonlinearFit": "what fit gives",
     "nonlinear.Solution": "what minimise gives",
-    "nonlinear.beside": "puts two tensors beside one another, in tests/nonlinear",
     "nonlinear.load_forward_mode": "takes nothing",
     "covariance.ExactFitError": "an error",
     "covariance.SampleKind": "an enumeration",

@@ -29,12 +29,12 @@ def row(folder: Path, recording: Path, request: Request) -> dict[str, Any]:
         request: what was asked of it.
     """
     content = content_of(folder / "diagnosis.json") or {}
-    follows = content.get("follows") or {}
+    fits = content.get("goodness_of_fit") or {}
     return {
         "verdict": content.get("verdict", ""),
         "p_value": content.get("p_value"),
         "findings": [finding(entry) for entry in content.get("findings") or ()],
-        "residual_before": {output: numbers.get("residual") for output, numbers in follows.items()},
+        "residual_before": {output: numbers.get("residual") for output, numbers in fits.items()},
         "residual_after": _open_loop(folder / "model.json", recording, request) if content else {},
         "parameters": _parameters(folder / "model.json", request) if content else {},
         "sentences": [*content.get("advice", ()), *content.get("warnings", ())],

@@ -1,1 +1,1 @@
-"""Work shared by the cores of one machine."""
+"""Parallel work on the cores of one machine."""

@@ -1,4 +1,4 @@
-"""When long work has to stop: after so many seconds, or when a user interrupts it; asked for between its steps."""
+"""Deadlines of long work: a time limit, and interrupts by the user; checked between the steps of the work."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["Deadline", "Reason", "Stopped", "check_deadline", "is_limited", "lim
 T = TypeVar("T")
 
 Reason = Literal["time limit", "interrupt"]
-"""Why work was stopped."""
+"""The reason for which work was stopped."""
 
 _SAME_INTERRUPT_S = 0.3
-"""Seconds within which a second interrupt is the first again: a terminal's and a parent process's."""
+"""Seconds within which a second SIGINT is a duplicate of the first: from the terminal and the parent process."""
 
 
 class Stopped(BaseException):
-    """Work was stopped before its end. No Exception, so that code that deals with failures does not take it for one.
+    """Work was stopped before its end. Not an Exception, so that handlers of failures do not catch it.
 
     Attributes:
-        reason: why.
+        reason: "time limit" or "interrupt".
     """
 
     def __init__(self, reason: Reason) -> None:
@@ -38,12 +38,12 @@ class Stopped(BaseException):
 
 @dataclass
 class Deadline:
-    """A moment until which work may go on, and an interrupt that ends it before.
+    """A time limit of work, and an event that stops it earlier.
 
     Attributes:
-        limit: seconds from now; infinite for none.
-        interrupted: set by the first interrupt.
-        begin: of the work, by :func:`time.monotonic`, which forked processes share.
+        limit: seconds from ``begin``; infinite for no limit.
+        interrupted: event that the first interrupt sets; None for work that interrupts do not stop.
+        begin: start of the work by :func:`time.monotonic`, which forked processes share.
     """
 
     limit: float = math.inf
@@ -56,10 +56,10 @@ class Deadline:
         return monotonic() - self.begin
 
     def check(self) -> None:
-        """Stop here if it is time.
+        """Raise if the work has to stop.
 
         Raises:
-            Stopped: the time is over, or the user interrupted.
+            Stopped: the time limit is over, or the user interrupted.
         """
         if self.interrupted is not None and self.interrupted.is_set():
             raise Stopped("interrupt")
@@ -72,10 +72,10 @@ _interrupted: ContextVar[threading.Event | None] = ContextVar("interrupted", def
 
 
 def check_deadline() -> None:
-    """Stop here if the work that this is a step of has to; called between steps of less than a second.
+    """Raise if the current work has to stop; call it between steps of less than a second.
 
     Raises:
-        Stopped: so it is.
+        Stopped: the time limit is over, or the user interrupted.
     """
     deadline = _deadline.get()
     if deadline is not None:
@@ -83,18 +83,18 @@ def check_deadline() -> None:
 
 
 def is_limited() -> bool:
-    """Whether anything may stop the work that this is a step of."""
+    """Whether the current work has a deadline."""
     return _deadline.get() is not None
 
 
 @contextmanager
 def limited(limit: float = math.inf, *, interruptible: bool = True, begin: float | None = None) -> Iterator[Deadline]:
-    """A deadline for all work within the block, in the place of one that there was.
+    """Set the deadline of all work within the block, in place of an outer deadline.
 
     Args:
-        limit: seconds; infinite for none.
-        interruptible: also stop at an interrupt, where :func:`stopped_by_interrupt` asks for that.
-        begin: moment from which the seconds count, by :func:`time.monotonic`; None for now.
+        limit: seconds; infinite for no limit.
+        interruptible: also stop at an interrupt, within :func:`stopped_by_interrupt`.
+        begin: start of the time limit by :func:`time.monotonic`; None for now.
 
     Example:
         >>> with limited(0.0):
@@ -112,7 +112,7 @@ def limited(limit: float = math.inf, *, interruptible: bool = True, begin: float
 
 
 def within(seconds: float, work: Callable[[], T]) -> T | None:
-    """The result of a work that is of use only if it ends in so many seconds; None where it does not.
+    """The result of ``work`` if it ends within ``seconds``; otherwise None.
 
     Example:
         >>> within(60.0, lambda: 1), within(0.0, check_deadline)
@@ -127,9 +127,9 @@ def within(seconds: float, work: Callable[[], T]) -> T | None:
 
 @contextmanager
 def stopped_by_interrupt() -> Iterator[None]:
-    """The first interrupt stops :func:`limited` work at its next step; a second one is a KeyboardInterrupt as usual.
+    """Let the first interrupt stop :func:`limited` work at its next step; a second raises KeyboardInterrupt as usual.
 
-    Only in the main thread of a process that does not ignore interrupts; elsewhere nothing changes.
+    It has an effect only in the main thread of a process with Python's default handler of SIGINT.
     """
     usual = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:

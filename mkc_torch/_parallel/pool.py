@@ -1,4 +1,4 @@
-"""Work that the cores of this machine share, in a pool of copies of this process: they know all that it knows."""
+"""Parallel work in forked copies of this process, which share its memory and so need no arguments."""
 
 from __future__ import annotations
 
@@ -27,42 +27,42 @@ __all__ = ["Serializer", "allow_copies", "shared", "speculative"]
 
 T = TypeVar("T")
 
-_BEHIND = 5
-"""Niceness of a copy that works meanwhile: against what is waited for it has a quarter of a core."""
+_SPECULATIVE_NICENESS = 5
+"""Niceness of a copy with speculative work: in competition with other work it gets a quarter of a core."""
 
 _PARENT_DEATH = 1
-"""PR_SET_PDEATHSIG of prctl.h."""
+"""The constant PR_SET_PDEATHSIG of prctl.h."""
 
 _BYTES = 4
-"""Of the number of a work, which a pipe gives out whole."""
+"""Bytes of a task number in the pipe; a read of so few bytes is atomic."""
 
-_ASKED_EVERY_S = 0.1
-"""Seconds after which it is asked again whether to wait on for copies."""
+_CHECK_INTERVAL_S = 0.1
+"""Seconds between two checks of the deadline while waiting for a copy."""
 
 _copies = 0
 _ahead: list[Future[dict[int, bytes]]] = []
 
 
 def allow_copies(most: int | None = None) -> None:
-    """Have work be shared by all cores from now on, or by so many copies beside this process.
+    """Let work be shared by all cores from now on, or by this process and ``most`` forked copies.
 
-    For a command of our own, in which torch computes in one thread from the beginning: its threads, and a GPU, do not
-    survive a fork. Nothing is forked elsewhere than on Linux.
+    Only for commands in which torch uses one thread from the start: torch's threads and a GPU do not survive a fork.
+    Nothing is forked on systems other than Linux.
     """
     global _copies
     _copies = (cores() - 1 if most is None else most) if sys.platform == "linux" else 0
 
 
 def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing: str = "") -> list[T]:
-    """The results of all works, in their order; who works at which makes no difference to any.
+    """The results of all works, in order; they do not depend on which process does which work.
 
     Args:
-        works: none needs what another one leaves behind. What a copy could not do, or not send, is done here.
-        known: objects that results may hold and that are not copied with them; the rest of a result can be pickled.
-        thing: name of what each work is about, where progress counts them.
+        works: independent tasks. A task that fails in a copy, or whose result cannot be pickled, is done here.
+        known: objects that results may refer to and that are not copied; the rest of a result must be picklable.
+        thing: name of the subject of each work, for the progress counter; empty for no counter.
 
     Raises:
-        Stopped: the deadline of what this is a part of is over; no copy is left.
+        Stopped: the deadline of the current work is over; all copies have been ended.
 
     Example:
         >>> shared([lambda: 2 + 2, lambda: 3 + 3])
@@ -77,10 +77,10 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
 
 @contextmanager
 def speculative(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> Iterator[Callable[[], list[T]]]:
-    """What copies begin with while this process goes on, the last one first; ``known`` as of :func:`shared`.
+    """Start works in copies while this process continues, the last work first; ``known`` as in :func:`shared`.
 
-    Gives a function for all results, which takes part in what nobody has begun, and waits for the rest; where there is
-    no core to spare it does all of it. What is shared goes before: the copies take what is left of the cores.
+    Yields a function that returns all results: it does the works that no copy has started, and waits for the others.
+    Without a free core it does all of them. :func:`shared` has priority: these copies run at a lower priority.
     """
     busy = sum(not copy.done() for copy in _ahead)
     with _begun(works, min(_copies - busy, len(works)), known, ahead=True) as results:
@@ -88,9 +88,10 @@ def speculative(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) 
 
 
 class Serializer:
-    """Results as bytes: with the numbers of objects that both sides know, and of a tensor what it shows.
+    """Pickles results: known objects by their number, tensors by their values without the rest of their storage.
 
-    Whoever has worked at it, what is unpacked lies in memory alike, so that what follows rounds alike.
+    Unpacked tensors have the same memory layout in whichever process they were computed, so that later results are
+    rounded alike.
     """
 
     def __init__(self, known: Iterable[object] = ()) -> None:
@@ -107,7 +108,7 @@ class Serializer:
 class _Packer(pickle.Pickler):
     def __init__(self, file: io.BytesIO, known: list[object]) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self._numbers = {id(one): number for number, one in enumerate(known)}
+        self._numbers = {id(item): number for number, item in enumerate(known)}
 
     def persistent_id(self, obj: object) -> int | None:
         return self._numbers.get(id(obj))
@@ -119,7 +120,7 @@ class _Packer(pickle.Pickler):
 
 
 def _tensor(array: Any) -> torch.Tensor:
-    # in memory of torch's own, whose alignment its sums depend on
+    # in memory that torch allocates: the rounding of its sums depends on the alignment
     return torch.from_numpy(array).clone()
 
 
@@ -136,18 +137,18 @@ class _Unpacker(pickle.Unpickler):
 def _begun(
     works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False, thing: str = ""
 ) -> Iterator[Callable[[], list[T]]]:
-    """Works that copies have begun with, as a function for all results; no copy is left in the end."""
+    """Start works in copies; yields a function that returns all results. All copies are ended on exit."""
     parcels = Serializer(known)
     if copies < 1:
         yield lambda: [_done(work, parcels, thing) for work in counted(works, len(works), thing)]
         return
-    # whoever reads a number has that work
+    # the process that reads a number does that work
     todo, entry = os.pipe()
-    # the last ones first: works are listed by how likely they are, and the fit of what does not fit takes longest
+    # in reverse order: works are sorted by likelihood, and the fit of an unlikely candidate takes longest
     os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in reversed(range(len(works)))))
     os.close(entry)
     before = set(multiprocessing.active_children())
-    task = works, todo, parcels, _BEHIND if ahead else 0
+    task = works, todo, parcels, _SPECULATIVE_NICENESS if ahead else 0
     pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _begin, task)
     begun: list[Future[dict[int, bytes]]] = []
     try:
@@ -164,10 +165,10 @@ def _begun(
 
 
 def _forked(pool: ProcessPoolExecutor, copies: int) -> list[Future[dict[int, bytes]]]:
-    """What copies will have done; nothing where there is no memory for another process."""
-    # copies stay deaf to an interrupt: this process hears of it, and ends them
+    """The future results of each copy; empty where there is not enough memory for another process."""
+    # copies inherit the blocked SIGINT: this process receives it, and ends them
     with suppress(OSError), _uninterrupted(), warnings.catch_warnings():
-        # a fork beside threads is deprecated; those of pools and progress bars hold nothing that a copy uses
+        # a fork with threads is deprecated; the threads of pools and progress bars hold no lock that a copy needs
         warnings.simplefilter("ignore", DeprecationWarning)
         return [pool.submit(_take_part) for _ in range(copies)]
     return []
@@ -175,7 +176,7 @@ def _forked(pool: ProcessPoolExecutor, copies: int) -> list[Future[dict[int, byt
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """An interrupt comes afterwards."""
+    """Delay an interrupt until the end of the block."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -192,42 +193,42 @@ def _results(
 ) -> list[T]:
     done = {}
     for number in _taken(todo):
-        # the last ones are taken first, by whomever
+        # all processes take the works in reverse order
         count(thing, len(works) - 1 - number, len(works))
         done[number] = _done(works[number], parcels, thing)
     for copy in copies:
         _waited_for(copy)
         with suppress(BrokenProcessPool):
             done |= {number: parcels.unpacked(parcel) for number, parcel in copy.result().items()}
-    # what a copy could not do fails here as it would without copies
+    # a work that failed in a copy raises its error here
     return [done[number] if number in done else _done(work, parcels) for number, work in enumerate(works)]
 
 
 def _waited_for(copy: Future[dict[int, bytes]]) -> None:
-    """Wait until a copy is done, or until this process has to stop."""
-    while is_limited() and not wait([copy], _ASKED_EVERY_S).done:
+    """Wait until a copy is done, or until the deadline."""
+    while is_limited() and not wait([copy], _CHECK_INTERVAL_S).done:
         check_deadline()
 
 
 def _taken(todo: int) -> Iterator[int]:
-    """Numbers that nobody else has taken, until there are none left."""
-    while taken := os.read(todo, _BYTES):
-        yield int.from_bytes(taken, "big")
+    """Numbers of works that no other process has taken, until all are taken."""
+    while number := os.read(todo, _BYTES):
+        yield int.from_bytes(number, "big")
 
 
 def _done(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
-    """As a copy would send it; a work that is counted counts nothing itself."""
+    """The result of a work as if sent by a copy; a counted work does not count its own steps."""
     check_deadline()
     with silently() if thing else nullcontext():
         result = work()
     try:
         return parcels.unpacked(parcels.packed(result))
-    except Exception:  # what cannot be sent
+    except Exception:  # it cannot be pickled
         return result
 
 
 _task: tuple[Sequence[Callable[[], object]], int, Serializer] = ((), 0, Serializer())
-"""What a copy works at, where it takes a number from, and how it sends results."""
+"""In a copy: the works, the pipe of their numbers, and the serializer of results."""
 
 
 def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer, niceness: int) -> None:
@@ -236,7 +237,7 @@ def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer
     allow_copies(0)
     _ahead.clear()
     ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
-    warnings.simplefilter("ignore")  # another thread may have held the lock of where they are written
+    warnings.simplefilter("ignore")  # another thread may have held the lock of their stream
     gc.disable()
     os.nice(niceness)
 

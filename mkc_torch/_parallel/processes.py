@@ -1,4 +1,4 @@
-"""Work on several files at once: one process a core, quiet when interrupted."""
+"""Work on several files in parallel: one process a core, without tracebacks at an interrupt."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ R = TypeVar("R")
 
 
 def cores() -> int:
-    """Cores that this process may use.
+    """The number of cores that this process may use.
 
     Example:
         >>> cores() >= 1
@@ -35,9 +35,9 @@ def cores() -> int:
 
 
 def one_thread() -> None:
-    """Have torch, and the linear algebra of NumPy, compute in one thread in this process.
+    """Limit torch and the linear algebra of NumPy to one thread in this process.
 
-    What a recording asks for is too small to share: with a second one, a diagnosis takes a sixth longer.
+    The problems of a recording are too small to share: with a second thread a diagnosis takes a sixth longer.
     """
     from threadpoolctl import threadpool_limits
 
@@ -46,10 +46,10 @@ def one_thread() -> None:
 
 
 def keep_memory() -> None:
-    """Have the C library keep the memory of tensors that are gone, where it is glibc.
+    """Let glibc keep freed memory instead of returning it to the system.
 
-    It gives that of each large tensor back to the system at once, which clears its pages for the next one: 1 to 7 % of
-    the CPU time of a diagnosis.
+    By default it returns the memory of each large tensor at once, and the system clears the pages for the next tensor:
+    1 to 7 % of the CPU time of a diagnosis. It has no effect with other C libraries.
     """
     with suppress(OSError, AttributeError, TypeError):
         library = ctypes.CDLL(None)
@@ -62,9 +62,9 @@ _KEPT = ((-3, 1 << 28), (-1, 1 << 30), (-2, 1 << 26))
 
 
 def keep_modules() -> None:
-    """Have the collector of a process that is ours pass over what has been imported, also when the process ends.
+    """Exclude imported modules from garbage collection, also at exit; for commands of this package.
 
-    It would look at all of torch's objects several times over, which takes 0.5 s of CPU: a quarter of a short command.
+    The collector would otherwise scan all objects of torch several times: 0.5 s of CPU, a quarter of a short command.
     """
     gc.freeze()
     gc.set_threshold(50_000)
@@ -85,15 +85,15 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
     before = set(multiprocessing.active_children())
     # spawned, for torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
-    # without a lock: an interrupt can come between its taking and its giving back, and all would wait for it for ever
+    # without a lock: an interrupt between its acquisition and its release would block all processes
     stop = context.RawValue(ctypes.c_bool, False)
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(stop,)) as pool:
         try:
-            with _not_interrupted():  # processes that start inherit it, and say nothing when they are interrupted
+            with _not_interrupted():  # new processes inherit it, and print no traceback at an interrupt
                 futures: list[Future[R]] = [pool.submit(_interruptible, work, item) for item in items]
             yield (future.result for future in futures)
         except BaseException:
-            stop.value = True  # an item that a process has taken already cannot be cancelled
+            stop.value = True  # a started item cannot be cancelled
             for child in set(multiprocessing.active_children()) - before:
                 with suppress(ProcessLookupError, TypeError):
                     os.kill(child.pid, signal.SIGINT)  # type: ignore[arg-type]
@@ -102,7 +102,7 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
 
 
 class _Stop(Protocol):
-    """Whether to stop, as all processes know it."""
+    """A flag in shared memory: whether to stop."""
 
     value: bool
 
@@ -124,7 +124,7 @@ def _stopped() -> bool:
 
 
 def _interruptible(work: Callable[[T], R], item: T) -> R:
-    """Work that an interrupt ends as it would here: what is half-written is cleared away."""
+    """Do the work with the default handler of interrupts, so that half-written files are removed."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if _stopped():

@@ -1,4 +1,4 @@
-"""How far long work is: its stage, and how many of the things that a stage is made of are done."""
+"""Progress of long work: how many items of a stage are done."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 @runtime_checkable
 class Counter(Protocol):
-    """What is told of the things that a stage is made of."""
+    """A receiver of progress."""
 
     def count(self, thing: str, done: int, total: int) -> object:
-        """So many of so many are done; ``thing`` is the name of one, such as "candidate"."""
+        """Receive that ``done`` of ``total`` items are done; ``thing`` is the name of an item, such as "candidate"."""
 
 
 _counter: ContextVar[Counter | None] = ContextVar("counter", default=None)
@@ -25,7 +25,7 @@ _counter: ContextVar[Counter | None] = ContextVar("counter", default=None)
 
 @contextmanager
 def counting(counter: object) -> Iterator[None]:
-    """What is counted within the block is told to ``counter``, where it is a :class:`Counter`; to nobody otherwise."""
+    """Send the counts within the block to ``counter`` if it is a :class:`Counter`; otherwise discard them."""
     token = _counter.set(counter if isinstance(counter, Counter) else None)
     try:
         yield
@@ -35,26 +35,26 @@ def counting(counter: object) -> Iterator[None]:
 
 @contextmanager
 def silently() -> Iterator[None]:
-    """Nothing is counted within the block: it is a part of something that is."""
+    """Discard the counts within the block, which is a part of a counted item."""
     with counting(None):
         yield
 
 
 def count(thing: str, done: int, total: int) -> None:
-    """So many of so many are done; nothing is told of a ``thing`` without a name, or of a single one."""
+    """Report that ``done`` of ``total`` items are done, unless ``thing`` is empty or there is only one item."""
     counter = _counter.get()
     if counter is not None and thing and total > 1:
         counter.count(thing, done, total)
 
 
 def counted(things: Iterable[T], total: int, thing: str) -> Iterator[T]:
-    """The things, each counted as done when the next one is asked for.
+    """Iterate over the things; each is counted as done when the next is requested.
 
     Example:
-        >>> class Told:
+        >>> class Printer:
         ...     def count(self, thing, done, total):
         ...         print(f"{thing}: {done} of {total}")
-        >>> with counting(Told()):
+        >>> with counting(Printer()):
         ...     list(counted("ab", 2, "letter"))
         letter: 0 of 2
         letter: 1 of 2
@@ -62,8 +62,8 @@ def counted(things: Iterable[T], total: int, thing: str) -> Iterator[T]:
         ['a', 'b']
     """
     done = 0
-    for one in things:
+    for item in things:
         count(thing, done, total)
-        yield one
+        yield item
         done += 1
     count(thing, done, total)

@@ -1,1 +1,1 @@
-"""What knows no domain: checked arguments, files, order statistics, trust regions, forward mode, units in words."""
+"""Helpers without domain knowledge: argument checks, files, order statistics, trust regions, forward mode, units."""

@@ -1,8 +1,8 @@
-"""Arguments that are refused: what was expected, what came, and what to do about it.
+"""Checks of arguments; an error states what was expected, what it got, and the remedy.
 
-Types and shapes are always looked at. Values of tensors are looked at where that does not have to wait for an
-accelerator and where there is one value to look at: not in compiled code, nor under ``vmap``. There, what is out of
-range goes through the formulas, and a NaN comes out as NaN.
+Types and shapes are always checked. Values of tensors are checked only on the CPU, where this does not wait for an
+accelerator, and not in compiled code or under ``vmap``, where a tensor has no single value. There, values out of range
+enter the formulas unchecked, and a NaN gives NaN.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ __all__ = [
 
 
 DIVERGED = "The network has diverged, or what it was given holds NaN: lower the learning rate, or look at its inputs"
-"""What to do about predictions that are not finite."""
+"""The remedy for predictions that are not finite."""
 
 
 def format_value(value: object) -> str:
-    """What a value is, as an error tells it: shortened, or by name if it is a class or has no text of one line."""
+    """A short description of a value for error messages: its repr, or its class where that is not one line."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     text, kind = reprlib.repr(value), type(value).__name__
@@ -55,17 +55,17 @@ def format_value(value: object) -> str:
 
 
 def refuse_other_type(name: str, value: object, kind: type, what: str, advice: str) -> None:
-    """Refuse what is no instance of a class; the class itself is told to be made one.
+    """Refuse a value that is not an instance of a class; for the class itself the remedy is to call it.
 
     Args:
-        name: of the argument.
-        value: of the argument.
+        name: name of the argument.
+        value: value of the argument.
         kind: the class.
-        what: is wanted, "a Recording" say.
-        advice: how to get one.
+        what: the expected object in words, such as "a Recording".
+        advice: how to get an instance.
 
     Raises:
-        TypeError: it is none.
+        TypeError: it is not an instance.
     """
     if not isinstance(value, kind):
         if isinstance(value, type) and issubclass(value, kind):
@@ -74,15 +74,15 @@ def refuse_other_type(name: str, value: object, kind: type, what: str, advice: s
 
 
 def refuse_no_tensor(name: str, value: object, kind: str) -> None:
-    """Refuse data that are no tensor, and say how to make one.
+    """Refuse data that are not a tensor, with the conversion as remedy.
 
     Args:
-        name: of the argument.
-        value: of the argument.
-        kind: what is wanted, "a real tensor" say.
+        name: name of the argument.
+        value: value of the argument.
+        kind: the expected object in words, such as "a real tensor".
 
     Raises:
-        TypeError: an array, a list, a number, or something else.
+        TypeError: it is an array, a list, a number, or another object.
     """
     if isinstance(value, Tensor):
         return
@@ -95,17 +95,17 @@ def refuse_complex(name: str, value: Tensor) -> None:
     """Refuse complex numbers.
 
     Raises:
-        TypeError: they are.
+        TypeError: the tensor is complex.
     """
     if value.is_complex():
         raise TypeError(f"Expected argument `{name}` to be real but got {value.dtype}; pass its real part.")
 
 
 def refuse_not_real(name: str, value: object, kind: str = "a real floating-point tensor") -> None:
-    """Refuse data that are no tensor of real floating-point numbers, and say how to make one.
+    """Refuse data that are not a tensor of real floating-point numbers, with the conversion as remedy.
 
     Raises:
-        TypeError: integers, complex numbers, or no tensor.
+        TypeError: integers, complex numbers, or not a tensor.
     """
     refuse_no_tensor(name, value, kind)
     if isinstance(value, Tensor) and not value.is_floating_point():
@@ -118,10 +118,10 @@ def refuse_not_real(name: str, value: object, kind: str = "a real floating-point
 def as_numbers(
     name: str, value: object, dtype: torch.dtype | None = None, device: torch.device | None = None
 ) -> Tensor:
-    """A parameter as a tensor: one already, a number, or a sequence of numbers, which get ``dtype``.
+    """A tensor unchanged, or a number or a sequence of numbers as a tensor of ``dtype``.
 
     Raises:
-        TypeError: it is none of these, or complex.
+        TypeError: it is not numeric, or complex.
     """
     if not isinstance(value, Tensor):
         try:
@@ -137,18 +137,18 @@ def as_numbers(
 def refuse_out_of_range(
     name: str, value: object, low: float = 0.0, high: float = math.inf, ends: str = "()", advice: str = ""
 ) -> None:
-    """Refuse a number, or a tensor or sequence of numbers, that is not all in a range.
+    """Refuse a number, or a tensor or sequence of numbers, with a value outside a range.
 
     Args:
-        name: of the argument.
-        value: numbers always; those of a tensor where they can be looked at.
+        name: name of the argument.
+        value: value of the argument; the values of a tensor are checked where the module allows.
         low, high: ends of the range.
-        ends: "(" or "[" and ")" or "]": whether the ends themselves are in it.
-        advice: what to do.
+        ends: "(" or "[" and ")" or "]": whether the ends are in the range.
+        advice: the remedy; empty for none.
 
     Raises:
-        TypeError: it is no number.
-        ValueError: it is out of range, or NaN.
+        TypeError: it is not numeric.
+        ValueError: a value is out of range, or NaN.
     """
     if isinstance(value, (int, float)):
         least = most = _float(name, value)
@@ -158,7 +158,7 @@ def refuse_out_of_range(
         if seen is None:
             return
         least, most = seen
-    # written so that NaN fails
+    # for NaN all comparisons are False, so it is refused
     if (low <= least if ends[0] == "[" else low < least) and (most <= high if ends[1] == "]" else most < high):
         return
     got = f"{value}"
@@ -173,29 +173,30 @@ def refuse_out_of_range(
 def checked_number(
     name: str, value: object, low: float = 0.0, high: float = math.inf, ends: str = "()", advice: str = ""
 ) -> float:
-    """``value``, one number in a range as :func:`refuse_out_of_range` takes it.
+    """``value`` as a float in a range; arguments as for :func:`refuse_out_of_range`.
 
     Raises:
-        TypeError: it is no number.
+        TypeError: it is not a real number.
         ValueError: it is out of range, or NaN.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(
-            f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {format_value(value)}{_then(advice)}."
+            f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {format_value(value)}"
+            f"{_then(advice)}."
         )
     try:
         number = float(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer with hundreds of digits
         number = math.inf
     refuse_out_of_range(name, number, low, high, ends, advice)
     return number
 
 
 def checked_whole(name: str, value: object, least: int | None = None, advice: str = "") -> int:
-    """``value``, a whole number of at least ``least``.
+    """``value`` as an integer of at least ``least``.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: it is not such an integer.
     """
     number = None if isinstance(value, bool) or not isinstance(value, numbers.Integral) else int(value)
     if number is None or (least is not None and number < least):
@@ -207,22 +208,22 @@ def checked_whole(name: str, value: object, least: int | None = None, advice: st
 
 
 def refuse_text(name: str, value: object, what: str) -> None:
-    """Refuse text where a sequence of names is wanted, for its letters would be the names.
+    """Refuse a string where a sequence of names is expected, because its letters would be the names.
 
     Raises:
-        TypeError: text, or what is no sequence of texts.
+        TypeError: it is a string, or not a sequence of strings.
     """
     if isinstance(value, str):
         raise TypeError(f"Expected argument `{name}` to be {what} but got {value!r}; write ({value!r},).")
-    if not isinstance(value, (tuple, list)) or not all(isinstance(one, str) for one in value):
+    if not isinstance(value, (tuple, list)) or not all(isinstance(text, str) for text in value):
         raise TypeError(f"Expected argument `{name}` to be {what} but got {format_value(value)}.")
 
 
 def refuse_bad_weight(weight: object, name: str = "weight") -> None:
-    """Refuse weights that are no tensor of real numbers, negative, NaN or infinite; a boolean mask is welcome.
+    """Refuse weights that are not a real tensor, or negative, NaN or infinite; a boolean mask is accepted.
 
     Raises:
-        TypeError: no tensor, or complex.
+        TypeError: not a tensor, or complex.
         ValueError: a weight is negative or not finite.
     """
     refuse_no_tensor(name, weight, "a tensor of weights or a boolean mask")
@@ -242,13 +243,13 @@ def refuse_bad_weight(weight: object, name: str = "weight") -> None:
 
 
 def seems_finite(*values: Tensor) -> bool:
-    """Whether no element is NaN or infinite; True where that cannot be seen, False where only a sum overflows."""
+    """Whether all elements are finite; True where they cannot be checked, False also where only their sum overflows."""
     if torch.compiler.is_compiling() or any(value.device.type != "cpu" for value in values):
         return True
     try:
-        # a sum takes a fraction of the time that a look at each element takes
+        # a sum takes a fraction of the time of a check of each element
         totals = [value.detach().sum().item() for value in values]
-    except RuntimeError:  # under vmap there is no one value
+    except RuntimeError:  # under vmap there is no single value
         return True
     return all(map(math.isfinite, totals))
 
@@ -256,10 +257,10 @@ def seems_finite(*values: Tensor) -> bool:
 def refuse_not_finite(
     name: str, value: Float[Tensor, "*shape"], advice: str, counts: Bool[Tensor, "*shape"] | None = None
 ) -> None:
-    """Refuse a tensor with an element that counts and is NaN or infinite; by looking at each.
+    """Refuse a tensor with NaN or infinite elements in the mask ``counts``.
 
     Raises:
-        ValueError: there is one.
+        ValueError: there is such an element.
     """
     wrong = ~torch.isfinite(value.detach())
     if counts is not None:
@@ -278,18 +279,18 @@ def refuse_bad_batch(
     error: Float[Tensor, "*shape"] | None = None,
     advice: str = "",
 ) -> None:
-    """Refuse predictions and targets that count and are NaN or infinite, where that can be seen.
+    """Refuse NaN or infinite predictions and targets in the mask, where their values can be checked.
 
     Args:
-        input, target: predictions and targets, in float32 at least; None for predictions that are not looked at.
-        counts: which elements count; None if all do.
-        error: their difference with 0 in place of what does not count, where it is laid out: one look does then.
-        advice: what else to do about predictions that are not finite.
+        input, target: predictions and targets, at least in float32; None for predictions that are not checked.
+        counts: the mask; None for all elements.
+        error: their difference, 0 outside the mask, if it is in memory: a single check then suffices.
+        advice: a further remedy for predictions that are not finite.
 
     Raises:
         ValueError: a target or a prediction is not finite.
     """
-    if seems_finite(*([one for one in (input, target) if one is not None] if error is None else (error,))):
+    if seems_finite(*([value for value in (input, target) if value is not None] if error is None else (error,))):
         return
     refuse_not_finite("target", target, "Leave them out: loss(input, target, weight=torch.isfinite(target))", counts)
     if input is not None:
@@ -306,10 +307,10 @@ def _float(name: str, value: float) -> float:
 
 
 def refuse_other_shapes(**given: Tensor) -> None:
-    """Refuse tensors that do not broadcast, by their names; not in compiled code, which says so itself.
+    """Refuse tensors that do not broadcast, by their names; not in compiled code, where torch raises.
 
     Raises:
-        ValueError: they do not.
+        ValueError: they do not broadcast.
     """
     if torch.compiler.is_compiling():
         return
@@ -321,18 +322,18 @@ def refuse_other_shapes(**given: Tensor) -> None:
 
 
 def _extremes(value: Tensor) -> tuple[float, float] | None:
-    """Least and greatest element, NaN if there is one; None where they cannot be looked at, or there is none."""
+    """The smallest and the largest element, NaN if any is NaN; None without elements or where they are not checked."""
     if torch.compiler.is_compiling() or value.device.type != "cpu" or value.numel() == 0:
         return None
     least, most = torch.aminmax(value.detach())
     try:
         return least.item(), most.item()
-    except RuntimeError:  # under vmap there is no one value
+    except RuntimeError:  # under vmap there is no single value
         return None
 
 
 def first_of(value: Tensor, wrong: Tensor) -> str:
-    """The first element that is wrong, as an error tells it."""
+    """The first wrong element and its index, for error messages."""
     index = tuple(int(at) for at in wrong.nonzero()[0])  # not tolist, which torch 2.6 lacks under its transforms
     return f"{value[index].item():.6g}" + (f" at index {index}" if index else "")
 

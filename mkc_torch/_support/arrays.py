@@ -1,7 +1,7 @@
-"""Arrays and data frames as tensors: what comes in at the door, with no import of the libraries that made it.
+"""Conversion of arrays and data frames to tensors, without importing the libraries that made them.
 
-An array is what has ``__array__`` or ``to_numpy``; a data frame is an array with ``columns``, of pandas, polars or a
-library that follows one of them.
+An array is an object with ``__array__`` or ``to_numpy``; a data frame is an array with ``columns``, of pandas, polars
+or a compatible library.
 """
 
 from __future__ import annotations
@@ -31,30 +31,36 @@ __all__ = [
 
 
 class ArrayLike(Protocol):
-    """A NumPy array, a pandas or polars DataFrame or Series, or whatever else gives itself as a NumPy array."""
+    """A NumPy array, a pandas or polars DataFrame or Series, or another object that converts to a NumPy array."""
 
     def __array__(self) -> np.ndarray: ...
 
 
 Data: TypeAlias = Tensor | ArrayLike
 
-_NUMBERS, _TIMES, _TEXT = "biuf", "mM", "UST"
-"""Kinds of NumPy dtypes."""
+_NUMBERS = "biuf"
+"""NumPy dtype kinds of real numbers and booleans."""
+
+_TIMES = "mM"
+"""NumPy dtype kinds of times."""
+
+_TEXT = "UST"
+"""NumPy dtype kinds of text."""
 
 
 def is_array(value: object) -> bool:
-    """Whether a value is an array or a data frame, and no tensor."""
+    """Whether a value is an array or a data frame but not a tensor."""
     return not isinstance(value, Tensor) and (hasattr(value, "__array__") or hasattr(value, "to_numpy"))
 
 
 def is_frame(value: object) -> bool:
     """Whether a value is a data frame."""
-    # a lazy frame is asked for no columns, which it would have to compute
+    # a lazy frame has no to_numpy, and so its columns are not computed
     return hasattr(value, "to_numpy") and hasattr(value, "columns")
 
 
 def column_names(value: object) -> tuple[str, ...] | None:
-    """The names of a data frame's columns where all are text, else None.
+    """The names of a data frame's columns if all are strings, else None.
 
     Example:
         >>> column_names(np.ones((2, 2))) is None
@@ -67,19 +73,19 @@ def column_names(value: object) -> tuple[str, ...] | None:
 
 
 def as_tensor(name: str, value: Data, *, like: Tensor | None = None, missing: float | None = None) -> Tensor:
-    """A tensor as it is; an array or a data frame as a tensor of its numbers, on the CPU.
+    """A tensor unchanged, or an array or a data frame as a tensor on the CPU.
 
-    float32 stays float32; other real numbers and booleans become float64. A frame is (N, columns), float32 where all
-    of its columns are. The tensor shares the memory of an array that already is what is wanted.
+    float32 stays float32; other real numbers and booleans become float64. A frame becomes (N, columns), float32 if all
+    its columns are. The tensor shares the memory of an array that needs no conversion.
 
     Args:
-        name: of the argument.
-        value: a tensor, a NumPy array, a DataFrame or Series of pandas or polars, or what gives itself as an array.
-        like: the tensor whose dtype and device an array gets, instead of those above.
-        missing: what stands where a frame has no value (null, NA); None refuses such a frame. NaN is a value.
+        name: name of the argument.
+        value: a tensor, a NumPy array, a DataFrame or Series of pandas or polars, or a compatible object.
+        like: tensor whose dtype and device an array gets instead.
+        missing: replacement of missing values (null, NA) of a frame; None refuses them. NaN is not missing.
 
     Raises:
-        TypeError: no array, or one of text, times, complex numbers or other objects; of a frame, the column is named.
+        TypeError: not an array, or an array of text, times, complex numbers or other objects; names a frame's column.
         ValueError: values are missing.
 
     Example:
@@ -102,15 +108,16 @@ def as_tensor(name: str, value: Data, *, like: Tensor | None = None, missing: fl
 
 
 def as_tensors(**values: Data) -> tuple[Tensor, ...]:
-    """Arrays and data frames as tensors of one dtype and device; what is a tensor already stays as it is.
+    """Arrays and data frames as tensors of a common dtype and device; tensors are unchanged.
 
-    Arrays follow the first floating tensor beside them. Where there is none, they become float32 if all of them are.
+    Arrays get the dtype and device of the first floating-point tensor among the values. Without such a tensor they
+    become float32 if all of them are float32, else float64.
 
     Args:
-        **values: by the names of the arguments.
+        **values: the values by the names of the arguments.
 
     Raises:
-        TypeError, ValueError: as :func:`as_tensor`.
+        TypeError, ValueError: see :func:`as_tensor`.
 
     Example:
         >>> X, Y = as_tensors(X=torch.ones(2, 1), Y=np.ones(2))
@@ -121,18 +128,18 @@ def as_tensors(**values: Data) -> tuple[Tensor, ...]:
     arrays = [name for name, value in values.items() if not isinstance(value, Tensor)]
     if arrays:
         given = [value for value in values.values() if isinstance(value, Tensor) and value.is_floating_point()]
-        like = given[0] if given else max((made[name] for name in arrays), key=lambda one: one.element_size())
+        like = given[0] if given else max((made[name] for name in arrays), key=lambda tensor: tensor.element_size())
         made |= {name: made[name].to(like) for name in arrays}
     return tuple(made.values())
 
 
 def refuse_other_columns(name: str, value: object, names: tuple[str, ...] | None) -> None:
-    """Refuse a data frame whose columns are not those of the fit, or stand in another order.
+    """Refuse a data frame whose columns differ from those of the fit, or their order does.
 
     Args:
-        name: of the argument.
-        value: of the argument; what has no named columns passes.
-        names: of the columns of the fit; None where they had no names.
+        name: name of the argument.
+        value: value of the argument; it passes if it has no named columns.
+        names: names of the columns of the fit; None if they had no names.
 
     Raises:
         ValueError: they differ.
@@ -149,7 +156,7 @@ def refuse_other_columns(name: str, value: object, names: tuple[str, ...] | None
 
 
 def series_of(frame: Any) -> Iterator[tuple[Any, Any]]:
-    """The columns of a data frame, each with its name, which two of them can share."""
+    """The columns of a data frame, each with its name; names may repeat."""
     if hasattr(frame, "get_columns"):
         yield from ((series.name, series) for series in frame.get_columns())
     elif hasattr(frame, "items"):
@@ -159,15 +166,15 @@ def series_of(frame: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def numbers_of(where: str, value: Any, missing: float | None = None) -> np.ndarray:
-    """An array of float32 or float64 that torch can share, from an array or one column of a frame.
+    """A float32 or float64 array whose memory torch can share, from an array or a column of a frame.
 
     Args:
-        where: it stands, for errors: "argument `X`" say.
-        value: what gives itself as a NumPy array.
-        missing: what stands where it has no value; None refuses it then.
+        where: its place, for errors, such as "argument `X`".
+        value: an object that converts to a NumPy array.
+        missing: replacement of missing values; None refuses them.
 
     Raises:
-        TypeError: no real numbers.
+        TypeError: not real numbers.
         ValueError: values are missing.
     """
     array = np.asarray(value.to_numpy() if hasattr(value, "to_numpy") else value)
@@ -175,17 +182,17 @@ def numbers_of(where: str, value: Any, missing: float | None = None) -> np.ndarr
     if gone is not None and gone.any():
         array = _filled(where, array, gone, missing)
     elif array.dtype.kind not in _NUMBERS:
-        raise TypeError(f"Expected {where} to hold real numbers but got {_told_of(array)}.")
+        raise TypeError(f"Expected {where} to hold real numbers but got {_describe_content(array)}.")
     dtype = np.float32 if array.dtype == np.float32 else np.float64
-    # torch shares neither memory that is read-only nor a reversed or byte-swapped order
+    # torch cannot share read-only memory, negative strides or swapped bytes
     return np.require(array.astype(dtype, copy=False), requirements=["C", "W"])
 
 
 def _filled(where: str, array: np.ndarray, gone: np.ndarray, missing: float | None) -> np.ndarray:
-    """The numbers of a column that lacks some, in float64, with ``missing`` in their place."""
+    """A column in float64 with ``missing`` in place of its missing values."""
     present = array[~gone]
     if present.dtype.kind not in _NUMBERS and not _all_numbers(present):
-        raise TypeError(f"Expected {where} to hold real numbers but got {_told_of(present)}.")
+        raise TypeError(f"Expected {where} to hold real numbers but got {_describe_content(present)}.")
     if missing is None:
         raise ValueError(
             f"Expected {where} to have a value everywhere but got {int(gone.sum())} missing of {gone.size}; drop "
@@ -197,7 +204,7 @@ def _filled(where: str, array: np.ndarray, gone: np.ndarray, missing: float | No
 
 
 def absent(value: Any) -> np.ndarray | None:
-    """Where a column has no value; None if it is of a kind that always has one."""
+    """The mask of a column's missing values; None if its type has no missing values."""
     if isinstance(value, np.ma.MaskedArray):
         return np.ma.getmaskarray(value)
     if isinstance(getattr(value, "dtype", None), np.dtype):
@@ -213,15 +220,15 @@ def _where(name: str, label: object) -> str:
 
 
 def _all_numbers(array: np.ndarray) -> bool:
-    return all(isinstance(one, (bool, int, float, np.number, np.bool_)) for one in array.flat)
+    return all(isinstance(item, (bool, int, float, np.number, np.bool_)) for item in array.flat)
 
 
-def _told_of(array: np.ndarray) -> str:
-    """What an array of something else than real numbers holds, and what to do about it."""
+def _describe_content(array: np.ndarray) -> str:
+    """The content of an array that does not hold real numbers, and the remedy, for error messages."""
     kind = array.dtype.kind
     if kind == "c":
         return f"{array.dtype}; pass its real part"
-    first = next((one for one in array.flat if one is not None), None)
+    first = next((item for item in array.flat if item is not None), None)
     if kind in _TIMES or hasattr(first, "tzinfo"):
         return "times; turn them into numbers, such as seconds since the first"
     if kind in _TEXT or isinstance(first, str):

@@ -1,4 +1,4 @@
-"""How every picture looks, and the axes that it is drawn on."""
+"""The style of all plots, and their axes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 __all__ = ["BLUE", "GREY", "INK", "ORANGE", "PALE", "SHADE", "STYLE", "array", "axes_or_new", "style"]
 
-# Okabe and Ito's colours, told apart with any colour vision
+# Okabe and Ito's colours, distinguishable with any colour vision
 BLUE, ORANGE, INK, GREY, PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
 SHADE = "#F3D9C6"
 STYLE = {
@@ -37,33 +37,34 @@ STYLE = {
     "svg.hashsalt": "mkc",
     "savefig.transparent": True,
 }
-# a name from a file may hold a dollar sign; a title of given height spares a layout of every panel
+# names from files may contain a dollar sign; a fixed title height saves a layout pass for every panel
 _OF_NAMES = {"text.parse_math": False, "axes.titley": 1.0, "axes.titlesize": 10.0, "axes.titlepad": 5.0}
-_SIZE = (6.4, 4.0)  # inches
+_SIZE = (6.4, 4.0)
+"""Size of a figure in inches."""
 
 
 @contextmanager
 def style() -> Iterator[None]:
-    """The looks of all pictures, while one is drawn."""
+    """Apply the style of all plots within the block."""
     import matplotlib
 
     with matplotlib.rc_context(STYLE | _OF_NAMES), warnings.catch_warnings():
-        # names in letters that the font for measuring lacks; the reader's browser has them
+        # names may contain letters that the font for the layout lacks; the browser of the reader has them
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
 
 
 def axes_or_new(ax: Any = None, *, projection: str | None = None, size: tuple[float, float] = _SIZE) -> Any:
-    """The axes, or those of a new figure of pyplot, which a notebook shows and ``plt.show()`` opens.
+    """The given axes, or the axes of a new pyplot figure, which a notebook shows and ``plt.show()`` opens.
 
     Args:
-        ax: matplotlib's, or None.
-        projection: that the axes must have, such as "mollweide".
-        size: of a new figure, in inches.
+        ax: axes of matplotlib, or None.
+        projection: required projection of the axes, such as "mollweide".
+        size: size of a new figure in inches.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
-        TypeError: what is given is no axes.
+        TypeError: ``ax`` is not axes.
         ValueError: the axes have another projection.
     """
     try:
@@ -87,5 +88,5 @@ def axes_or_new(ax: Any = None, *, projection: str | None = None, size: tuple[fl
 
 
 def array(values: Tensor) -> np.ndarray:
-    """Numbers to draw."""
+    """A tensor as a NumPy array, for a plot."""
     return values.detach().cpu().numpy()

@@ -16,8 +16,8 @@ __all__ = ["effective_size"]
 def effective_size(values: Float[Tensor, " N"]) -> float:
     """Number of independent samples whose mean has the same variance: N over the integrated autocorrelation time.
 
-    Summed over pairs of lags as long as they are positive. Geyer, "Practical Markov chain Monte Carlo", Statistical
-    Science 7 (1992), 3.3.
+    The autocorrelations are summed over pairs of lags up to the first negative pair. Geyer, "Practical Markov chain
+    Monte Carlo", Statistical Science 7 (1992), 3.3.
 
     Example:
         >>> generator = torch.Generator().manual_seed(0)

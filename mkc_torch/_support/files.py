@@ -1,4 +1,4 @@
-"""Writing results so that a failure leaves nothing half-written and nothing of the user's is lost."""
+"""Writing of results without half-written files after a failure and without loss of the user's files."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["claim_folder", "folder_held", "write_atomically"]
 
 
 def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a whole file or none of it.
+    """Write a file atomically.
 
-    The data go to a temporary file in the same folder, which then takes the target's name in one step.
+    The data are written to a temporary file in the same folder, which is then renamed.
 
     Args:
-        path: the target, in a folder that exists.
-        data: its content; text is written as UTF-8, line ends as they are.
+        path: the target, in an existing folder.
+        data: its content; text is written as UTF-8 with unchanged line ends.
         overwrite: replace an existing file.
 
     Raises:
@@ -46,22 +46,22 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
         raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}; create it first.")
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("xb") as file:  # not tempfile, whose files nobody but the owner can read
+        with temporary.open("xb") as file:  # not tempfile, whose files only the owner can read
             file.write(data.encode() if isinstance(data, str) else data)
             file.flush()
             os.fsync(file.fileno())
         _take_name(temporary, path, overwrite)
     except OSError as error:
-        if error.errno is None:  # our own sentence
+        if error.errno is None:  # raised above
             raise
-        # a write to a full disk does not name the file, and the temporary's name tells a user nothing
+        # the error of a full disk names no file, and the temporary name is meaningless to a user
         raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _take_name(temporary: Path, path: Path, overwrite: bool) -> None:
-    """Give a file its name; a file that another process gave that name meanwhile is not replaced unasked."""
+    """Rename a file; without ``overwrite`` a target that another process has created meanwhile is kept."""
     if not overwrite:
         try:
             os.link(temporary, path)  # fails where the name is taken
@@ -74,18 +74,18 @@ def _take_name(temporary: Path, path: Path, overwrite: bool) -> None:
     os.replace(temporary, path)  # noqa: PTH105 - one name for the step that tests make fail
 
 
-_LEFT = re.compile(r"\.[0-9a-f]{16}\.tmp")
-"""What a process that was killed while it wrote leaves behind."""
+_LEFTOVER = re.compile(r"\.[0-9a-f]{16}\.tmp")
+"""Names of temporary files that a killed process leaves behind."""
 
 
 @contextmanager
 def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
-    """No other process holds the folder meanwhile; whichever way this one ends, it is free again.
+    """Lock a folder against other processes within the block; the lock ends with the process at the latest.
 
-    What a process that was killed left half-written is removed. Where the system has no locks, nothing is held.
+    Temporary files of killed processes are removed. On a system without file locks nothing is locked.
 
     Raises:
-        FileExistsError: another process holds it.
+        FileExistsError: another process has locked the folder.
 
     Example:
         >>> import tempfile
@@ -93,7 +93,7 @@ def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
         ...     write_atomically(Path(folder) / "a.txt", "text")
     """
     path = Path(path)
-    if sys.platform == "win32":  # which has no such locks
+    if sys.platform == "win32":  # it has no such locks
         yield
         return
     handle = os.open(path, os.O_RDONLY)
@@ -106,9 +106,9 @@ def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
             ) from None
         except OSError:  # a file system without locks
             pass
-        for left in path.iterdir():
-            if _LEFT.fullmatch(left.name):
-                left.unlink(missing_ok=True)
+        for leftover in path.iterdir():
+            if _LEFTOVER.fullmatch(leftover.name):
+                leftover.unlink(missing_ok=True)
         yield
     finally:
         os.close(handle)
@@ -117,23 +117,23 @@ def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
 _MADE = b"Made by mkc_torch"
 _MARKS = {".html": _MADE, ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
 _MARKS |= dict.fromkeys((".params", ".param", ".h", ".yaml"), _MADE)
-"""By which files of a kind are known as written here."""
+"""Text by which a file of this suffix is recognised as written by mkc_torch."""
 
 
 def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files: Iterable[str] = ()) -> Path:
-    """Create an output folder, its parents too, or take an existing one that is empty.
+    """Create an output folder and its parents, or accept an existing empty folder.
 
     Args:
         path: the folder.
-        overwrite: accept a folder with files in it. None of them is removed.
-        files: names of those that will be written: a file of the user's own under such a name is not to be lost.
+        overwrite: accept a folder with files in it. No file is removed.
+        files: names of the files that will be written; a user's own file with such a name is refused.
 
     Returns:
         The folder.
 
     Raises:
-        FileExistsError: ``path`` is a file, or a folder with something in it and ``overwrite`` is False, or it has a
-            file to be written that was not written here.
+        FileExistsError: ``path`` is a file, or a folder that is not empty and ``overwrite`` is False, or one of
+            ``files`` exists and was not written by mkc_torch.
 
     Example:
         >>> import tempfile
@@ -159,12 +159,12 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files
 
 
 def _something_in(folder: Path) -> bool:
-    return any(not _LEFT.fullmatch(path.name) for path in folder.iterdir())
+    return any(not _LEFTOVER.fullmatch(path.name) for path in folder.iterdir())
 
 
 def _foreign(folder: Path, names: Sequence[str]) -> list[str]:
-    """Files that are there and were not written here; one of a kind without a mark goes with those that have one."""
-    there = [name for name in names if (folder / name).is_file()]
-    marked = {name: _MARKS[Path(name).suffix] for name in there if Path(name).suffix in _MARKS}
+    """Existing files that mkc_torch has not written; a file without a mark counts as written if a marked file does."""
+    existing = [name for name in names if (folder / name).is_file()]
+    marked = {name: _MARKS[Path(name).suffix] for name in existing if Path(name).suffix in _MARKS}
     own = {name for name, mark in marked.items() if mark in (folder / name).read_bytes()}
-    return [name for name in there if name not in own and (name in marked or not own)]
+    return [name for name in existing if name not in own and (name in marked or not own)]

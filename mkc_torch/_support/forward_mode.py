@@ -1,4 +1,4 @@
-"""Tangents of a function, by forward mode, by reverse mode, or by reverse mode of reverse mode."""
+"""Jacobians of functions by forward mode, by reverse mode, or by reverse mode applied twice."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ Residual = Callable[..., Tensor]
 
 @functools.cache
 def load_forward_mode() -> None:
-    """Torch compiles its rules for forward mode at the first use, by a function that it deprecates itself."""
-    one = torch.ones(1)
+    """Load torch's rules for forward mode, which it compiles at the first use by a function that it deprecates."""
+    point = torch.ones(1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        torch.func.jvp(torch.sin, (one,), (one,))
+        torch.func.jvp(torch.sin, (point,), (point,))
 
 
 def make_dual(constant: Tensor, moving: Tensor) -> Tensor:
-    """A constant, with a tangent of zeros where one number, ``moving``, has a tangent.
+    """A constant as a dual tensor with zero tangent if the scalar ``moving`` has a tangent; otherwise unchanged.
 
-    What has none is added and multiplied by reference functions written in Python, half a millisecond each and a second
-    at their first use.
+    In forward mode, tensors without a tangent are added and multiplied by reference functions in Python, which take
+    0.5 ms each and 1 s at their first use.
     """
     if not is_wrapped(moving):
         return constant
@@ -48,11 +48,11 @@ def make_dual(constant: Tensor, moving: Tensor) -> Tensor:
 
 
 _CELLS = 250_000
-"""Numbers of the tangents that are made together: on the way to them a function holds several times as many."""
+"""Numbers in a batch of tangents, a limit of memory: a function holds several times as many during the evaluation."""
 
 
 def directions_at_once(values: int) -> int:
-    """Directions along which so many values are differentiated together.
+    """Number of directions in a batch for a function with this number of values.
 
     Example:
         >>> directions_at_once(4_500), directions_at_once(360_000)
@@ -62,7 +62,7 @@ def directions_at_once(values: int) -> int:
 
 
 def forward_tangents(function: Residual, values: int = 1) -> Residual:
-    """The transposed Jacobian, a row for each parameter; of a function of many ``values`` a few rows at a time."""
+    """The transposed Jacobian as a function, a row per parameter; in batches for a function with many ``values``."""
     load_forward_mode()
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
@@ -70,24 +70,25 @@ def forward_tangents(function: Residual, values: int = 1) -> Residual:
             return torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
 
         basis = torch.eye(theta.shape[0], dtype=theta.dtype, device=theta.device)
-        few = directions_at_once(values)
-        # all of them in one chunk would lie otherwise in memory, and be rounded otherwise in what follows
-        return torch.func.vmap(along, chunk_size=None if few >= len(basis) else few)(basis)
+        batch = directions_at_once(values)
+        # a chunk of all directions would have another memory layout, and so another rounding in later operations
+        return torch.func.vmap(along, chunk_size=None if batch >= len(basis) else batch)(basis)
 
     return tangents
 
 
 def forward_jacobian(function: Residual, theta: Tensor, values: int) -> Tensor:
-    """As ``torch.func.jacfwd`` has it, of a function of so many values."""
+    """The Jacobian in the layout of ``torch.func.jacfwd``, for a function with this number of values."""
     return forward_tangents(function, values)(theta).movedim(0, -1)
 
 
 def twice_reverse_tangents(function: Residual) -> Residual:
-    """The tangents as slopes of what reverse mode makes of weights of the values, which is linear in these.
+    """The transposed Jacobian as a function, by differentiating the vector-Jacobian product by its vector.
 
-    Forward mode does in Python what torch does here in C++, unless a constant has a tangent too (:func:`make_dual`). It is
-    used where reverse mode has no finite answer, as beside an infinite slope that ``torch.where`` leaves out, and where
-    there is no second derivative. Torch takes that for 0, so a function's first answer is compared along one direction.
+    This runs in C++, forward mode in Python unless constants have tangents too (:func:`make_dual`). Forward mode is
+    used where reverse mode is not finite, as next to an infinite slope that ``torch.where`` excludes, and where there
+    is no second derivative. Torch takes a missing second derivative for 0, so the first result of each function is
+    compared with forward mode along one direction.
     """
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
@@ -103,14 +104,14 @@ def twice_reverse_tangents(function: Residual) -> Residual:
 
 
 _trusted: WeakKeyDictionary[Residual, bool] = WeakKeyDictionary()
-"""Whether a function's tangents by reverse mode of reverse mode were those of forward mode when they were compared."""
+"""Whether a function's tangents by reverse mode applied twice agreed with forward mode when they were compared."""
 
 
 def _agree(rows: Tensor, function: Residual, theta: Tensor, *data: Any) -> bool:
-    """Whether tangents are those of forward mode along one direction."""
+    """Whether tangents agree with forward mode along one direction."""
     load_forward_mode()
     sizes = rows.flatten(1).abs().amax(1)
-    # each parameter by as much as the others, in the values
+    # scaled so that all parameters change the values alike
     direction = torch.where((sizes > 0) & sizes.isfinite(), 1.0 / sizes, 1.0)
     along = torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
     off = (torch.tensordot(direction, rows, 1) - along).abs().amax()
@@ -118,7 +119,7 @@ def _agree(rows: Tensor, function: Residual, theta: Tensor, *data: Any) -> bool:
 
 
 def _twice_reversed(function: Residual, theta: Tensor, *data: Any) -> Tensor | None:
-    """None where reverse mode cannot be had."""
+    """The tangents by reverse mode applied twice; None where torch cannot compute them."""
     with torch.enable_grad():
         at = theta.detach().requires_grad_()
         values = function(at, *data)
@@ -132,6 +133,8 @@ def _twice_reversed(function: Residual, theta: Tensor, *data: Any) -> Tensor | N
 
 
 def reverse_tangents(function: Residual) -> Residual:
+    """The transposed Jacobian as a function, by reverse mode."""
+
     def tangents(theta: Tensor, *data: Any) -> Tensor:
         jacobian: Tensor = torch.func.jacrev(function)(theta, *data)
         return jacobian.movedim(-1, 0)

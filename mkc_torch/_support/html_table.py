@@ -1,4 +1,4 @@
-"""Small tables of HTML for notebooks: text escaped, colours those of the page, so that light and dark both read."""
+"""HTML tables for notebooks, with escaped text, in the colours of the page for light and dark themes."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def html_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str
         '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-variant-numeric:tabular-nums">'
         f"{f'<thead><tr>{head}</tr></thead>' if any(columns) else ''}<tbody>{body}</tbody></table></div>"
     )
-    sentences = "".join(f'<p style="margin:4px 0 0;max-width:76ch">{escape(one)}</p>' for one in below)
+    sentences = "".join(f'<p style="margin:4px 0 0;max-width:76ch">{escape(sentence)}</p>' for sentence in below)
     return (
         f'<div><p style="margin:0 0 4px"><strong>{escape(caption)}</strong></p>{table if rows else ""}{sentences}</div>'
     )
 
 
 def with_error(value: float, error: float) -> str:
-    """A number with its standard error, both to the decimals that two digits of the error have.
+    """A number with its standard error, both rounded to two digits of the error.
 
     Example:
         >>> with_error(11.96931, 0.01712), with_error(-0.5, math.inf), with_error(5123.0, 210.0)

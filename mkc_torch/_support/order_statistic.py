@@ -21,9 +21,9 @@ def order_statistic(
     """The h-th smallest value of each channel; with weights, the value at which their cumulated share reaches h/N.
 
     Args:
-        values: what is ordered along the samples N.
-        weight: non-negative weights that broadcast against ``values``; a whole number counts a value so often.
-        h: rank in (0, N]; what is no whole number is rounded up.
+        values: values, ordered along the samples N.
+        weight: non-negative weights that broadcast against ``values``; an integer weight repeats a value.
+        h: rank in (0, N]; rounded up to an integer.
     """
     if weight is None:
         rank = math.ceil(h)
@@ -41,7 +41,7 @@ def order_statistic(
 
 
 def _kept(weight: Float[Tensor, "*batch N m"]) -> Bool[Tensor, " N"] | None:
-    """The samples of weight 1 where all others have weight 0 and all channels and problems share them, or None."""
+    """The mask of the samples if the weights are 0 or 1 and shared by all channels and problems; else None."""
     if weight.numel() != weight.shape[-2] or weight.requires_grad or is_wrapped(weight):
         return None
     shared = weight.detach().reshape(-1)
@@ -50,7 +50,7 @@ def _kept(weight: Float[Tensor, "*batch N m"]) -> Bool[Tensor, " N"] | None:
 
 
 def _is_plain(values: Tensor) -> bool:
-    """Whether NumPy may read the memory: on a processor, of a dtype it knows, with no derivative and no transform."""
+    """Whether NumPy may read the memory: on the CPU, float32 or float64, without derivatives and transforms."""
     return (
         values.device.type == "cpu"
         and values.dtype in (torch.float32, torch.float64)
@@ -62,7 +62,7 @@ def _is_plain(values: Tensor) -> bool:
 
 
 def _selected(values: Float[Tensor, "*batch N m"], rank: int) -> Float[Tensor, "*batch m"]:
-    """The value of this rank by NumPy's partition, which is two to five times as fast as torch's selection."""
+    """The value of this rank by NumPy's partition, 2 to 5 times as fast as ``torch.kthvalue``."""
     ordered = values.squeeze(-1).numpy() if values.shape[-1] == 1 else values.mT.contiguous().numpy()
     found = torch.from_numpy(np.partition(ordered, rank - 1, axis=-1)[..., rank - 1].copy())
     return found.unsqueeze(-1) if values.shape[-1] == 1 else found
@@ -71,5 +71,5 @@ def _selected(values: Float[Tensor, "*batch N m"], rank: int) -> Float[Tensor, "
 def robust_scale(
     error: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None = None
 ) -> Float[Tensor, "*batch m"]:
-    """1.4826 times the median absolute residual of each channel, the standard deviation of Gaussian ones."""
+    """1.4826 times the median absolute residual of each channel: the standard deviation for Gaussian residuals."""
     return 1.4826 * order_statistic(error.abs(), weight, 0.5 * error.shape[-2])

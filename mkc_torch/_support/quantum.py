@@ -1,4 +1,4 @@
-"""The step of numbers that were recorded in steps."""
+"""The resolution of recorded numbers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 __all__ = ["quanta_of", "rounding_of"]
 
 _DECIMALS = 7
-"""Decimals up to which the numbers of a file are taken for rounded ones."""
+"""Numbers of a file with fewer decimals than this are taken as rounded."""
 
 _ROUNDED = 1e-12
-"""Of a number: by so much a rounded one may be off."""
+"""Relative tolerance at which a number counts as rounded."""
 
 
 def quanta_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """The step of each column: between the few numbers that it has, or the last decimal of a file; 0 for none.
+    """The resolution of each column: the smallest step between few distinct values, or the last decimal; else 0.
 
     Example:
         >>> import torch
@@ -27,23 +27,23 @@ def quanta_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
         >>> quanta_of(values).tolist()
         [0.01, 0.0]
     """
-    return values.new_tensor([max(_step(one), _resolution(one)) for one in values.unbind(-1)])
+    return values.new_tensor([max(_step(column), _resolution(column)) for column in values.unbind(-1)])
 
 
 def rounding_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """Standard deviation of what rounding to those steps adds to each column: a twelfth of their square, as a root."""
+    """The standard deviation of the rounding error of each column: its resolution over √12."""
     return quanta_of(values) / 12.0**0.5
 
 
 def _step(values: Float[Tensor, " N"]) -> float:
-    """Smallest step between two numbers that a column has; 0 where nearly all numbers are different."""
+    """The smallest step between distinct values of a column; 0 where nearly all values are distinct."""
     numbers = values.unique()
     few = len(numbers) < len(values) // 4 and len(numbers) > 1
     return float(numbers.diff().min()) if few else 0.0
 
 
 def _resolution(values: Float[Tensor, " N"]) -> float:
-    """The quantum of numbers that a file has with a few decimals; 0 where they have more than a few.
+    """The last decimal of numbers with few decimals; 0 for more decimals.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Processes that work on parts of one problem: sums over all of them, and an error of one that is an error of all."""
+"""Sums over the processes of a distributed group; an error on one rank is raised on all ranks."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ T = TypeVar("T")
 
 
 class RanksError(RuntimeError):
-    """Another process of the group failed, or is gone."""
+    """Another process of the group failed or has ended."""
 
 
 class Ranks:
     """The processes of a ``torch.distributed`` group, or this one alone.
 
-    Every method that works does so on all ranks or raises on all: before a result is used the ranks tell one another
-    whether they have one. A process that is gone closes its connections, of which gloo tells the others at once; one
-    that hangs is waited for as long as the group's timeout says, and so is any with nccl.
+    Every method returns on all ranks or raises on all ranks: before a result is used, the ranks exchange whether they
+    have a result. With gloo, the others notice at once that a process has ended, because its connections close; a
+    process that hangs, and any failure with nccl, is noticed after the timeout of the group.
 
     Args:
-        group: of ``torch.distributed``; None takes the default group where it is initialised, else this process alone.
+        group: a ``torch.distributed`` group; None is the default group if it is initialised, else this process alone.
 
     Example:
         >>> Ranks().sum_of(lambda: torch.ones(2).double(), 2)
@@ -46,22 +46,22 @@ class Ranks:
             raise ValueError("Expected argument `group` to be one that this process is a member of.")
 
     def sum_of(self, work: Callable[[], Float64[Tensor, " k"]], length: int) -> Float64[Tensor, " k"]:
-        """The sum over the ranks of what each works out, element by element.
+        """The elementwise sum over the ranks of the results of ``work``.
 
         Args:
-            work: gives float64 numbers.
-            length: how many.
+            work: returns float64 numbers, (length,).
+            length: count of the numbers.
 
         Raises:
             RanksError: another rank failed; on a rank that fails, its own error.
         """
         if self.alone:
             return work()
-        # the last number says whether the rank failed, so that one message does
+        # the last number is 1 if the rank failed, so that one message suffices
         flat, error = torch.zeros(length + 1, dtype=torch.float64), None
         try:
             flat[:-1] = work()
-        except Exception as caught:  # whatever a user's batches raise, the others wait for this rank; raised below
+        except Exception as caught:  # any error of a user's batches, as the others wait for this rank; raised below
             flat[-1], error = 1.0, caught
         with _connected():
             moved = flat.to(self._device())
@@ -72,7 +72,7 @@ class Ranks:
         return flat[:-1]
 
     def gathered(self, work: Callable[[], T]) -> list[T]:
-        """What every rank works out, in the order of ranks, on each of them.
+        """The results of ``work`` of all ranks, in the order of ranks, on each rank.
 
         Raises:
             RanksError: another rank failed; on a rank that fails, its own error.
@@ -86,12 +86,12 @@ class Ranks:
             error = caught
         found: list[Any] = [None] * self.size
         with _connected():
-            dist.all_gather_object(found, (mine, _told(error)), group=self.group)
+            dist.all_gather_object(found, (mine, _error_message(error)), group=self.group)
         self._raise_first(error, [message for _, message in found])
         return [value for value, _ in found]
 
     def from_first(self, work: Callable[[], T]) -> T:
-        """What rank 0 works out, on each rank: bit for bit the same whatever their processors are.
+        """The result of ``work`` on rank 0, on each rank, bit for bit the same on any processor.
 
         Raises:
             RanksError: rank 0 failed; there, its own error.
@@ -104,7 +104,7 @@ class Ranks:
                 result = work()
             except Exception as caught:  # raised below, once the others know
                 error = caught
-        box = [(result, _told(error))]
+        box = [(result, _error_message(error))]
         source = 0 if self.group is None else dist.get_global_rank(self.group, 0)
         with _connected():
             dist.broadcast_object_list(box, src=source, group=self.group)
@@ -118,7 +118,7 @@ class Ranks:
     def _raise(self, error: Exception | None) -> None:
         messages: list[Any] = [None] * self.size
         with _connected():
-            dist.all_gather_object(messages, _told(error), group=self.group)
+            dist.all_gather_object(messages, _error_message(error), group=self.group)
         self._raise_first(error, messages)
 
     def _raise_first(self, error: Exception | None, messages: list[str | None]) -> None:
@@ -129,7 +129,7 @@ class Ranks:
                 raise RanksError(f"Rank {rank} failed, and so no rank goes on: {message}")
 
 
-def _told(error: Exception | None) -> str | None:
+def _error_message(error: Exception | None) -> str | None:
     return None if error is None else f"{type(error).__name__}: {error}"
 
 

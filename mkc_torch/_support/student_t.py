@@ -1,7 +1,7 @@
-"""Distribution of Student's t and of Fisher's F, for intervals and p-values.
+"""Distributions of Student's t and Fisher's F, for intervals and p-values.
 
-Both are incomplete beta functions, which torch lacks: the continued fraction of DLMF 8.17.22, by Lentz's method. Values
-are in float64 and without a gradient.
+Both are incomplete beta functions, which torch lacks; they are computed by the continued fraction of DLMF 8.17.22 with
+Lentz's method, in float64 and without a gradient.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from torch import Tensor
 __all__ = ["fisher_tail", "incomplete_beta", "student_quantile", "student_tails"]
 
 _STEPS = 2000
-"""Of the continued fraction: about twice the root of the larger parameter are enough."""
+"""Maximum number of terms of the continued fraction; twice the root of the larger parameter suffices."""
 
 _HALVINGS = 100
-"""Of an interval that a quantile lies in: far out in the tail it is next to 0."""
+"""Number of bisections for a quantile; many, because the root is close to 0 far in the tail."""
 
 _FREEDOM = 1e6
-"""Degrees of freedom beyond this are taken for so many: quantiles are within 1e-6 of a Gaussian's."""
+"""Limit of the degrees of freedom: beyond it quantiles are within 1e-6 of a Gaussian's."""
 
 
 def incomplete_beta(a: Tensor, b: Tensor, x: Tensor) -> Tensor:
@@ -31,7 +31,7 @@ def incomplete_beta(a: Tensor, b: Tensor, x: Tensor) -> Tensor:
         tensor(0.5248, dtype=torch.float64)
     """
     a, b, x = torch.broadcast_tensors(*(v.detach().double() for v in (a, b, x)))
-    # the fraction converges fast on the near side of the mean
+    # the continued fraction converges fast below the mean
     far = x > (a + 1.0) / (a + b + 2.0)
     p, q, y = torch.where(far, b, a), torch.where(far, a, b), torch.where(far, 1.0 - x, x)
     log_front = torch.xlogy(p, y) + q * torch.log1p(-y) - torch.log(p)
@@ -63,7 +63,7 @@ def _apart(value: Tensor, tiny: float) -> Tensor:
 
 
 def student_tails(t: Tensor, freedom: Tensor) -> Tensor:
-    """The chance of a Student-t beyond ``|t|`` on either side: a two-sided p-value.
+    """The probability of a Student t beyond ``±|t|``: a two-sided p-value.
 
     Example:
         >>> student_tails(torch.tensor(2.0), torch.tensor(10.0))
@@ -74,7 +74,7 @@ def student_tails(t: Tensor, freedom: Tensor) -> Tensor:
 
 
 def fisher_tail(f: Tensor, over: Tensor, under: Tensor) -> Tensor:
-    """The chance of a Fisher-F beyond ``f``, with the degrees of freedom of its two squares.
+    """The probability of a Fisher F above ``f``, with its numerator and denominator degrees of freedom.
 
     Example:
         >>> fisher_tail(torch.tensor(3.0), torch.tensor(2.0), torch.tensor(20.0))
@@ -85,7 +85,7 @@ def fisher_tail(f: Tensor, over: Tensor, under: Tensor) -> Tensor:
 
 
 def student_quantile(level: float, freedom: Tensor) -> Tensor:
-    """The t that a share ``level`` of a Student-t lies within ± of.
+    """The t for which a Student t is within ±t with probability ``level``.
 
     Example:
         >>> student_quantile(0.95, torch.tensor([10.0, 1e6]))
@@ -95,14 +95,14 @@ def student_quantile(level: float, freedom: Tensor) -> Tensor:
     half = torch.full_like(freedom, 0.5)
     a = 0.5 * freedom.clamp(max=_FREEDOM)
     inside = _bisected(lambda x: incomplete_beta(half, a, x) > level, freedom)
-    # far out the rest is a small number, which one less the share would lose
+    # far in the tail, 1 − share loses the digits of the small rest
     outside = _bisected(lambda x: incomplete_beta(a, half, x) > 1.0 - level, freedom)
     near, far = inside / (1.0 - inside), (1.0 - outside) / outside
     return torch.sqrt(2.0 * a * torch.where(inside > 0.5, far, near))
 
 
 def _bisected(above: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-    """Where a rising function passes a level, between 0 and 1."""
+    """The point between 0 and 1 at which a condition becomes true, by bisection."""
     low, high = torch.zeros_like(like), torch.ones_like(like)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

@@ -40,6 +40,6 @@ def forward_mode_is_active() -> bool:
 def in_backward() -> bool:
     """Whether a backward pass is running, as while activation checkpointing recomputes a forward pass.
 
-    torch.utils.checkpoint has no public way to tell the recomputation from the first pass.
+    torch.utils.checkpoint has no public way to distinguish the recomputation from the first pass.
     """
     return torch._C._current_graph_task_id() != -1

@@ -1,4 +1,4 @@
-"""Newton's method within a trust region for a batch of smooth, not necessarily convex functions."""
+"""Newton's method with a trust region for a batch of smooth, possibly nonconvex functions."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 __all__ = ["Minima", "Quadratic", "minimise"]
 
 _NEGATIVE = 1e-6
-"""Least curvature, relative to the largest, at which a stationary point counts as a minimum, with the sign reversed."""
+"""Negative curvature, relative to the largest curvature, up to which a stationary point counts as a minimum."""
 
 
 @dataclass(frozen=True)
 class Quadratic:
-    """Functions about one point each: values (K,), gradients (K, n), symmetric Hessians (K, n, n)."""
+    """Second-order models of K functions: values (K,), gradients (K, n), symmetric Hessians (K, n, n)."""
 
     value: Float[Tensor, " K"]
     gradient: Float[Tensor, "K n"]
@@ -39,7 +39,7 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Minima:
-    """Where the descents came to rest: points (K, n), values (K,), steps tried (K,), and whether each is a minimum."""
+    """Results of the descents: points (K, n), values (K,), steps tried (K,), and whether each is a minimum (K,)."""
 
     point: Float[Tensor, "K n"]
     value: Float[Tensor, " K"]
@@ -49,7 +49,7 @@ class Minima:
 
 @dataclass(frozen=True)
 class _Step:
-    """Steps (K, n), their lengths, the gains foreseen of them and of Newton's whole step, and whether all bends up."""
+    """Steps (K, n), their lengths, the predicted gains of them and of the full Newton steps, and convexity."""
 
     step: Float[Tensor, "K n"]
     length: Float[Tensor, " K"]
@@ -59,9 +59,9 @@ class _Step:
 
 
 def _step(at: Quadratic, radius: Float[Tensor, " K"]) -> _Step:
-    """Newton's step with the absolute values of the curvatures, cut to the radius.
+    """Newton's step with the absolute values of the curvatures, shortened to the radius.
 
-    Where going along the most negative curvature gains more, at a saddle say, that is the step.
+    Where a step along the most negative curvature gains more, such as at a saddle, it is taken instead.
     """
     curvature, vectors = torch.linalg.eigh(at.hessian)
     slope = torch.matmul(at.gradient.unsqueeze(-2), vectors).squeeze(-2)
@@ -98,14 +98,14 @@ def minimise(
     """Descend from every start to a local minimum of its function.
 
     Args:
-        function: called with points (k, n) and the indices (k,) of the descents still under way; gives the functions,
-            their gradients and Hessians there.
-        start: (K, n).
-        radius: length (K,) of the first steps at most.
-        tol: gain of Newton's step, as the second-order model foresees it, below which a descent ends with that step,
-            relative to a value of 1 or the function's own if larger; default 64 times the rounding error of the dtype.
-        max_iter: steps tried at most.
-        retract: takes points to equivalent ones, where a function is constant along some curves.
+        function: called with points (k, n) and the indices (k,) of the running descents; returns the values, gradients
+            and Hessians there.
+        start: start points, (K, n).
+        radius: maximum length of the first steps, (K,).
+        tol: predicted gain of Newton's step below which a descent ends with that step, relative to the absolute value
+            of the function or 1 if larger; default 64 times the rounding error of the dtype.
+        max_iter: maximum number of steps tried.
+        retract: maps points to equivalent points, where a function is constant along some curves.
 
     Raises:
         ValueError: a function, its gradient or its Hessian is not finite at a start.
@@ -130,11 +130,11 @@ def minimise(
         scale = at.value.abs().clamp(min=1.0)
         last = newton.convex & (newton.whole_gain <= tol * scale)
         size = torch.linalg.vector_norm(point, dim=-1)
-        # a region that has shrunk to rounding error holds no lower point
+        # a trust region of the size of rounding errors contains no lower point
         stuck = newton.length <= eps * size
         done = last | stuck
         if bool(done.any()):
-            # what gains nothing is worth a step only if that is short, not along a flat direction
+            # the last step is taken only if it is short, not along a flat direction
             short = last & (newton.length <= 1e-3 * size)
             ends = torch.where(short.unsqueeze(-1), retract(point + newton.step), point)
             near = newton.convex & (newton.whole_gain <= max(tol, 1e4 * eps) * scale)
@@ -145,11 +145,11 @@ def minimise(
                 iteration,
                 near[done],
             )
-            left = (~done).nonzero().squeeze(-1)
-            if left.numel() == 0:
+            running = (~done).nonzero().squeeze(-1)
+            if running.numel() == 0:
                 return Minima(found, value, n_iter, converged)
-            active, point, radius, at = active[left], point[left], radius[left], at.select(left)
-            newton = _Step(*(getattr(newton, f)[left] for f in ("step", "length", "gain", "whole_gain", "convex")))
+            active, point, radius, at = active[running], point[running], radius[running], at.select(running)
+            newton = _Step(*(getattr(newton, f)[running] for f in ("step", "length", "gain", "whole_gain", "convex")))
         trial = retract(point + newton.step)
         there = function(trial, active)
         ratio = (at.value - there.value) / newton.gain

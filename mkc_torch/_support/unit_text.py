@@ -1,4 +1,4 @@
-"""Units as texts: tidied, and divided by one another."""
+"""Units as text: normal forms, quotients and conversion factors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _FACTOR = re.compile(r"(?P<name>[^\d⁻⁰¹²³⁴⁵⁶⁷⁸⁹^]+)\^?(?P<pow
 _PREFIXES = {"": 1.0, "n": 1e-9, "µ": 1e-6, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3}
 _BASE = {f"{prefix}{name}": (size, name) for name in "TAVmsK" for prefix, size in _PREFIXES.items()}
 _BASE |= {"°C": (1.0, "K"), "G": (1e-4, "T"), "mG": (1e-7, "T"), "gauss": (1e-4, "T"), "°": (1.0, "°")}
-"""Units with their sizes in base units."""
+"""Units with their factors to base units, and these base units."""
 
 _PLAIN = -3, 6
-"""Powers of ten between which a number is written out."""
+"""Powers of ten between which a number has no exponent."""
 
 
 def sized(value: float, unit: str = "") -> str:
-    """A number to four digits with its unit, as it stands in an equation.
+    """A number to four digits with its unit, for an equation.
 
     Example:
         >>> sized(-0.12345, "m"), sized(2.5e-7), sized(3.0)
@@ -31,44 +31,44 @@ def sized(value: float, unit: str = "") -> str:
     """
     power = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
     if _PLAIN[0] <= power < _PLAIN[1]:
-        told = f"{value:.4g}"
+        number = f"{value:.4g}"
     else:
-        told = f"{value / 10.0**power:.4g} × 10{str(power).replace('-', '⁻').translate(_POWERS)}"
-    return f"{told} {unit}".rstrip().replace("-", "−", 1) if value < 0 else f"{told} {unit}".rstrip()
+        number = f"{value / 10.0**power:.4g} × 10{str(power).replace('-', '⁻').translate(_POWERS)}"
+    return f"{number} {unit}".rstrip().replace("-", "−", 1) if value < 0 else f"{number} {unit}".rstrip()
 
 
 def duration(seconds: float) -> str:
-    """A time to two digits, in the unit that a person reads it in: s, min, h or d.
+    """A time to two digits in s, min, h or d, whichever suits its size.
 
     Example:
         >>> duration(0.0312), duration(95.0), duration(420.0), duration(7560.0), duration(260000.0)
         ('0.031 s', '95 s', '7 min', '2.1 h', '3 d')
     """
-    for most, size, unit in _TIMES:
-        if abs(seconds) < most:
+    for limit, size, unit in _TIMES:
+        if abs(seconds) < limit:
             return sized(float(f"{seconds / size:.2g}"), unit)
     return sized(float(f"{seconds / _DAY:.2g}"), "d")
 
 
 _DAY = 86400.0
 _TIMES = (120.0, 1.0, "s"), (7200.0, 60.0, "min"), (2.0 * _DAY, 3600.0, "h")
-"""Below how many seconds a time is told in a unit, the unit's seconds, and the unit."""
+"""Upper limit in s of the times in a unit, the length of the unit in s, and the unit."""
 
 
 def share_of(value: float) -> str:
-    """A share in percent, or as so many times where it is more.
+    """A share in percent, or from 2 on as a multiple.
 
     Example:
         >>> share_of(0.382), share_of(3.14)
         ('38 %', '3.1 times the size')
     """
     percent = value < 2.0
-    told = sized(float(f"{100.0 * value if percent else value:.2g}"))
-    return f"{told} %" if percent else f"{told} times the size"
+    number = sized(float(f"{100.0 * value if percent else value:.2g}"))
+    return f"{number} %" if percent else f"{number} times the size"
 
 
 def tidy(unit: str) -> str:
-    """A unit with each factor once; as it is, where it is no product of powers.
+    """A unit with each factor once; unchanged if it is not a product of powers.
 
     Example:
         >>> tidy("rad/s/s"), tidy("m/(s·kg)"), tidy("1/s"), tidy("°C"), tidy("")
@@ -79,7 +79,7 @@ def tidy(unit: str) -> str:
 
 
 def quotient(unit: str, other: str, power: int = 1) -> str:
-    """The unit of one for each power of the other; empty where one is not known.
+    """The unit ``unit / other**power``; empty if a unit is empty or not a product of powers.
 
     Example:
         >>> quotient("rad/s²", "rad/s", 2), quotient("rad/s²", "rad/s"), quotient("m/s²", "m/s", 2)
@@ -92,9 +92,9 @@ def quotient(unit: str, other: str, power: int = 1) -> str:
 
 
 def ratio(unit: str, other: str) -> float | None:
-    """How many of the other one of a unit is; None where that is not known.
+    """The factor from a unit to the other unit; None if not known.
 
-    A degree is a kelvin: sizes are of differences.
+    It is for differences: 1 °C is 1 K.
 
     Example:
         >>> ratio("µT/A", "nT/mA"), ratio("µT/K", "µT/°C"), ratio("µT", "V"), ratio("furlong", "furlong")
@@ -102,15 +102,15 @@ def ratio(unit: str, other: str) -> float | None:
     """
     if tidy(unit) == tidy(other):
         return 1.0
-    sizes = [_in_base_units(one) for one in (unit, other)]
+    sizes = [_in_base_units(text) for text in (unit, other)]
     if sizes[0] is None or sizes[1] is None or sizes[0][1] != sizes[1][1]:
         return None
-    # of two powers of ten, whose quotient is one too
+    # the quotient of two powers of ten is rounded to a power of ten
     return float(f"{sizes[0][0] / sizes[1][0]:.12g}")
 
 
 def _in_base_units(unit: str) -> tuple[float, dict[str, int]] | None:
-    """The size of a unit in base units, and their powers; None where one is not known."""
+    """The factor of a unit to base units, and the powers of these; None if a factor of the unit is not known."""
     factors = _factors(unit)
     if factors is None:
         return None
@@ -126,7 +126,7 @@ def _in_base_units(unit: str) -> tuple[float, dict[str, int]] | None:
 
 
 def _factors(unit: str) -> dict[str, int] | None:
-    """Name to power; None where the text is no product of powers."""
+    """The factors of a unit: name to power; None if it is not a product of powers."""
     factors: dict[str, int] = {}
     for place, part in enumerate(re.split(r"/", unit.strip())):
         for piece in re.split(r"[·*]", part.strip().removeprefix("(").removesuffix(")")):

@@ -1,4 +1,4 @@
-"""Texts from files and numbers within them, as a reader sees them in print."""
+"""Typeset texts from files, and numbers in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MINUS = re.compile(r"(?<![\w.)\]-])-(?=\d)")
 
 
 def plain(text: str) -> str:
-    """A text from a file on one line, without characters that steer a terminal.
+    """Return a text from a file without line breaks and control characters.
 
     Example:
         >>> plain("coil \\x1b[31m\\n temperature")
@@ -25,18 +25,18 @@ def plain(text: str) -> str:
 
 
 def several(names: Sequence[str], most: int = 6) -> str:
-    """Names one after the other; of many, the first ones.
+    """Join names; of many, only the first ``most``.
 
     Example:
         >>> several(["x", "y"]), several("abcdefgh", 3)
         ('x, y', 'a, b, c and 5 more')
     """
-    told = ", ".join(plain(name) for name in names[:most])
-    return term("number.and_more", first=told, count=len(names) - most) if len(names) > most else told
+    text = ", ".join(plain(name) for name in names[:most])
+    return term("number.and_more", first=text, count=len(names) - most) if len(names) > most else text
 
 
 def superscript(power: int) -> str:
-    """A power.
+    """Format an exponent.
 
     Example:
         >>> superscript(-6)
@@ -46,7 +46,7 @@ def superscript(power: int) -> str:
 
 
 def typeset(text: str) -> str:
-    """A sentence on one line, its numbers with a true minus sign and powers of ten.
+    """Return a sentence without line breaks, with true minus signs and powers of ten.
 
     Example:
         >>> typeset("by -6.1° at (-0.2, +0.9); 8.82e-06 1/µT², log-2 of 2021-03-04")
@@ -57,5 +57,5 @@ def typeset(text: str) -> str:
 
 
 def capital(text: str) -> str:
-    """With a capital letter at its beginning."""
+    """Capitalise the first letter."""
     return text[:1].upper() + text[1:]

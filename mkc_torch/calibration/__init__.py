@@ -1,4 +1,4 @@
-"""Calibration of a magnetometer: the ellipsoid of its readings, what the motion determines, and calibration.json."""
+"""Calibration of magnetometers by an ellipsoid fit or by aiding sensors, and its file calibration.json."""
 
 from mkc_torch.calibration.aided.place import earth_field
 from mkc_torch.calibration.calibrate import calibrate

@@ -1,4 +1,4 @@
-"""What helped to calibrate a sensor that hardly tilts, and what it did and did not determine."""
+"""The result of an aided calibration: the aid, and what it did and did not determine."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ __all__ = ["AidedResult", "aid_from_json", "aid_to_json"]
 
 @dataclass(frozen=True)
 class AidedResult:
-    """How a calibration came about that the ellipsoid alone does not determine.
+    """Details of a calibration that the ellipsoid alone does not determine.
 
     Attributes:
-        by: "gyroscope", "attitude" or "place".
-        response: what of the sensor is free: "offset", "offset and scale" or "full matrix".
-        evidence: of each response, in nats, less that of the one taken: the likeliest, but by place and date the full
-            matrix unless another one is clearly likelier.
-        undetermined: offsets and entries of the matrix, as "offset_z" or "matrix_zz", that the recording says little or
-            nothing of; they are what was likely beforehand, no offset and the unit matrix, and have no standard error.
-        heading_error: standard error in ° of how the heading changes as the vehicle turns as it did.
-        constant_error: of a constant of the heading, in °, which only tilting shows; infinite by place and date, for no
-            length tells how a sensor is turned.
-        gyro_bias, gyro_bias_se: of the gyroscope in rad/s; None without one.
+        by: the aid: "gyroscope", "attitude" or "place".
+        response: the free parameters of the sensor: "offset", "offset and scale" or "full matrix".
+        evidence: log evidence of each response in nats, minus that of the selected response. The most likely response
+            is selected; by place and date the full matrix, unless a simpler response is clearly more likely.
+        undetermined: offsets and entries of the matrix, as "offset_z" or "matrix_zz", that the recording hardly
+            determines. They keep their prior values, zero offset and the unit matrix, and have no standard error.
+        heading_error: standard error in ° of heading changes over a level turn.
+        constant_error: standard error in ° of the constant heading offset, which only tilting determines; infinite by
+            place and date, because a length does not determine a rotation.
+        gyro_bias, gyro_bias_se: bias of the gyroscope and its standard error in rad/s; None without a gyroscope.
     """
 
     by: str
@@ -40,7 +40,7 @@ class AidedResult:
 
 
 def aid_to_json(aid: AidedResult) -> Mapping[str, Any]:
-    """The part "aided" of calibration.json."""
+    """Encode the part "aided" of calibration.json."""
     content: dict[str, Any] = {
         "by": aid.by,
         "response": aid.response,
@@ -62,7 +62,7 @@ def aid_to_json(aid: AidedResult) -> Mapping[str, Any]:
 
 
 def aid_from_json(c: CheckedValues) -> AidedResult | None:
-    """What stands under "aided"; None where nothing does, as in files of an ellipsoid."""
+    """Decode the part "aided"; None if the file has none, as for a plain ellipsoid fit."""
     if not c.has("aided"):
         return None
     biased = c.has("aided", "gyro_bias")

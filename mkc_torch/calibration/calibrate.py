@@ -1,4 +1,4 @@
-"""The calibration of a magnetometer: one recording in, offset, matrix, their errors and what was noticed out."""
+"""Calibrate a magnetometer from a recording: offset, matrix, standard errors and warnings."""
 
 from __future__ import annotations
 
@@ -36,33 +36,37 @@ from mkc_torch.recording.unit_warnings import RECORDED, converted_from, field_wa
 __all__ = ["Calibration", "Matrix", "ResidualSpread", "Vector", "calibrate", "prepared"]
 
 REJECTED_BELOW = 0.5
-"""A sample of less than this weight counts as rejected."""
+"""Samples with a smaller weight count as rejected."""
 
 MAX_REJECTED = 0.2
-"""Above this share of rejected samples one ellipsoid is a doubtful model, and a warning says so."""
+"""Share of rejected samples above which a warning questions the model of a single ellipsoid."""
 
 MUCH_SCATTER = 0.1
-"""Scatter of the calibrated field's length, as a share of the radius, above which a warning says so."""
+"""Scatter of the calibrated field's length, as a share of the radius, above which there is a warning."""
 
 UNUSUAL_RATIO = 1.5
-"""Longest over shortest semi-axis above which a warning says so."""
+"""Ratio of the longest to the shortest semi-axis above which there is a warning."""
 
 ENOUGH_INFORMATION = 0.1
-"""Information, as a share of even coverage, at which directions that are missing do no harm."""
+"""Information, as a share of even coverage, from which missing directions do no harm."""
 
 _LEAST = 1e-60
+"""Smallest magnitude of a field, in any unit; its reciprocal is the largest."""
+
 FEW_SAMPLES = 50
+"""Number of samples below which there is a warning."""
+
 _AXES = ("mag_x", "mag_y", "mag_z")
 
 
 def prepared(recording: Recording) -> Recording:
-    """The samples a calibration uses: those with a finite and possible field, in the order of time if there is a time.
+    """The samples that a calibration uses: finite and possible fields, sorted by time if there is a time.
 
-    Samples of a frozen sensor and clipped ones are left out too.
+    Clipped samples and samples of a frozen sensor are left out too.
 
     Raises:
         MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
-        RecordingError: fewer than nine samples are left, or values whose squares no number holds.
+        RecordingError: fewer than nine samples remain, or values whose squares overflow or underflow.
 
     Example:
         >>> angle = torch.linspace(0.0, 6.0, 30)
@@ -80,17 +84,17 @@ def prepared(recording: Recording) -> Recording:
     if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
         where = f"{recording.name}: " if recording.name else ""
         raise RecordingError(
-            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, which is no magnetic field in any unit; "
+            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, which is not a magnetic field in any unit; "
             "check these columns."
         )
     return usable
 
 
 def _refuse_few(usable: Recording) -> None:
-    """Refuse samples that are too few for an ellipsoid.
+    """Check that there are enough samples for an ellipsoid.
 
     Raises:
-        RecordingError: with what was dropped.
+        RecordingError: too few samples; the message lists what was dropped.
     """
     if len(usable) >= MIN_POINTS:
         return
@@ -98,7 +102,7 @@ def _refuse_few(usable: Recording) -> None:
     found = "1 sample is" if len(usable) == 1 else f"{len(usable)} samples are"
     reasons = " ".join(usable.warnings)
     raise RecordingError(
-        f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
+        f"{where}{found} too few; an ellipsoid needs at least {MIN_POINTS}. Record while turning the sensor "
         f"through all directions.{' ' + reasons if reasons else ''}"
     )
 
@@ -114,30 +118,30 @@ def calibrate(
 ) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
-    Samples that are not finite, that no field explains, of a frozen sensor, or at the end of its range are left out and
-    the rest is sorted by time, which the warnings tell. Without a time, rows count as in the order of time. Standard
-    errors allow for autocorrelation, but not from one ``experiment`` to the next. Where the radius does not fit the
-    unit, it is called "recorded units", and a warning says why.
+    Samples that are not finite, impossible, frozen, or clipped are left out, and the others are sorted by time;
+    ``warnings`` lists this. Without a time, rows are taken to be in the order of time. Standard errors allow for
+    autocorrelation within a run (``experiment``), not between runs. If the radius does not fit the unit, the unit is
+    "recorded units", and a warning states why.
 
-    Where the turns do not determine an ellipsoid, as those of a vehicle that hardly tilts, an attitude ``q_*`` or a
-    gyroscope ``gyro_*`` stands in for them; ``aid`` says what it determined, and what not.
+    If the turns do not determine an ellipsoid, as for a vehicle that hardly tilts, an attitude ``q_*`` or a gyroscope
+    ``gyro_*`` supplies the missing information; ``aid`` lists what it determined and what remains undetermined.
 
     Args:
-        recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
+        recording: recording with columns ``mag_x``, ``mag_y``, ``mag_z`` in the same unit, and optionally ``time`` in s.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
-        name: what the sensor is called; default the recording's name.
-        seed: of the robust start.
-        earth: the field at the place of the recording, as :func:`mkc_torch.calibration.earth_field` has it: its length
-            is that of the corrected field, unless ``field_strength`` is given, and helps where the turns do not
-            determine an ellipsoid; its inclination chooses where that fit starts.
-        sensor: "mag", or "accel" for an accelerometer ``accel_*``, in whose place the field is gravity and
-            ``field_strength`` its length in m/s², 9.80665 if not given.
+        name: name of the sensor; default the recording's name.
+        seed: seed of the robust start.
+        earth: the field at the place of the recording, from :func:`mkc_torch.calibration.earth_field`. Its length is
+            the default of ``field_strength``. If the turns do not determine an ellipsoid, its length adds information
+            and its inclination selects the starting point of the aided fit.
+        sensor: "mag", or "accel" for an accelerometer ``accel_*``; its field is gravity, and ``field_strength`` is in
+            m/s², 9.80665 by default.
 
     Raises:
-        MissingColumnError: a column of the magnetometer is not there.
+        MissingColumnError: a column of the magnetometer is missing.
         RecordingError: fewer than nine usable samples.
-        NotIdentifiableError: the samples do not determine an ellipsoid, and nothing stands in for what is missing.
-        TypeError, ValueError: a field strength that is no number, or not positive.
+        NotIdentifiableError: the samples do not determine an ellipsoid, and no aiding data makes up for it.
+        TypeError, ValueError: ``field_strength`` is not a number or not positive, or ``sensor`` is unknown.
 
     Example:
         >>> from mkc_torch.calibration.coverage import fibonacci_sphere
@@ -162,7 +166,7 @@ def calibrate(
 def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
     if earth is not None and field_strength is None:
         field_strength = earth.strength
-    recording.stack(*_AXES)  # refused before a column is added
+    recording.stack(*_AXES)  # check before a column is added
     usable = prepared(numbered(recording))
     try:
         fit = recorded_ellipsoid(usable, seed)
@@ -181,7 +185,7 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
     matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
     density = _density(fit)
     length = torch.linalg.vector_norm(fit.calibrate(points), dim=-1)
-    # of all samples, those that were left out while the sensor rested among them
+    # counts all samples, including those thinned out while the sensor rested
     rejected = mkc_weight((length / radius).square() - 1.0, density[0], density[1]) < REJECTED_BELOW
     found = fit.coverage_
     assert isinstance(found, Coverage)
@@ -223,7 +227,7 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
 
 
 def _tails(usable: Recording, residual: Tensor) -> ChannelTails | None:
-    """The tails of the residual of the samples that the ellipsoid was fitted to; None of an exact fit."""
+    """The tails of the residual of the fitted samples; None for an exact fit."""
     taken = in_each_run(usable.magnetometer(), run_slices(usable), thin_at_rest)
     assert taken is not None
     return next(iter(time_series_tails(residual[taken].unsqueeze(-1))), None)
@@ -232,7 +236,7 @@ def _tails(usable: Recording, residual: Tensor) -> ChannelTails | None:
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
     """σ, d and bound of the algebraic residual about the centre.
 
-    The estimator's residual is about another origin, which only multiplies it.
+    The estimator's residual is about another origin, which only scales it.
     """
     estimator = fit.estimator_
     assert isinstance(estimator, MKCRegression)
@@ -242,10 +246,10 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
 
 
 def _with_faults(error: NotIdentifiableError, usable: Recording) -> NotIdentifiableError:
-    """The refusal, and which faults of the sensor took samples away that might have been enough."""
+    """Add the warnings about frozen and clipped samples, which may have removed the needed samples, to an error."""
     faults = [sentence for sentence in usable.warnings if FROZEN in sentence or CLIPPED in sentence]
     if any(CLIPPED in sentence for sentence in faults):
-        faults.append("Set the sensor to a wider range, or take away what magnetises it, and record again.")
+        faults.append("Set the sensor to a wider range, or remove what magnetises it, and record again.")
     return NotIdentifiableError(" ".join([str(error), *faults]), error.coverage, error.directions)
 
 
@@ -253,48 +257,48 @@ def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_sha
     warnings = []
     if rejected_share > MAX_REJECTED:
         warnings.append(
-            f"{100.0 * rejected_share:.0f} % of the samples do not fit one ellipsoid: the sensor's offset may have "
-            "changed during the recording, or something magnetic was near for long. `mkc diagnose` says what changed, "
-            "and when; or record again away from it, or calibrate the parts of the recording separately."
+            f"{100.0 * rejected_share:.0f} % of the samples do not fit the ellipsoid: the sensor's offset may have "
+            "changed during the recording, or a magnetic object was near for long. `mkc diagnose` reports what changed "
+            "and when; or record again away from the object, or calibrate the parts of the recording separately."
         )
     scatter = float(robust_scale(residual.unsqueeze(-1))) / float(fit.radius_)
     if scatter > MUCH_SCATTER:
         warnings.append(
-            f"The length of the calibrated field scatters by {100.0 * scatter:.0f} % of the radius; that of a sensor "
-            "which is calibrated in a steady field scatters by one to three. Offset and semi-axes may be off by more "
-            "than their standard errors say; `mkc diagnose` says what disturbs it."
+            f"The length of the calibrated field scatters by {100.0 * scatter:.0f} % of the radius; in a steady field "
+            "1 to 3 % is usual. Offset and semi-axes may be wrong by more than their standard errors; `mkc diagnose` "
+            "reports what disturbs the field."
         )
     ratio = float(fit.semi_axes_[2] / fit.semi_axes_[0])
     if ratio > UNUSUAL_RATIO:
         warnings.append(
-            f"The longest semi-axis is {ratio:.2g} times the shortest. The gains of one chip differ by some per cent, "
-            "and iron nearby seldom adds more than some ten: check that all three columns are in one unit, that none "
-            "is cut off at the end of its range, and the directions covered."
+            f"The longest semi-axis is {ratio:.2g} times the shortest. The gains of a chip differ by a few per cent, "
+            "and iron nearby seldom adds more than about 10 %: check that all three columns are in the same unit, that "
+            "no column is clipped, and which directions are covered."
         )
     if len(residual) < FEW_SAMPLES:
         warnings.append(
             f"{len(residual)} samples are few for nine unknowns: the true errors can be far larger than the "
-            f"standard errors say. Record {FEW_SAMPLES} at least."
+            f"standard errors. Record at least {FEW_SAMPLES}."
         )
     if found.gaps:
         warnings.append(_gaps(fit, found))
     if not bool(torch.as_tensor(getattr(fit.estimator_, "converged_", True)).all()):
-        warnings.append("The fit stopped before it came to rest; its last digits are uncertain.")
+        warnings.append("The fit did not converge; its last digits are uncertain.")
     return warnings
 
 
 def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
-    """Which directions are missing, and what that means for the result."""
+    """The warning about missing directions and their consequence for the result."""
     missing = "; ".join(str(gap) for gap in found.gaps)
     worst = 100.0 * float((torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_).max())
-    known = f"to {worst:.1g} % of the radius" if worst < math.inf else "but how well is not known"
+    known = f"to {worst:.1g} % of the radius" if worst < math.inf else "with unknown accuracy"
     if found.information >= ENOUGH_INFORMATION:
-        means = f"The others determine offset and semi-axes {known}, so the calibration holds all the same"
+        means = f"The others determine offset and semi-axes {known}, so the calibration is still valid"
     else:
         means = (
-            f"The others determine offset and semi-axes {known}, if nothing changed meanwhile: what is known worst is "
-            f"known {found.information**-0.5:.1g} times less well than from all directions, and a disturbance counts "
-            "as much more"
+            f"The others determine offset and semi-axes {known}, if nothing changed meanwhile: the worst-determined "
+            f"combination is {found.information**-0.5:.1g} times less accurate than from all directions, and "
+            "disturbances have that much more influence"
         )
     return (
         f"Directions not covered: {missing}. {means}. To be sure, turn the sensor so that the field points there too."

@@ -1,4 +1,4 @@
-"""Samples at the end of a sensor's range, where one value stands for all beyond it."""
+"""Find and drop clipped samples: values at the end of a sensor's range."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ __all__ = ["CLIPPED", "clipped_entries", "distinct_rows", "without_clipped"]
 CLIPPED = "clipped samples"
 
 _LEAST = 20
-"""Different samples at an end from which it is looked at. Ten real recordings of six sensors have five at most."""
+"""Fewest distinct samples at the end of a range that count as clipped. Ten real recordings of six sensors have at most
+five."""
 
 _TIMES = 5.0
-"""Times as many as any of the next values has, from which an end is a limit: at the top of a smooth swing, which is
-the worst case of a sensor with coarse digits, the last value has 2.4 times as many as the one before."""
+"""Smallest ratio of samples at an end to samples at any of the next values if the end is a limit. At the top of a
+smooth swing, the worst case of a sensor with coarse digits, the ratio is 2.4."""
 
 _NEXT = 3
+"""Number of neighbouring values that an end is compared with."""
 
 
 def without_clipped(recording: Recording, *names: str) -> Recording:
-    """The samples but for those at the end of a column's range, where it is cut off; ``warnings`` names value and axis.
+    """Drop samples at the end of a column's range, where it is cut off; ``warnings`` names value and axis.
 
-    An end is a limit where far more different samples have exactly its value than have those next to it. Equal
-    samples, as of a sensor at rest, count once.
+    An end is a limit if far more distinct samples have exactly its value than the neighbouring values. Equal samples,
+    as of a sensor at rest, count once.
 
     Args:
-        recording: finite in these columns.
-        names: the columns of one sensor.
+        recording: recording that is finite in these columns.
+        names: the columns of a sensor.
 
     Example:
         >>> angle = torch.linspace(0.0, 20.0, 1000).double()
@@ -47,23 +49,23 @@ def without_clipped(recording: Recording, *names: str) -> Recording:
     clipped = clipped_entries(values)
     if not bool(clipped.any()):
         return recording
-    told = []
+    values_cut_off = []
     for k, name in enumerate(names):
         for end in values[clipped[:, k], k].unique().tolist():
             count = int((values[:, k] == end).sum())
-            told.append(f"`{name}` is cut off at {end:.6g} ({counted(count, 'sample')})")
+            values_cut_off.append(f"`{name}` is cut off at {end:.6g} ({counted(count, 'sample')})")
     left_out = clipped.any(-1)
     return recording.rows(
-        ~left_out, f"Left out {int(left_out.sum())} of {len(recording)} {CLIPPED}: {'; '.join(told)}."
+        ~left_out, f"Left out {int(left_out.sum())} of {len(recording)} {CLIPPED}: {'; '.join(values_cut_off)}."
     )
 
 
 def clipped_entries(values: Float[Tensor, "N k"]) -> Bool[Tensor, "N k"]:
-    """Which values stand at an end at which their column is cut off."""
+    """Mask of the values at an end at which their column is cut off, (N, k)."""
     clipped = torch.zeros_like(values, dtype=torch.bool)
     at_an_end = torch.maximum((values == values.amin(0)).sum(0), (values == values.amax(0)).sum(0))
     if int(at_an_end.max()) < _LEAST:
-        return clipped  # before repeats are found, which takes a hundred times as long
+        return clipped  # skips the search for repeats, which takes a hundred times as long
     different = distinct_rows(values)
     for k, column in enumerate(different.unbind(-1)):
         for sign in (1.0, -1.0):
@@ -74,7 +76,7 @@ def clipped_entries(values: Float[Tensor, "N k"]) -> Bool[Tensor, "N k"]:
 
 
 def distinct_rows(values: Float[Tensor, "N k"]) -> Float[Tensor, "M k"]:
-    """The different rows in lexicographic order, as ``values.unique(dim=0)`` has them, in a tenth of its time.
+    """The distinct rows in lexicographic order, as of ``values.unique(dim=0)`` but ten times faster.
 
     Example:
         >>> distinct_rows(torch.tensor([[2.0, 1.0], [1.0, 3.0], [2.0, 1.0]]))

@@ -1,4 +1,4 @@
-"""Which directions a set of vectors covers, and whether they determine an ellipsoid."""
+"""Coverage of the sphere by directions, and the information it gives about an ellipsoid."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 NEAR_DEGREES = 15.0
-"""A direction counts as covered when a sample lies within this angle of it."""
+"""Largest angle in ° between a covered direction and the nearest sample."""
 
 GAP_DEGREES = 40.0
-"""An empty cap of this radius is named; a full sphere of 30 samples leaves smaller ones."""
+"""Smallest radius in ° of an empty cap that is reported; a sphere of 30 even samples has smaller caps."""
 
 _GRID = 2000
+"""Number of directions on the sphere at which coverage is evaluated."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """An empty cap of directions: its middle, a unit vector in the sensor's axes, and its radius in degrees."""
+    """An empty cap of directions: its centre, a unit vector in the sensor's axes, and its radius in degrees."""
 
     direction: tuple[float, float, float]
     degrees: float
@@ -41,8 +42,8 @@ class Coverage:
     Attributes:
         fraction: share of all directions with a sample within 15°.
         gaps: empty caps of more than 40°, largest first.
-        information: what the worst-determined combination of centre and shape is known by, as a share of what an even
-            coverage of the sphere with as many samples would give; 1 is even coverage, 0 undetermined.
+        information: information about the worst-determined combination of centre and shape, as a share of that of an
+            even coverage with as many samples; 1 for even coverage, 0 if it is undetermined.
     """
 
     fraction: float
@@ -51,7 +52,7 @@ class Coverage:
 
 
 def nearest_axis(direction: tuple[float, float, float]) -> str:
-    """Name of the axes that a direction points along, such as "+z" or "-x+y".
+    """Name of the axes along which a direction points, such as "+z" or "-x+y".
 
     Example:
         >>> nearest_axis((0.1, -0.2, 0.97)), nearest_axis((-0.7, 0.7, 0.1))
@@ -72,7 +73,7 @@ def fibonacci_sphere(count: int, *, dtype: torch.dtype = torch.float64) -> Float
 
 
 def tangents(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
-    """First-order change of the norm with the centre and the shape: the functions u_i and u_i u_j on the sphere."""
+    """Derivatives of the norm by centre and shape: the functions u_i and u_i u_j on the sphere."""
     x, y, z = directions.unbind(-1)
     root2 = math.sqrt(2.0)
     return torch.stack([x, y, z, x * x, y * y, z * z, root2 * x * y, root2 * x * z, root2 * y * z], -1)
@@ -86,10 +87,13 @@ def _even_information() -> Float[Tensor, "9 9"]:
 
 
 def least_information(moment: Float[Tensor, "9 9"]) -> tuple[float, Float[Tensor, " 9"]]:
-    """Of the worst-determined combination of centre and shape, as a share of even coverage, and that combination.
+    """Information about the worst-determined combination of centre and shape, and that combination.
 
     Args:
         moment: mean product of the :func:`tangents`.
+
+    Returns:
+        The information as a share of even coverage, and the combination (9,).
     """
     even = _even_information()
     half = torch.linalg.solve_triangular(even, moment.detach().double().cpu(), upper=False)
@@ -99,10 +103,10 @@ def least_information(moment: Float[Tensor, "9 9"]) -> tuple[float, Float[Tensor
 
 
 def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
-    """Coverage of the sphere by vectors; their lengths do not matter.
+    """Coverage of the sphere by the directions of vectors; their lengths do not matter.
 
     Args:
-        directions: vectors from the centre, in the sensor's axes; none of length 0.
+        directions: vectors from the centre, in the sensor's axes, of nonzero length.
 
     Example:
         >>> round(coverage(fibonacci_sphere(500)).fraction, 2)
@@ -114,24 +118,24 @@ def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
     if directions.shape[0] == 0:
         raise ValueError("Expected at least one direction but got none.")
     vectors = directions.detach().double().cpu()
-    # scaled first, so that the squares of tiny or huge components stay in range
+    # scale first, so that the squares of tiny or huge components stay in range
     vectors = vectors / vectors.abs().amax(-1, keepdim=True)
     unit = vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
     grid = fibonacci_sphere(_GRID)
     nearest = torch.full((_GRID,), -1.0, dtype=torch.float64)
-    for part in unit.split(256):  # the products of a part stay in the cache
+    for part in unit.split(256):  # parts whose products fit into the cache
         nearest = torch.maximum(nearest, (grid @ part.mT).amax(-1))
     angle = torch.rad2deg(torch.acos(nearest.clamp(-1.0, 1.0)))
     rows = tangents(unit)
     information, _ = least_information(rows.mT @ rows / rows.shape[0])
     gaps: list[Gap] = []
-    left = angle.clone()
-    while float(left.max()) > GAP_DEGREES:
-        worst = int(left.argmax())
+    uncovered = angle.clone()
+    while float(uncovered.max()) > GAP_DEGREES:
+        worst = int(uncovered.argmax())
         x, y, z = grid[worst].tolist()
-        gaps.append(Gap((x, y, z), float(left[worst])))
+        gaps.append(Gap((x, y, z), float(uncovered[worst])))
         apart = torch.rad2deg(torch.acos((grid @ grid[worst]).clamp(-1.0, 1.0)))
-        left[apart < max(60.0, float(left[worst]))] = 0.0
+        uncovered[apart < max(60.0, float(uncovered[worst]))] = 0.0
     return Coverage(
         fraction=float((angle < NEAR_DEGREES).double().mean()),
         gaps=tuple(gaps),

@@ -1,4 +1,4 @@
-"""A calibration beside an older one: what differs, by how many standard errors, and what that does to the field."""
+"""Compare a calibration with an older one: differences in standard errors, and their effect on the field."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 __all__ = ["LEVEL", "Difference", "Differences", "differences"]
 
 LEVEL = 0.01
-"""Probability at most with which two calibrations of an unchanged sensor are said to differ: shared out among the ten
-numbers (Bonferroni), which holds however they are correlated."""
+"""Significance level of the comparison of two calibrations, with Bonferroni's correction for the ten numbers, which is
+valid for any correlation."""
 
 _AXES = "xyz"
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 class Difference(NamedTuple):
-    """One of the ten numbers in both calibrations.
+    """A number of both calibrations.
 
     Attributes:
-        name: such as "offset x".
-        unit: of new, old and error.
+        name: its name, such as "offset x".
+        unit: unit of ``new``, ``old`` and ``error``.
         new, old: its values.
-        error: combined standard error, the root of the sum of both squares; NaN where one is not known.
+        error: combined standard error, the root of the sum of both squares; NaN if either is unknown.
     """
 
     name: str
@@ -42,24 +42,24 @@ class Difference(NamedTuple):
 
     @property
     def in_errors(self) -> float:
-        """New less old in combined standard errors; NaN where these are not known."""
+        """New minus old in combined standard errors; NaN if these are unknown."""
         if self.new == self.old:
             return 0.0
         return (self.new - self.old) / self.error if self.error != 0.0 else math.copysign(math.inf, self.new - self.old)
 
 
 class Differences(NamedTuple):
-    """A calibration less another.
+    """The differences between two calibrations.
 
     Attributes:
-        name: of the other one.
-        numbers: the offset, the six entries of the matrix, and the radius: a field or a gain of all axes that changed
-            shows there alone, where each calibration has its own field's length.
-        limit: of what is still within errors, in combined standard errors.
-        samples: measurements that the corrected fields are compared at.
-        angle_max, angle_rms: between the two corrected fields, in degrees.
+        name: name of the old calibration.
+        numbers: the offset, the six entries of the matrix, and the radius. If each calibration uses its own radius as
+            field strength, a changed field or common gain shows only in the radius.
+        limit: largest insignificant difference, in combined standard errors.
+        samples: number of measurements at which the corrected fields are compared.
+        angle_max, angle_rms: angle between the two corrected fields, in degrees.
         length_max, length_rms: difference of their lengths, in ``unit``.
-        unit: of the corrected field.
+        unit: unit of the corrected field.
     """
 
     name: str
@@ -74,26 +74,26 @@ class Differences(NamedTuple):
 
     @property
     def known(self) -> tuple[Difference, ...]:
-        """Those whose errors are known."""
-        return tuple(one for one in self.numbers if not math.isnan(one.in_errors))
+        """The differences whose errors are known."""
+        return tuple(number for number in self.numbers if not math.isnan(number.in_errors))
 
     @property
     def beyond(self) -> tuple[Difference, ...]:
-        """Those beyond the limit, the largest first."""
-        found = [one for one in self.known if abs(one.in_errors) > self.limit]
-        return tuple(sorted(found, key=lambda one: -abs(one.in_errors)))
+        """The differences beyond the limit, the largest first."""
+        found = [number for number in self.known if abs(number.in_errors) > self.limit]
+        return tuple(sorted(found, key=lambda number: -abs(number.in_errors)))
 
 
 def differences(new: Calibration, old: Calibration, points: Float[Tensor, "N 3"]) -> Differences:
-    """Two calibrations of a sensor side by side.
+    """Compare two calibrations of a sensor.
 
     Args:
-        new: whose units all is told in.
-        old: the other one, in any unit that can be converted to them.
-        points: measurements of the new one's recording, in its unit: the directions where the fields are compared.
+        new: the new calibration, in whose units all differences are.
+        old: the old calibration, in any unit that can be converted to these.
+        points: measurements of the new recording, in its unit, at which the corrected fields are compared.
 
     Raises:
-        ValueError: their units cannot be converted to one another.
+        ValueError: their units cannot be converted to each other.
 
     Example:
         >>> from mkc_torch.calibration.calibrate import calibrate
@@ -106,8 +106,8 @@ def differences(new: Calibration, old: Calibration, points: Float[Tensor, "N 3"]
     measured, field = ratio(old.unit, new.unit), ratio(old.field_unit, new.field_unit)
     if measured is None or field is None:
         raise ValueError(
-            f"the calibration {old.name} is from {old.unit} to {old.field_unit} and this one from {new.unit} to "
-            f"{new.field_unit}, which cannot be set beside one another; calibrate both with the same `--unit`, and "
+            f"the calibration {old.name} is from {old.unit} to {old.field_unit} and the new calibration from "
+            f"{new.unit} to {new.field_unit}, which cannot be compared; calibrate both with the same unit options, and "
             "both with or both without `--field-strength`."
         )
     center = points.new_tensor(old.center) * measured
@@ -162,12 +162,12 @@ def differences(new: Calibration, old: Calibration, points: Float[Tensor, "N 3"]
 
 
 def _of_radius(calibration: Calibration) -> float:
-    """Standard error at most of the geometric mean of the semi-axes, however their errors are correlated."""
+    """Upper bound of the standard error of the geometric mean of the semi-axes, for any correlation of their errors."""
     pairs = zip(calibration.semi_axes, calibration.semi_axes_se, strict=True)
     return calibration.radius * sum(error / axis for axis, error in pairs) / 3.0
 
 
 def _angle(a: Float[Tensor, "N 3"], b: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-    """Between vectors, in rad: exact for small angles too, where an arc cosine is not."""
+    """Angles between vectors in rad, accurate for small angles too, unlike an arc cosine."""
     across = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1)
     return torch.atan2(across, (a * b).sum(-1))

@@ -74,7 +74,7 @@ def symmetric_root(shape: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
 
 
 _SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-"""Where each element of a symmetric matrix, row by row, is among those of its upper triangle."""
+"""For each element of a symmetric matrix, row by row, its index in the upper triangle."""
 
 
 def ellipsoid_from_root(theta: Float[Tensor, "*batch 9"]) -> Ellipsoid:
@@ -86,11 +86,11 @@ def ellipsoid_from_root(theta: Float[Tensor, "*batch 9"]) -> Ellipsoid:
 def sampson_distance(theta: Float[Tensor, " 9"], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     """First-order distance of points to an ellipsoid, in their unit, positive outside.
 
-    With y = L (p - center) it is ``(|y| - 1) / |∇_p |y||``. From the orthogonal distance e it differs by at most about
-    ``e² b / (2 a²)``, a and b the shortest and the longest semi-axis; at the ends of the axes it is exact.
+    With y = L (p - center) it is ``(|y| - 1) / |∇_p |y||``. It differs from the orthogonal distance e by at most about
+    ``e² b / (2 a²)``, with a and b the shortest and the longest semi-axis; at the ends of the axes it is exact.
 
     Args:
-        theta: as :func:`ellipsoid_from_root` takes it, in the unit of the points.
+        theta: parameters as in :func:`ellipsoid_from_root`, in the unit of the points.
         points: (N, 3).
 
     Example:
@@ -104,18 +104,18 @@ def sampson_distance(theta: Float[Tensor, " 9"], points: Float[Tensor, "N 3"]) -
 
 
 def distance_along(y: Float[Tensor, "*batch N 3"], root: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch N"]:
-    """The same from y and the symmetric L."""
-    # keeps a point at the very centre finite
+    """:func:`sampson_distance` from y = L (p - center) and the symmetric L."""
+    # keeps the distance of the centre finite
     tiny = torch.finfo(y.dtype).eps ** 2
     norm = (y.square().sum(-1) + tiny).sqrt()
     return (norm - 1.0) * norm / ((y @ root).square().sum(-1) + tiny).sqrt()
 
 
 def axes_of(shape: Tensor) -> tuple[Tensor, Tensor]:
-    """Semi-axes in ascending order and the rotation whose columns they lie along, with determinant +1."""
+    """Semi-axes in ascending order, and the rotation (determinant +1) whose columns are their directions."""
     values, vectors = torch.linalg.eigh(shape)
     vectors = vectors.flip(-1)
-    # each axis points to the side of its largest component, so that the result does not depend on the solver
+    # the largest component of each axis is positive, so that the result does not depend on the solver
     index = vectors.abs().argmax(-2, keepdim=True)
     vectors = vectors * torch.sign(torch.gather(vectors, -2, index))
     vectors = torch.cat([vectors[..., :2], vectors[..., 2:] * torch.linalg.det(vectors)[..., None, None]], -1)

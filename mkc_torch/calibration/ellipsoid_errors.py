@@ -1,4 +1,4 @@
-"""First-order errors of centre, semi-axes and calibration matrix from those of the parameters of an ellipsoid."""
+"""Propagate errors of an ellipsoid's parameters to centre, semi-axes and calibration matrix, to first order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.ellipsoid import Ellipsoid, symmetric_root
-from mkc_torch.linear._implicit.layer import wanted
+from mkc_torch.linear._implicit.layer import needs_derivatives
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -20,12 +20,12 @@ __all__ = ["derived_slopes"]
 def derived_slopes(
     local: Ellipsoid, parameters: Float[Tensor, "*batch 9"], ellipsoid_of: Callable[[Tensor], Ellipsoid]
 ) -> Float[Tensor, "B 24 9"]:
-    """Derivatives by the parameters of the centre, the semi-axes, the calibration matrix and it less its radius.
+    """Jacobian of centre (3), semi-axes (3), calibration matrix (9) and that matrix over its radius (9).
 
     Args:
         local: the ellipsoid, in the coordinates of the parameters.
-        parameters: of each problem.
-        ellipsoid_of: the ellipsoid of the parameters of one problem.
+        parameters: parameters of each problem.
+        ellipsoid_of: makes an ellipsoid of the parameters of a problem.
     """
 
     def quantities(theta: Tensor) -> Tensor:
@@ -49,11 +49,11 @@ def derived_slopes(
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], theta: Float[Tensor, "B p"]) -> Float[Tensor, "B q p"]:
-    """Derivatives of each problem's values, of a function that takes all problems at once."""
-    if wanted(theta):
+    """Jacobian for each problem of a function that takes all problems at once."""
+    if needs_derivatives(theta):
         return torch.func.vmap(torch.func.jacrev(function))(theta)
-    # the same numbers to the last digit; torch.func, and a gradient that is given, would load torch's compiler and
-    # sympy, which takes longer than a calibration
+    # bitwise the same result; torch.func, and autograd.grad with grad_outputs, import torch's compiler and sympy, which
+    # takes longer than a calibration
     with torch.inference_mode(False), torch.enable_grad():
         width = function(theta[0]).shape[-1]
         leaf = theta.unsqueeze(1).repeat(1, width, 1).requires_grad_()

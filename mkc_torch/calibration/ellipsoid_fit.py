@@ -1,9 +1,9 @@
 """Ellipsoid fit to points in space, for the calibration of magnetometers and accelerometers.
 
-A triaxial sensor in a constant field that turns through all directions draws an ellipsoid. Its centre is the offset
-(hard iron), its shape the gains and cross-couplings (soft iron). The fit is linear regression on the nine monomials of
-(36) of Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, by any estimator of ``mkc_torch.linear``; a
-finish by maximum likelihood in the unit of the points can follow.
+The readings of a triaxial sensor that turns through all directions in a constant field lie on an ellipsoid. Its centre
+is the offset (hard iron), its shape the gains and cross-couplings (soft iron). The fit is linear regression on the nine
+monomials of (36) of Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, by any estimator of
+``mkc_torch.linear``. A refinement by maximum likelihood in the unit of the points can follow.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from mkc_torch.calibration.not_identifiable import (
     NotIdentifiableError,
     middle_of,
     not_identifiable,
-    told_of_equal,
-    told_of_flat,
+    equal_points_message,
+    flat_points_message,
 )
 from mkc_torch.calibration.points import MIN_POINTS, prepared, refuse_no_points
 from mkc_torch.linear import MKCRegression, RankDeficientError
@@ -53,67 +53,68 @@ if TYPE_CHECKING:
 __all__ = ["MAX_SCATTER", "MAX_STANDARD_ERROR", "MIN_INFORMATION", "MIN_POINTS", "EllipsoidFit"]
 
 MIN_INFORMATION = 0.003
-"""Least information, as a share of even coverage, that identifies an ellipsoid."""
+"""Smallest information, as a share of even coverage, that identifies an ellipsoid."""
 
 MAX_STANDARD_ERROR = 0.05
-"""Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid; the bias
-by noise counts in it."""
+"""Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid; it
+includes the bias by noise."""
 
 MAX_SCATTER = 0.2
-"""Largest scatter of the points about the surface, as a share of its shortest semi-axis: the square of it is the bias
-of the fit. A ball of noise scatters by half."""
+"""Largest scatter of the points about the surface, as a share of its shortest semi-axis; the bias of the fit is its
+square. A ball of noise scatters by half."""
 
-LENT_UNSURE, LENT_UNSURE_OF_ONE = 0.1, 4.0
-"""How far the information that noise seems to lend may differ from what is computed, as a share of it: because the
-noise is not quite alike in all directions, and by chance, over the root of the number of points. The standard
-deviation of that chance is 1.7 to 1.8 where two circles of 1000 points each lend it all, at noise of 8 and 14 %."""
+LENT_UNSURE = 0.1
+"""Relative uncertainty of the spurious information by noise, because the noise may differ between directions."""
+
+LENT_UNSURE_OF_ONE = 4.0
+"""Statistical uncertainty of the spurious information by noise, relative, times the root of the number of points. Its
+standard deviation is 1.7 to 1.8 for two circles of 1000 points each at noise of 8 and 14 %."""
 
 _UNEVEN = 10.0
-"""Bias over the square of the scatter, each as a share, above which it is the directions that are missing: an even
-coverage has 4 to 5."""
+"""Ratio of the relative bias to the squared relative scatter above which missing directions are the reason of the bias;
+for even coverage it is 4 to 5."""
 
 _EXACT = 1e4
-"""Roundings by which a point may be off a surface that it is on."""
+"""Largest distance of a point on the surface from it, in units of machine precision times the radius."""
 
 
 class EllipsoidFit(Fitted):
     """Ellipsoid through points by robust linear regression: the linear head for magnetometers.
 
     Args:
-        estimator: any estimator of ``mkc_torch.linear``; default ``MKCRegression()``. Give it ``covariance="hac"``
-            when the points are a time series in the order of time.
-        finish: None keeps the algebraic fit; "maximum_likelihood" goes on from it to the maximum of the MKC likelihood
-            of the points' distances to the surface, :func:`sampson_distance`, with σ and d learned again, in the unit
-            of the points. It is what the algebraic fit is an approximation of where the noise of the points is the
-            same in all directions: the algebraic residual weighs a point by its distance to the centre and is biased
-            by the square of the noise over the radius.
-        max_scatter: share of the shortest semi-axis by which the points may scatter about the surface, in (0, ∞]; inf
-            takes any, as a place to start from where something else moves the points.
+        estimator: any estimator of ``mkc_torch.linear``; default ``MKCRegression()``. Use ``covariance="hac"`` if the
+            points are a time series in the order of time.
+        finish: None keeps the algebraic fit. "maximum_likelihood" refines it to the maximum of the MKC likelihood of
+            the points' distances to the surface, :func:`sampson_distance`, with σ and d learned again, in the unit of
+            the points. The algebraic fit approximates it for isotropic noise: its residual weighs a point by its
+            distance to the centre and is biased by the square of the noise over the radius.
+        max_scatter: largest scatter of the points about the surface, as a share of the shortest semi-axis, in (0, ∞];
+            inf accepts any scatter, for a starting point if other effects than noise move the points.
 
     Attributes, after ``fit`` (``*`` batch dimensions, lengths in the unit of the points):
         center_: (*, 3), the offset.
         semi_axes_: (*, 3), ascending.
         rotation_: (*, 3, 3), columns along the semi-axes, determinant +1.
         calibration_matrix_: (*, 3, 3), symmetric, with ``|calibration_matrix_ @ (p - center_)| = radius_`` on the
-            ellipsoid: applied to points less their centre it makes the ellipsoid a sphere of the same volume.
+            ellipsoid: applied to centred points it maps the ellipsoid to a sphere of the same volume.
         radius_: (*,), geometric mean of the semi-axes.
         coef_: (*, 9), coefficients of (36) in the points' own coordinates.
-        residual_: (*, N), calibrated norm less ``radius_``.
-        weights_: (*, N), the weight in [0, 1] with which each point entered.
-        center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
-            has a ``covariance_``; infinite where nine points leave none to tell errors from. After a finish they are
-            those of the finish, of the estimator's kind ("sandwich" where it has none). They hold the bias by the
-            noise of the points, as the root of the sum of squares, so that intervals reach over it; but for
-            ``max_scatter=inf``, where it is no noise that moves the points.
-        coverage_: one :class:`mkc_torch.calibration.coverage.Coverage`, or a list of them, of the points in use.
-        root_se_: standard errors of ``calibration_matrix_ / radius_``, which makes the ellipsoid a unit sphere.
+        residual_: (*, N), calibrated norm minus ``radius_``.
+        weights_: (*, N), weight in [0, 1] of each point.
+        center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, if the estimator has a
+            ``covariance_``; infinite for nine points, which leave no degrees of freedom. After a finish they are those
+            of the finish, of the estimator's kind ("sandwich" if it has no kind). They include the bias by the noise
+            of the points, as the root of the sum of squares, so that intervals cover it; except for
+            ``max_scatter=inf``, where the scatter is not noise.
+        coverage_: :class:`mkc_torch.calibration.coverage.Coverage` of the points in use; a list of them for a batch.
+        root_se_: standard errors of ``calibration_matrix_ / radius_``, which maps the ellipsoid to a unit sphere.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
         finish_: the :class:`mkc_torch.nonlinear.NonlinearFit` of the finish, or None: residual, d and bound are in the
             unit of the points, ``theta`` is about the median of the points in units of their median distance from it.
 
     Raises:
-        TypeError: ``estimator`` is none of ``mkc_torch.linear``, or ``max_scatter`` is no number.
-        ValueError: ``finish`` is something else, or ``max_scatter`` is out of range.
+        TypeError: ``estimator`` is not an estimator of ``mkc_torch.linear``, or ``max_scatter`` is not a number.
+        ValueError: ``finish`` is unknown, or ``max_scatter`` is out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, (36)-(41).
@@ -151,16 +152,16 @@ class EllipsoidFit(Fitted):
         """Fit an ellipsoid to points.
 
         Args:
-            points: (*, N, 3) with N >= 9, in any unit of length or field; a tensor, a NumPy array or a DataFrame, of
-                which :meth:`calibrate` then takes one with the same columns alone.
+            points: (*, N, 3) with N >= 9, in any unit of length or field; a tensor, a NumPy array or a DataFrame.
+                After a DataFrame, :meth:`calibrate` accepts only DataFrames with the same columns.
             sample_weight: non-negative weights (*, N); 0 leaves a point out.
 
         Raises:
-            TypeError: not a floating tensor, or an array of something else than real numbers.
+            TypeError: not a floating tensor, or an array that does not hold real numbers.
             ValueError: wrong shape, too few or non-finite points.
-            NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
-                missing), cover them by their noise alone, draw no surface, for they scatter about it by more than
-                ``max_scatter``, or their noise draws the result aside by more than a standard error may be.
+            NotIdentifiableError: the points lie on a plane, cover too few directions (the message lists the missing
+                directions), cover them only by their noise, scatter about the surface by more than ``max_scatter``, or
+                their noise biases the result by more than the largest accepted standard error.
         """
         self._forget()
         weight = None if sample_weight is None else as_tensor("sample_weight", sample_weight)
@@ -185,14 +186,14 @@ class EllipsoidFit(Fitted):
         radius = torch.linalg.vector_norm(points - origin, dim=-1, keepdim=True)
         size = order_statistic(radius, used, half).unsqueeze(-2)
         if bool((size <= 0).any()):
-            raise not_identifiable(told_of_equal(points), points - origin)
+            raise not_identifiable(equal_points_message(points), points - origin)
         X = monomials((points - origin) / size).unsqueeze(-2)
         Y = torch.ones_like(X[..., 0])
         self.estimator_ = copy.copy(self.estimator)
         try:
             self.estimator_.fit(X, Y, None if weight is None else weight.unsqueeze(-1))
         except RankDeficientError:
-            raise not_identifiable(told_of_flat(points), points - middle_of(points)) from None
+            raise not_identifiable(flat_points_message(points), points - middle_of(points)) from None
         local = ellipsoid_from_coefficients(self.estimator_.coef_)
         self._refuse_unbounded(local, points)
         scale = size.squeeze(-1)
@@ -217,7 +218,7 @@ class EllipsoidFit(Fitted):
         self._refuse_undetermined(points, in_use, scatter, noise, errors)
 
     def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
-        """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
+        """Maximise the likelihood of the distances, starting from an ellipsoid, in local coordinates."""
         root = symmetric_root(local.shape)
         row, column = torch.triu_indices(3, 3)
 
@@ -252,14 +253,14 @@ class EllipsoidFit(Fitted):
 
     def _refuse_unbounded(self, local: Ellipsoid, points: Tensor) -> None:
         values = torch.linalg.eigvalsh(local.shape.nan_to_num(0.0, 0.0, 0.0))
-        # a surface a hundred times longer than wide is a cylinder to these points
+        # a surface a hundred times longer than wide is indistinguishable from a cylinder
         bounded = (values[..., 0] > 1e-4 * values[..., -1]).reshape(-1)
         if not bool(bounded.all()):
             index = int((~bounded).nonzero()[0, 0])
             vectors = (points - middle_of(points)).reshape(-1, *points.shape[-2:])[index]
-            seen = " They are seen from the middle of the samples, for the centre is not known; the gaps may be wider."
+            seen = " These are relative to the middle of the samples, as the centre is unknown; the gaps may be wider."
             raise not_identifiable(
-                f"{_problem(index, points.dim() > 2)}Not identifiable: the quadric that fits the points is no "
+                f"{_problem(index, points.dim() > 2)}Not identifiable: the quadric that fits the points is not an "
                 "ellipsoid.",
                 vectors,
                 seen=seen,
@@ -282,24 +283,24 @@ class EllipsoidFit(Fitted):
         ellipsoid_of: Callable[[Tensor], Ellipsoid],
         bias: Bias | None,
     ) -> tuple[list[float], list[float]]:
-        """Keep the standard errors; the largest of centre and semi-axes over the radius, without the bias and with it.
+        """Set the standard errors; return the largest of centre and semi-axes over the radius, without and with bias.
 
-        The bias enters as a standard error, so that an interval reaches over it.
+        The bias enters as a standard error, so that intervals cover it.
         """
         slopes = derived_slopes(local, parameters, ellipsoid_of)
-        aside = alone = total = torch.zeros_like(slopes[..., 0])
+        bias_shift = alone = total = torch.zeros_like(slopes[..., 0])
 
         def spread(rows: Tensor, covariance: Tensor) -> Tensor:
             variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
             return torch.where(variance.isnan(), torch.inf, variance).clamp(min=0.0)
 
         if bias is not None:
-            aside = torch.einsum("bij,bj->bi", slopes, bias.offset)
+            bias_shift = torch.einsum("bij,bj->bi", slopes, bias.offset)
         if covariance is not None:
             alone = total = spread(slopes, covariance)
             if bias is not None:
                 total = spread(slopes @ bias.growth, covariance)
-        total = total + aside.square()
+        total = total + bias_shift.square()
         if covariance is not None:
             kept = total.sqrt().reshape(*scale.shape[:-1], 24)
             self.center_se_ = kept[..., :3] * scale
@@ -307,12 +308,12 @@ class EllipsoidFit(Fitted):
             self.calibration_matrix_se_ = kept[..., 6:15].unflatten(-1, (3, 3))
             self.root_se_ = kept[..., 15:].unflatten(-1, (3, 3)) / scale.unsqueeze(-1)
         share = (scale / self.radius_.unsqueeze(-1)).reshape(-1).detach()
-        first, second = (share * one[:, :6].amax(-1).sqrt() for one in (alone, total))
+        first, second = (share * variance[:, :6].amax(-1).sqrt() for variance in (alone, total))
         return first.tolist(), second.tolist()
 
     def _in_use(self, weight: Tensor | None) -> Tensor:
-        """Points that count, (*, N)."""
-        # which of the points on the surface itself a trimmed fit keeps is a matter of rounding
+        """Mask of the points in use, (*, N)."""
+        # rounding decides which of the points exactly on the surface a trimmed fit keeps: count them all
         eps = torch.finfo(self.residual_.dtype).eps
         in_use = (self.weights_ >= 0.5) | (self.residual_.abs() <= _EXACT * eps * self.radius_.unsqueeze(-1))
         return in_use if weight is None else in_use & (weight > 0)
@@ -320,7 +321,7 @@ class EllipsoidFit(Fitted):
     def _bias(
         self, points: Tensor, scale: Tensor, noise: Tensor | None, parameters: Tensor, weight: Tensor | None
     ) -> Bias | None:
-        """Of the parameters, by the noise of the points, which are in the parameters' coordinates."""
+        """The bias of the parameters by the noise of the points; points are in the parameters' coordinates."""
         if noise is None:
             return None
         near = points.reshape(-1, *points.shape[-2:])
@@ -342,12 +343,12 @@ class EllipsoidFit(Fitted):
         directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[:2]), strict=True)]
         found = [coverage(d) for d in directions]
         self.coverage_: Coverage | list[Coverage] = found[0] if field.dim() == 2 else found
-        for index, one in enumerate(found):
+        for index, found_coverage in enumerate(found):
             where = _problem(index, field.dim() > 2)
-            if one.information < MIN_INFORMATION:
+            if found_coverage.information < MIN_INFORMATION:
                 raise not_identifiable(
-                    f"{where}Not identifiable: too few directions are covered to tell the offset from the shape "
-                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed).",
+                    f"{where}Not identifiable: too few directions are covered to separate the offset from the shape "
+                    f"({found_coverage.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed).",
                     directions[index],
                 )
             if MAX_STANDARD_ERROR < errors[0][index] < math.inf:
@@ -363,18 +364,18 @@ class EllipsoidFit(Fitted):
 
     @torch.no_grad()
     def _scatter(self, field: Tensor, weight: Tensor | None) -> Tensor:
-        """Of the points about the surface, as a share of its shortest semi-axis, for each problem."""
+        """Scatter of the points about the surface as a share of its shortest semi-axis, for each problem, (B,)."""
         radius = self.radius_[..., None, None]
         distance = distance_along(field / radius, self.calibration_matrix_ / radius).unsqueeze(-1)
         used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
         return (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
 
     def _noise(self, scatter: Tensor, in_use: Tensor) -> Tensor | None:
-        """Standard deviation of the points, in their unit, for each problem; None where something else moves them."""
+        """Standard deviation of the points in their unit, for each problem, (B,); None for ``max_scatter=inf``."""
         if self.max_scatter == math.inf:
             return None
         count = in_use.reshape(len(scatter), -1).sum(-1).to(scatter)
-        # nine coefficients go along with the noise of as many points
+        # nine coefficients absorb nine degrees of freedom
         free = (count / (count - MIN_POINTS).clamp(min=1.0)).sqrt()
         return scatter * self.semi_axes_[..., 0].detach().reshape(-1) * free
 
@@ -382,7 +383,7 @@ class EllipsoidFit(Fitted):
     def _refuse_lent(
         self, points: Tensor, in_use: Tensor, scatter: Tensor, noise: Tensor, directions: list[Tensor]
     ) -> None:
-        """Refuse directions that seem to be covered because the points scatter: the ellipsoid is that of the noise."""
+        """Raise an error if the directions seem covered only because of the scatter of the points."""
         flat = points.reshape(-1, *points.shape[-2:])
         use = in_use.reshape(flat.shape[:2]).to(flat)
         center, root = self.center_.reshape(-1, 1, 3), (self.calibration_matrix_ / self.radius_[..., None, None])
@@ -396,32 +397,32 @@ class EllipsoidFit(Fitted):
                 raise not_identifiable(
                     f"{_problem(index, points.dim() > 2)}Not identifiable: too few directions are covered for points "
                     f"that scatter about the ellipsoid by {100.0 * float(scatter[index]):.0f} % of its shortest "
-                    f"semi-axis. Less what the scatter alone seems to cover, {least:.1e} of the information of an even "
-                    f"coverage is left; {needed:.1e} is needed.",
+                    f"semi-axis. Without the spurious coverage by the scatter, {least:.1e} of the information of an "
+                    f"even coverage remains; {needed:.1e} is needed.",
                     directions[index],
                 )
 
     def _refuse_biased(self, scatter: list[float], errors: list[float], directions: list[Tensor]) -> None:
-        """Refuse what the noise draws aside by more than a standard error may be."""
+        """Raise an error if the bias by noise exceeds the largest accepted standard error."""
         for index, (wide, error) in enumerate(zip(scatter, errors, strict=True)):
             if MAX_STANDARD_ERROR < error < math.inf:
                 even = error <= _UNEVEN * wide**2
                 what = "there is too much noise in" if even else "too few directions are covered for"
-                less = "" if self.finish else '; finish="maximum_likelihood" has less of it'
+                less = "" if self.finish else '; finish="maximum_likelihood" has a smaller bias'
                 raise not_identifiable(
                     f"{_problem(index, len(errors) > 1)}Not identifiable: {what} points that scatter about the "
-                    f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. With the bias by that, the centre "
+                    f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. Including the bias by that scatter, the centre "
                     f"or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
                     f"{100.0 * MAX_STANDARD_ERROR:.0f} %{less}.",
                     directions[index],
                 )
 
     def _refuse_scattered(self, field: Tensor, scatter: Tensor) -> None:
-        """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
+        """Raise an error if the points scatter too much about the surface, as a ball of noise does."""
         wide = (scatter > self.max_scatter).nonzero().flatten()
         if len(wide) > 0:
             raise NotIdentifiableError(
-                f"{_problem(int(wide[0]), field.dim() > 2)}Not identifiable: the points draw no surface. They scatter "
+                f"{_problem(int(wide[0]), field.dim() > 2)}Not identifiable: the points do not form a surface. They scatter "
                 f"about the ellipsoid by {100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
                 f"{100.0 * self.max_scatter:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
                 "through all directions."

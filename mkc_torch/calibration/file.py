@@ -1,4 +1,4 @@
-"""Values of calibration.json by their path, each checked where it is taken."""
+"""Read values of calibration.json by their path, and check each value when it is read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class CalibrationFileError(ValueError):
-    """A text that is no calibration; the sentence says why."""
+    """A text is not a calibration; the message states why."""
 
 
 def finite_or_none(values: Sequence[float]) -> list[float | None]:
@@ -23,11 +23,11 @@ def finite_or_none(values: Sequence[float]) -> list[float | None]:
 
 
 def refuse_constant(name: str) -> NoReturn:
-    raise CalibrationFileError(f"this is no calibration: it holds {name}, which is not JSON; calibrate again.")
+    raise CalibrationFileError(f"this is not a calibration: it holds {name}, which is not JSON; calibrate again.")
 
 
 class CheckedValues:
-    """Values of the file by their path, each checked where it is taken."""
+    """Values of the file by their path; each method checks the value that it reads."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self.content = content
@@ -41,7 +41,7 @@ class CheckedValues:
         return value
 
     def has(self, *path: str) -> bool:
-        """Whether there is such a value: what older files do not have is none of theirs."""
+        """Whether the file has a value at this path; older files lack some values."""
         value: Any = self.content
         for key in path:
             if not (isinstance(value, Mapping) and key in value):
@@ -50,7 +50,7 @@ class CheckedValues:
         return True
 
     def names(self, *path: str) -> tuple[str, ...]:
-        """Of the values that stand under a name."""
+        """The names of the values of an object."""
         value = self._at(*path)
         if not isinstance(value, Mapping):
             raise self._wrong(path, "an object")

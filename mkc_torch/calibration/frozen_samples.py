@@ -1,4 +1,4 @@
-"""Samples of a sensor that froze: one value again and again while it turned on."""
+"""Find and drop samples of a frozen sensor: a repeated value while the sensor turned."""
 
 from __future__ import annotations
 
@@ -21,36 +21,40 @@ __all__ = ["FROZEN", "without_frozen"]
 FROZEN = "samples of a frozen sensor"
 
 _LEAST = 20
-"""Equal samples from which a sensor is looked at. Ten real recordings of six sensors hold three in a row in all axes
-at most and nine in one axis; at noise of half a step of the digits, twenty in a row are a chance of 1e-3 an axis."""
+"""Fewest equal samples in a row that are examined. Ten real recordings of six sensors have at most three in a row in
+all axes and nine in a single axis; at noise of half a digital step, twenty in a row have probability 1e-3 per axis."""
 
 _LONGER = 4.0
-"""Times the longest usual stretch of equal samples: a log that is written faster than the sensor measures has many."""
+"""Smallest ratio to the longest usual repeat; a log that is written faster than the sensor samples has many repeats."""
 
 _JUMP = 1.5
-"""Times the usual move, a hundredth of which is larger, from which what follows is a jump: a sensor that rested goes
-on from where it was, one that froze is elsewhere by then."""
+"""Smallest ratio of a jump after a repeat to the 99th percentile of usual moves. A sensor that rested continues where it
+was; a sensor that froze has moved."""
 
 _STEPS = 5.0
-"""Steps of the digits that a jump has at least."""
+"""Smallest jump, in digital steps."""
 
 _NOISY = 1.0
-"""Noise, in steps of the digits, at which equal samples are no rest: twenty-five in a row are a chance of 1e-10."""
+"""Smallest noise, in digital steps, at which equal samples cannot be a rest: twenty-five in a row have probability
+1e-10."""
 
 _FEWEST_OF_NOISE = 25
+"""Fewest equal samples in a row of a frozen sensor that is recognised by its noise."""
+
 _NAMED = 4
+"""Most repeats that the warning lists."""
 
 
 def without_frozen(recording: Recording, *names: str) -> Recording:
-    """The samples but for those of a sensor, or of one axis of it, that froze while it turned; ``warnings`` names them.
+    """Drop the samples of a sensor, or of an axis of it, that froze while it turned; ``warnings`` lists them.
 
-    A sensor at rest whose noise is less than a step of its digits repeats itself too. It goes on from there; one that
-    froze jumps to where it has been turned meanwhile; or it repeats itself, where its own noise would not let it, to
-    the end, or in one axis while the others go on.
+    A sensor at rest whose noise is less than a digital step repeats its value too, and then continues from that value.
+    A frozen sensor jumps to its new orientation; or it repeats a value despite its noise, up to the end or in a single
+    axis.
 
     Args:
-        recording: in the order of time, and finite in these columns; ``experiment`` separates runs.
-        names: the columns of one sensor.
+        recording: sorted by time and finite in these columns; ``experiment`` separates runs.
+        names: the columns of a sensor.
 
     Example:
         >>> angle = torch.linspace(0.0, 20.0, 1000)
@@ -61,25 +65,26 @@ def without_frozen(recording: Recording, *names: str) -> Recording:
     """
     values = recording.stack(*names)
     ends = list(run_ends(recording))
-    # at the end of its range an axis repeats itself too, which is another fault
+    # a clipped axis repeats its value too, which is another fault
     clipped = clipped_entries(values)
-    # a log may be written faster than the sensor measures
+    # a log may be written faster than the sensor samples
     fresh = torch.cat([torch.ones(1, dtype=torch.bool), (values[1:] != values[:-1]).any(-1)])
     everywhere = _frozen(values, ends, recording.time, values, clipped.any(-1), fresh)
     frozen = _mask(len(values), everywhere)
-    found = [(f"all of {', '.join(f'`{name}`' for name in names)}", one) for one in everywhere]
+    found = [(f"all of {', '.join(f'`{name}`' for name in names)}", repeat) for repeat in everywhere]
     for k, name in enumerate(names):
         others = torch.cat([values[:, :k], values[:, k + 1 :]], -1)
         alone = _frozen(values[:, k : k + 1], ends, recording.time, others, frozen | clipped[:, k], fresh)
-        found += [(f"`{name}`", one) for one in alone]
+        found += [(f"`{name}`", repeat) for repeat in alone]
     if not found:
         return recording
-    left_out = _mask(len(values), [one for _, one in found])
+    left_out = _mask(len(values), [repeat for _, repeat in found])
     found.sort(key=lambda item: item[1].start - item[1].end)
-    told = [f"{what} {_where(recording, one)}" for what, one in found[:_NAMED]]
+    listed_repeats = [f"{what} {_where(recording, repeat)}" for what, repeat in found[:_NAMED]]
     more = [f"and {counted(len(found) - _NAMED, 'more time')}"] if len(found) > _NAMED else []
     return recording.rows(
-        ~left_out, f"Left out {int(left_out.sum())} of {len(recording)} {FROZEN}: {'; '.join([*told, *more])}."
+        ~left_out,
+        f"Left out {int(left_out.sum())} of {len(recording)} {FROZEN}: {'; '.join([*listed_repeats, *more])}.",
     )
 
 
@@ -91,24 +96,24 @@ def _frozen(
     known: Bool[Tensor, " N"],
     fresh: Bool[Tensor, " N"],
 ) -> list[Repeat]:
-    """Repeats of the columns that no rest explains.
+    """Find repeats of the columns that a rest does not explain.
 
     Args:
-        values: of the columns.
-        ends: first rows of the runs but the first.
-        time: of the rows.
+        values: values of the columns.
+        ends: first rows of all runs except the first.
+        time: times of the rows.
         turned: the columns that show whether the sensor turned.
-        known: rows that are explained already.
-        fresh: rows that do not repeat all columns of the one before.
+        known: mask of the rows that are explained already.
+        fresh: mask of the rows that differ from the row before.
     """
     found = repeats(values, ends, _LEAST)
     free = ~(_mask(len(values), found) | known)
-    found = [one for one in found if not bool(known[one.start : one.end].any())]
+    found = [repeat for repeat in found if not bool(known[repeat.start : repeat.end].any())]
     if not found or not bool(free.any()):
         return []
-    # an axis of its own stays where it is turned about; so long as others do not move, nothing turned
+    # a single axis is constant while the sensor turns about it; without motion of the others, nothing turned
     alone = turned.shape[-1] != values.shape[-1]
-    usual = max((one.end - one.start for one in repeats(values[free], [], 1)), default=1)
+    usual = max((repeat.end - repeat.start for repeat in repeats(values[free], [], 1)), default=1)
     move, least = usual_move(values, free), _STEPS * max(step_of_digits(v) for v in values.unbind(-1))
     noisy = any(
         quietest_noise(column[free & fresh]) >= _NOISY * max(step_of_digits(column), 1e-300)
@@ -116,42 +121,42 @@ def _frozen(
     )
     others_move = usual_move(turned, free)
     stuck = []
-    for one in found:
-        length = one.end - one.start
+    for repeat in found:
+        length = repeat.end - repeat.start
         if length < _LONGER * usual:
             continue
-        seen = turned[one.start : one.end]
+        seen = turned[repeat.start : repeat.end]
         if alone and not float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0))) > others_move:
             continue
-        jumped = _jump(values, one, ends, time) > max(_JUMP * move, least)
-        # a sensor that goes on from there may have rested, whatever its noise does elsewhere
-        elsewhere = alone or one.end in (*ends, len(values))
+        jumped = _jump(values, repeat, ends, time) > max(_JUMP * move, least)
+        # a sensor that continues from its value may have rested, whatever its noise elsewhere
+        elsewhere = alone or repeat.end in (*ends, len(values))
         if jumped or (elsewhere and noisy and length >= _FEWEST_OF_NOISE):
-            stuck.append(one)
+            stuck.append(repeat)
     return stuck
 
 
-def _jump(values: Tensor, one: Repeat, ends: list[int], time: Tensor | None) -> float:
-    """How far what follows is from what was repeated; 0 where nothing follows at once."""
-    if time is not None and one.end < len(time):
-        pause = float(time[one.end] - time[one.end - 1])
+def _jump(values: Tensor, repeat: Repeat, ends: list[int], time: Tensor | None) -> float:
+    """Distance of the following samples from the repeated value; 0 if no sample follows immediately."""
+    if time is not None and repeat.end < len(time):
+        pause = float(time[repeat.end] - time[repeat.end - 1])
         if not 0.0 <= pause <= 5.0 * float(time.diff().median()):
             return 0.0
-    end = next((end for end in ends if end >= one.end), len(values))
-    following = next_place(values, one.end, end)
-    return 0.0 if following is None else float(torch.linalg.vector_norm(following - values[one.start]))
+    end = next((end for end in ends if end >= repeat.end), len(values))
+    following = next_place(values, repeat.end, end)
+    return 0.0 if following is None else float(torch.linalg.vector_norm(following - values[repeat.start]))
 
 
 def _mask(count: int, found: list[Repeat]) -> Bool[Tensor, " N"]:
     rows = torch.zeros(count, dtype=torch.bool)
-    for one in found:
-        rows[one.start : one.end] = True
+    for repeat in found:
+        rows[repeat.start : repeat.end] = True
     return rows
 
 
-def _where(recording: Recording, one: Repeat) -> str:
-    length = one.end - one.start
+def _where(recording: Recording, repeat: Repeat) -> str:
+    length = repeat.end - repeat.start
     if recording.time is None:
-        return f"from sample {one.start + 1} to {one.end} ({length})"
-    begin, last = float(recording.time[one.start]), float(recording.time[one.end - 1])
+        return f"from sample {repeat.start + 1} to {repeat.end} ({length})"
+    begin, last = float(recording.time[repeat.start]), float(recording.time[repeat.end - 1])
     return f"from {begin:.6g} to {last:.6g} s ({length})"

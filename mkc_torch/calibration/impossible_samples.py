@@ -1,4 +1,4 @@
-"""Samples that no field explains: codes for a missing value, and numbers that a transmission spoiled."""
+"""Find and drop impossible samples: codes for missing values, and numbers corrupted in transmission."""
 
 from __future__ import annotations
 
@@ -19,24 +19,25 @@ if TYPE_CHECKING:
 __all__ = ["without_impossible"]
 
 _APART = 20.0
-"""How many times as far from the middle as all others a sample is that no field explains. One that something magnetic
-disturbs has others between, before and after the worst of it."""
+"""Smallest ratio of an impossible sample's distance from the middle to that of all others. A magnetic disturbance also
+has samples between, before and after its maximum."""
 
 _TURNED = 4.0
-"""How many times the middle measurement a turn can change it by, whatever the others do: a turn over is twice."""
+"""Largest change by turning, in multiples of the median measurement; a turn by 180° is two."""
 
 _MOST = 0.25
-"""The share of samples that can be such."""
+"""Largest share of impossible samples."""
 
 _NAMED = 4
+"""Most values that the warning lists."""
 
 
 def without_impossible(recording: Recording, *names: str) -> Recording:
-    """The samples but for those whose values stand far apart from all others; ``warnings`` names them.
+    """Drop samples whose values are far from all others; ``warnings`` lists them.
 
     Args:
-        recording: in the order of time, if there is a time, and finite in these columns.
-        names: the columns of one sensor.
+        recording: sorted by time if there is a time, and finite in these columns.
+        names: the columns of a sensor.
 
     Example:
         >>> import torch
@@ -49,7 +50,7 @@ def without_impossible(recording: Recording, *names: str) -> Recording:
     """
     points = recording.stack(*names)
     middle = points.median(0).values
-    # the largest component, for the square of a number can be none
+    # the largest component, because the square of a number can overflow
     away = (points - middle).abs()
     near = _TURNED * float(middle.abs().max())
     if float(away.max()) <= near:
@@ -69,7 +70,7 @@ def without_impossible(recording: Recording, *names: str) -> Recording:
 
 
 def _limit(away: Float[Tensor, " N"], taken: Bool[Tensor, " N"]) -> float:
-    """The distance beyond which there is nothing for long: from the first wide gap among the outer samples on."""
+    """The distance at which the first wide gap among the outer samples begins."""
     outer = away[taken].unsqueeze(-1)
     begin = order_statistic(outer, None, math.ceil((1.0 - _MOST) * len(outer)))
     ordered = away[away >= begin].sort().values

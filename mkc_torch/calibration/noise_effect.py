@@ -1,10 +1,10 @@
-"""What noise of the points themselves does to a fit through them: a bias, and information that is not there.
+"""Effect of noise in the points on an ellipsoid fit: bias, and spurious information.
 
-Regressors that are made of noisy points hold the square of the noise: it draws the parameters aside, and lends points
-that determine no ellipsoid, on two circles say, a curvature that only the noise has. To second order both are half the
-variance of the noise times the Laplacian of the moments by the points; less that, the moments are those of the points
+Regressors of noisy points contain the square of the noise. It biases the parameters, and gives points that do not
+determine an ellipsoid, for example on two circles, a spurious curvature. To second order both effects are half the
+variance of the noise times the Laplacian of the moments by the points; subtracting that gives the moments of the points
 without noise (Kukush, Markovsky & Van Huffel, "Consistent estimation in an implicit quadratic measurement error
-model", Computational Statistics & Data Analysis 47 (2004)). The noise is taken to be alike in all directions.
+model", Computational Statistics & Data Analysis 47 (2004)). The noise is assumed to be isotropic.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 __all__ = ["Bias", "NoisyMoments", "algebraic_rows", "bias_by_noise", "distance_rows", "moments_of"]
 
 _STEP = 0.25
-"""Step of the differences, in standard deviations of the noise: small beside what the rows curve over, and their
-rounding is 16 times that of the moments."""
+"""Step of the finite differences, in standard deviations of the noise: small compared with the curvature of the rows;
+the rounding error is 16 times that of the moments."""
 
 
 class NoisyMoments(NamedTuple):
-    """Weighted means of the products of rows, and the part of them that noise has lent, each (B, k, k)."""
+    """Weighted means of the products of rows, and the part of them that is due to noise, each (B, k, k)."""
 
     found: Float[Tensor, "B k k"]
     lent: Float[Tensor, "B k k"]
 
 
 class Bias(NamedTuple):
-    """Of the parameters (B, p), and the matrix (B, p, p) that their errors grow by without what the noise has lent."""
+    """Bias of the parameters (B, p), and the factor (B, p, p) by which their errors grow without the noise's part."""
 
     offset: Float[Tensor, "B p"]
     growth: Float[Tensor, "B p p"]
@@ -47,13 +47,13 @@ def moments_of(
     weight: Float[Tensor, "B N"],
     noise: Float[Tensor, " B"],
 ) -> NoisyMoments:
-    """Moments of rows that are made of points.
+    """Moments of rows that depend on noisy points.
 
     Args:
-        rows: of each point.
-        points: with their noise.
-        weight: of each point, not all 0.
-        noise: standard deviation of each component of the points, in their unit.
+        rows: computes the rows (B, N, k) of points.
+        points: the noisy points.
+        weight: weight of each point, not all 0.
+        noise: standard deviation of each component of the points, in their unit, (B,).
 
     Example:
         >>> points = torch.zeros(1, 1, 3).double()
@@ -71,16 +71,16 @@ def moments_of(
     found = at(points)
     lent = torch.zeros_like(found)
     for axis in torch.eye(3, dtype=points.dtype, device=points.device):
-        aside = (_STEP * noise)[:, None, None] * axis
-        lent = lent + (at(points + aside) - found) + (at(points - aside) - found)
+        shift = (_STEP * noise)[:, None, None] * axis
+        lent = lent + (at(points + shift) - found) + (at(points - shift) - found)
     return NoisyMoments(found, lent / (2.0 * _STEP**2))
 
 
 def bias_by_noise(moments: NoisyMoments) -> Bias:
-    """Of parameters at which the rows' mean product with the residual, their last element, is 0.
+    """Bias of parameters at which the mean product of the rows with the residual, their last element, is 0.
 
     Args:
-        moments: of rows of the residual's derivatives by the parameters and of the residual.
+        moments: moments of rows that hold the residual's derivatives by the parameters and the residual.
     """
     p = moments.found.shape[-1] - 1
     without = (moments.found - moments.lent)[:, :p, :p]
@@ -90,7 +90,7 @@ def bias_by_noise(moments: NoisyMoments) -> Bias:
 
 
 def algebraic_rows(coef: Float[Tensor, "B 9"]) -> Callable[[Float[Tensor, "B N 3"]], Float[Tensor, "B N 10"]]:
-    """Derivatives of the algebraic residual, ``1 - coef · monomials``, less their sign, and the residual's negative."""
+    """Negative derivatives of the algebraic residual, ``1 - coef · monomials``, and its negative."""
 
     def rows(points: Tensor) -> Tensor:
         regressors = monomials(points)
@@ -101,10 +101,10 @@ def algebraic_rows(coef: Float[Tensor, "B 9"]) -> Callable[[Float[Tensor, "B N 3
 
 def distance_rows(theta: Float[Tensor, "B 9"]) -> Callable[[Float[Tensor, "B N 3"]], Float[Tensor, "B N 10"]]:
     """Derivatives of :func:`sampson_distance` by its parameters, and the distance."""
-    of_one = torch.func.vmap(torch.func.jacfwd(sampson_distance), in_dims=(0, 0))
+    derivatives = torch.func.vmap(torch.func.jacfwd(sampson_distance), in_dims=(0, 0))
     distance = torch.func.vmap(sampson_distance)
 
     def rows(points: Tensor) -> Tensor:
-        return torch.cat([of_one(theta, points), distance(theta, points).unsqueeze(-1)], -1)
+        return torch.cat([derivatives(theta, points), distance(theta, points).unsqueeze(-1)], -1)
 
     return rows

@@ -1,4 +1,4 @@
-"""The refusal of points that determine no ellipsoid, with the directions that are not covered."""
+"""The error about points that do not determine an ellipsoid, with the directions that are not covered."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ __all__ = ["NotIdentifiableError"]
 class NotIdentifiableError(ValueError):
     """The points do not determine an ellipsoid.
 
-    ``coverage`` says which directions are missing and ``directions`` (K, 3) holds the vectors it was computed from,
-    about the best centre known; both are None where all points are equal.
+    ``coverage`` lists the missing directions. ``directions`` (K, 3) holds the vectors from which it was computed,
+    relative to the best known centre. Both are None if all points are equal.
     """
 
     def __init__(self, message: str, found: Coverage | None = None, directions: Tensor | None = None) -> None:
@@ -24,11 +24,12 @@ class NotIdentifiableError(ValueError):
 
 
 def middle_of(points: Tensor) -> Tensor:
+    """The centre of the bounding box of points, (*, 1, 3)."""
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
 def not_identifiable(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiableError:
-    """The error, with the directions that are covered and advice on those that are not; ``seen`` says from where."""
+    """Make the error, with coverage and missing directions; ``seen`` is a sentence about their origin."""
     flat = vectors.detach().reshape(-1, 3)
     directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
     if len(directions) == 0:
@@ -45,23 +46,25 @@ def not_identifiable(message: str, vectors: Tensor, *, seen: str = "") -> NotIde
     return NotIdentifiableError(message, found, directions)
 
 
-def told_of_equal(points: Tensor) -> str:
+def equal_points_message(points: Tensor) -> str:
+    """The error message for points of which more than half are equal."""
     if bool((points == points[..., :1, :]).all()):
         return "Not identifiable: all points are equal. Turn the sensor through all directions while recording."
     return "Not identifiable: more than half of the points are equal. Turn the sensor through all directions."
 
 
-def told_of_flat(points: Tensor) -> str:
+def flat_points_message(points: Tensor) -> str:
+    """The error message for points whose regressors are linearly dependent."""
     flat = points.reshape(-1, *points.shape[-2:])
     centred = flat - flat.mean(-2, keepdim=True)
-    for one in centred:
-        constant = [name for i, name in enumerate("xyz") if not bool(one[:, i].any())]
+    for problem in centred:
+        constant = [name for i, name in enumerate("xyz") if not bool(problem[:, i].any())]
         if constant:
             return (
                 f"Not identifiable: {' and '.join(constant)} never changes, so the points lie in a plane. "
                 "Turn the sensor through all directions, and check that channel."
             )
-        _, singular, axes = torch.linalg.svd(one, full_matrices=False)
+        _, singular, axes = torch.linalg.svd(problem, full_matrices=False)
         if float(singular[2]) < 1e-6 * float(singular[0]):
             x, y, z = axes[2].tolist()
             return (

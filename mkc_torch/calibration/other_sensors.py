@@ -1,4 +1,4 @@
-"""An accelerometer by the same ellipsoid, gravity in the place of the field; a gyroscope's bias from rest."""
+"""Calibrate an accelerometer by the ellipsoid of gravity, and estimate a gyroscope's bias from rest."""
 
 from __future__ import annotations
 
@@ -21,29 +21,30 @@ if TYPE_CHECKING:
 __all__ = ["ACCEL", "GRAVITY", "accelerometer", "as_magnetometer", "rest_bias"]
 
 GRAVITY = 9.80665
-"""Standard gravity in m/s²; at a place it is within 0.3 % of it."""
+"""Standard gravity in m/s²; local gravity is within 0.3 % of it."""
 
 MAG = ("mag_x", "mag_y", "mag_z")
 ACCEL = ("accel_x", "accel_y", "accel_z")
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
 
 _GRAVITY = (8.0, 12.0)
-"""What the radius is in m/s², with the gains of a chip that is not calibrated."""
+"""Plausible range of the radius in m/s², given the gains of an uncalibrated chip."""
 
 _FEWEST_RESTS = 9
-"""Rests from which samples of the turns between them, which motion accelerates, are left out: as many as unknowns."""
+"""Fewest rests, one for each unknown, with which the accelerated samples between rests are left out."""
 
 _WINDOW = 1.0
-"""Of a rest of a gyroscope, in s."""
+"""Length of a window in which a gyroscope may be at rest, in s."""
 
 _STILL = 3.0
-"""Times the scatter of the quietest window within which a gyroscope is still."""
+"""Largest scatter of a window at rest, in multiples of the scatter of the quietest window."""
 
 _FEWEST_WINDOWS = 3
+"""Fewest windows at rest for a bias."""
 
 
 def as_magnetometer(recording: Recording) -> Recording:
-    """The recording with ``accel_*`` in the place of ``mag_*``, and the samples of turns left out between rests."""
+    """Rename ``accel_*`` to ``mag_*``, and leave out the samples between rests."""
     axes = dict(zip(MAG, recording.stack(*ACCEL).unbind(-1), strict=True))
     kept = {name: recording[name] for name in ("time", "experiment") if name in recording}
     unit = recording.units[ACCEL[0]] or "m/s²"
@@ -66,28 +67,28 @@ def as_magnetometer(recording: Recording) -> Recording:
 
 
 def accelerometer(recording: Recording, calibrate: Callable[[Recording], Calibration]) -> Calibration:
-    """Calibrate ``accel_*`` by the ellipsoid that gravity draws.
+    """Calibrate ``accel_*`` by the ellipsoid of gravity.
 
-    Where the recording has nine rests or more, as one has that is turned from side to side by hand and laid down in
-    between, the samples of the turns are left out, for motion accelerates the sensor then.
+    If the recording has nine rests or more, as when the sensor is laid down on each side by hand, the samples between
+    rests are left out, because motion accelerates the sensor there.
 
     Args:
-        recording: with ``accel_x``, ``accel_y``, ``accel_z``.
-        calibrate: of a magnetometer whose columns they are taken for, in m/s².
+        recording: recording with ``accel_x``, ``accel_y``, ``accel_z``.
+        calibrate: calibrates the columns renamed to ``mag_*``, in m/s².
     """
     found = calibrate(as_magnetometer(recording))
     warnings = found.warnings
     if found.unit == "m/s²" and not _GRAVITY[0] < found.radius < _GRAVITY[1]:
         warnings = (
-            f"The radius of the ellipsoid is {found.radius:.3g} m/s², which is not gravity; these may be g, or counts. "
-            "The corrected acceleration is in m/s² all the same; offset and semi-axes are in the columns' own unit.",
+            f"The radius of the ellipsoid is {found.radius:.3g} m/s², which is not gravity; the columns may be in g, or "
+            "in counts. The corrected acceleration is still in m/s²; offset and semi-axes are in the columns' own unit.",
             *warnings,
         )
     return dataclasses.replace(found, warnings=warnings, field_unit="m/s²", sensor="accel")
 
 
 def _rests(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
-    """Which samples are of a rest; None where there are too few rests."""
+    """Mask of the samples at rest, (N,); None if there are too few rests."""
     turns = turning(points)
     if turns is None:
         return None
@@ -96,13 +97,13 @@ def _rests(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
 
 
 def rest_bias(recording: Recording) -> RestBias | None:
-    """What a gyroscope says while nothing turns; None without a time or a rest of three seconds.
+    """Estimate the bias of a gyroscope at rest; None without a time or a rest of three seconds.
 
-    A window of a second is one of rest where its rates scatter little more than in the quietest one and, less their
-    bias, are those of the other such windows.
+    A window of a second is at rest if its rates scatter little more than in the quietest window and agree with the
+    rates of the other windows at rest.
 
     Args:
-        recording: with ``time`` and ``gyro_*``, in the order of time.
+        recording: recording with ``time`` and ``gyro_*``, sorted by time.
 
     Example:
         >>> draw = torch.Generator().manual_seed(0)
@@ -128,7 +129,7 @@ def rest_bias(recording: Recording) -> RestBias | None:
     parts = rate[: windows * count].unflatten(0, (windows, count))
     middle, scatter = parts.mean(1), parts.std(1)
     quiet = (scatter <= _STILL * scatter.amin(0)).all(-1)
-    # a turn at a steady rate is as quiet; the smallest rates are those of rest
+    # a turn at a constant rate is as quiet; the smallest rates belong to rest
     size = torch.linalg.vector_norm(middle, dim=-1)
     slowest = middle[quiet][size[quiet].argmin()] if bool(quiet.any()) else middle[0]
     noise = _STILL * scatter.amin(0) * (0.5 + 3.0 * count**-0.5)
@@ -141,4 +142,4 @@ def rest_bias(recording: Recording) -> RestBias | None:
 
 
 _MOST_BIAS = 0.2
-"""Rate in rad/s, 11 °/s, beyond which the slowest is no bias but a turn."""
+"""Largest bias in rad/s, 11 °/s; a larger rate is a turn."""

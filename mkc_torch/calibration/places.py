@@ -1,4 +1,4 @@
-"""Where samples stand: at their time, or, where there is none, in a row of the recording."""
+"""Positions of samples: their times, or their rows if the recording has no time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 __all__ = ["disturbed_places", "numbered", "places"]
 
 _ROW = "row of the recording"
-"""A column's name that no file has: it would need no renaming."""
+"""Name of the internal column of row numbers."""
 
 _ROWS_A_SECOND = 50.0
-"""Rows that are taken for a second, where there is no time: rejected samples count as close together as at 50 Hz."""
+"""Assumed sampling rate in Hz without a time, for the intervals of rejected samples."""
 
 
 def numbered(recording: Recording) -> Recording:
-    """The recording with the numbers of its rows, from 1 on, where it has no time; they go along as rows are dropped.
+    """Add a column of row numbers, from 1, if the recording has no time; dropped rows keep the others' numbers.
 
     Example:
         >>> kept = numbered(Recording({"a": torch.zeros(3)})).rows(torch.tensor([0, 2]))
@@ -43,7 +43,7 @@ def numbered(recording: Recording) -> Recording:
 
 
 def places(recording: Recording) -> Float[Tensor, " N"]:
-    """Times of the samples in s, or the numbers of their rows, from 1 on."""
+    """Times of the samples in s, or their row numbers from 1, (N,)."""
     if recording.time is not None:
         return recording.time
     if _ROW in recording:
@@ -52,7 +52,7 @@ def places(recording: Recording) -> Float[Tensor, " N"]:
 
 
 def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tuple[RejectedInterval, ...]:
-    """:func:`mkc_torch.recording.disturbance.disturbed_intervals`, in rows where there is no time.
+    """:func:`mkc_torch.recording.disturbance.disturbed_intervals`, in rows if there is no time.
 
     Example:
         >>> row = torch.arange(1, 1001)
@@ -62,4 +62,4 @@ def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tupl
     if recording.time is not None:
         return disturbed_intervals(recording.time, rejected)
     found = disturbed_intervals(places(recording) / _ROWS_A_SECOND, rejected)
-    return tuple(RejectedInterval(*(float(round(end * _ROWS_A_SECOND)) for end in one)) for one in found)
+    return tuple(RejectedInterval(*(float(round(end * _ROWS_A_SECOND)) for end in interval)) for interval in found)

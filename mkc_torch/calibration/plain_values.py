@@ -1,4 +1,4 @@
-"""Tensors as the plain numbers that a result holds, and the size of residuals."""
+"""Convert tensors to the plain numbers of a result, and measure the size of residuals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a calibration draws, each picture on one pair of axes; ``calibration.plot`` and the report draw by it."""
+"""Plots of a calibration, each on its own axes, for ``calibration.plot`` and the report."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ __all__ = ["PLANES", "Calibrated", "CalibrationPlot", "draw_coverage", "draw_den
 
 PLANES = ("xy", "xz", "yz")
 _MOST_POINTS = 20_000
+"""Most points that a plot draws."""
+
 _SHARES = 50
-"""Parts of the samples, each from all of the recording, by which the places that are not covered are found."""
+"""Number of interleaved parts of the samples in the search for uncovered directions."""
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
 _CLOSE = 5.0
-"""Times the robust scatter that a close view reaches."""
+"""Half range of a close view, in multiples of the robust scatter."""
 
 
 class Calibrated(Protocol):
-    """What the pictures need of a calibration; lengths in ``unit``, the corrected field in ``field_unit``."""
+    """The interface of a calibration for plots; lengths are in ``unit``, the corrected field in ``field_unit``."""
 
     @property
     def unit(self) -> str: ...
@@ -64,10 +66,11 @@ class Calibrated(Protocol):
 
 
 class CalibrationPlot:
-    """The pictures of a calibration. Each method draws on ``ax``, or on a new figure of pyplot, and returns the axes.
+    """Plots of a calibration. Each method draws on ``ax``, or on a new pyplot figure, and returns the axes.
 
-    The samples are those that the calibration was made from. One that was read from a file has none: give the methods a
-    ``recording``. Needs matplotlib, which the extra ``cli`` has. Axes that are none are a TypeError.
+    The samples are those of the calibration. A calibration that was read from a file has no samples: pass a
+    ``recording`` to the methods. Plots need matplotlib, which the extra ``cli`` installs. An ``ax`` that is not
+    matplotlib axes raises a TypeError.
 
     Example:
         >>> from matplotlib import pyplot
@@ -91,18 +94,18 @@ class CalibrationPlot:
         recording: Recording | None = None,
         ax: Any = None,
     ) -> Any:
-        """Samples near a plane through the centre, measured or corrected, and the outline they should lie on.
+        """Plot the samples near a plane through the centre, measured or corrected, and their ideal outline.
 
-        Rejected samples are orange; those far from the plane are pale; + is the centre.
+        Rejected samples are orange; samples far from the plane are pale; + is the centre.
 
         Args:
-            plane: of the sensor's corrected axes.
-            corrected: the corrected field instead of what was measured.
+            plane: plane of the sensor's corrected axes.
+            corrected: plot the corrected field instead of the measurements.
             recording: samples to draw; default those of the calibration.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: another plane, or there are no samples to draw.
+            ValueError: an unknown plane, or no samples to draw.
         """
         if plane not in PLANES:
             raise ValueError(f"Expected argument `plane` to be one of {', '.join(PLANES)} but got {plane!r}.")
@@ -112,17 +115,17 @@ class CalibrationPlot:
         return ax
 
     def residual(self, *, close: bool = False, recording: Recording | None = None, ax: Any = None) -> Any:
-        """Length of the corrected field less what it should be, over time, in the unit of what was measured.
+        """Plot the length of the corrected field minus its nominal length over time, in the unit of the measurements.
 
         Rejected samples are orange, disturbed intervals shaded.
 
         Args:
-            close: five times the robust scatter to either side of zero instead of all samples.
+            close: limit the axis to five times the robust scatter to either side of zero.
             recording: samples to draw; default those of the calibration.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no samples to draw.
+            ValueError: no samples to draw.
         """
         samples = self._drawn(recording)
         points = samples.magnetometer()
@@ -138,10 +141,10 @@ class CalibrationPlot:
         return ax
 
     def weights(self, *, recording: Recording | None = None, ax: Any = None) -> Any:
-        """The weight in [0, 1] of each sample over time; below one half it counts as rejected, and is orange.
+        """Plot the weight in [0, 1] of each sample over time; samples below 0.5 count as rejected and are orange.
 
         Raises:
-            ValueError: there are no samples to draw.
+            ValueError: no samples to draw.
         """
         samples = self._drawn(recording)
         weight = array(self._calibration.weight(samples.magnetometer()))
@@ -158,15 +161,15 @@ class CalibrationPlot:
         return ax
 
     def density(self, *, tail: bool = False, recording: Recording | None = None, ax: Any = None) -> Any:
-        """A histogram of the residuals with the fitted density and a Gaussian of the same samples.
+        """Plot a histogram of the residuals with the fitted density and a Gaussian of the same samples.
 
         Args:
-            tail: all samples on a logarithmic scale, instead of the head on a linear one.
+            tail: show all samples on a logarithmic scale instead of the centre on a linear scale.
             recording: samples to draw; default those of the calibration.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no samples to draw.
+            ValueError: no samples to draw.
         """
         points = self._drawn(recording).magnetometer()
         ax = axes_or_new(ax)
@@ -178,14 +181,14 @@ class CalibrationPlot:
         return ax
 
     def coverage(self, *, recording: Recording | None = None, ax: Any = None) -> Any:
-        """The directions of the field in the sensor's axes in equal-area projection; what is hatched is not covered.
+        """Plot the directions of the field in the sensor's axes in equal-area projection; hatched areas are uncovered.
 
         Args:
             recording: samples to draw; default those of the calibration.
             ax: axes of matplotlib with the projection "mollweide".
 
         Raises:
-            ValueError: there are no samples to draw, or the axes have another projection.
+            ValueError: no samples to draw, or the axes have another projection.
         """
         c, points = self._calibration, self._drawn(recording).magnetometer()
         ax = axes_or_new(ax, projection="mollweide", size=(7.2, 3.6))
@@ -198,21 +201,21 @@ class CalibrationPlot:
             return numbered(recording).finite("mag_x", "mag_y", "mag_z")
         if self._samples is None:
             raise ValueError(
-                "A calibration that was read from a file holds no samples to draw; give its recording, as in "
+                "A calibration that was read from a file has no samples to draw; pass its recording, as in "
                 '`calibration.plot.residual(recording=Recording.read("RECORDING.csv"))`.'
             )
         return self._samples
 
 
 def draw_sphere(ax: Any, c: Calibrated, points: Tensor, plane: str, *, corrected: bool) -> None:
-    """Samples near a plane of the sensor's corrected axes through the centre, and the outline they should lie on."""
+    """Draw the samples near a plane of the sensor's corrected axes through the centre, and their ideal outline."""
     i, j = ("xyz".index(axis) for axis in plane)
     rejected = c.weight(points) < 0.5
     field = c.corrected(points)
     near = array(field[:, 3 - i - j].abs() < 0.2 * c.field_strength)
     outline = _ring(i, j) * c.field_strength
     middle, unit = (0.0, 0.0), c.field_unit
-    if not corrected:  # the plane carried back to what was measured
+    if not corrected:  # the plane mapped back to the measurements
         outline = np.array(c.center) + outline @ np.linalg.inv(np.array(c.matrix)).T
         middle, unit = (c.center[i], c.center[j]), c.unit
     _cloud(ax, field if corrected else points, rejected, near, i, j)
@@ -227,7 +230,7 @@ def draw_sphere(ax: Any, c: Calibrated, points: Tensor, plane: str, *, corrected
 
 
 def draw_residual(ax: Any, c: Calibrated, points: Tensor, place: Tensor) -> None:
-    """Residual of the norm over time, or over rows, rejected samples and disturbed intervals told apart."""
+    """Draw the residual of the norm over time or rows, with rejected samples and disturbed intervals marked."""
     r = array(c.norm_residual(points))
     x = array(place)
     _shade(ax, c)
@@ -240,7 +243,7 @@ def draw_residual(ax: Any, c: Calibrated, points: Tensor, place: Tensor) -> None
 
 
 def draw_density(ax: Any, c: Calibrated, points: Tensor, *, tail: bool) -> None:
-    """The fitted density over a histogram of the residuals: the head, or all of them on a logarithmic scale."""
+    """Draw the fitted density over a histogram of the residuals: the centre, or all on a logarithmic scale."""
     half_radius = 0.5 * c.radius
     e = half_radius * c.algebraic_residual(points).double()
     d, bound = half_radius * c.d, half_radius * c.bound
@@ -262,13 +265,13 @@ def draw_density(ax: Any, c: Calibrated, points: Tensor, *, tail: bool) -> None:
         least = 1.0 / (len(e) * (edges[1] - edges[0]))
         ax.set_ylim(0.3 * least, 3.0 * max(float(fitted.max()), float(value.max())))
         ax.set_yscale("log")
-        # a formula for each label, and ticks between the decades, would take as long as the rest of the picture
+        # math text in labels, and minor ticks, would take as long as the rest of the plot
         ax.minorticks_off()
         ax.yaxis.set_major_formatter(lambda value, _: _decade(value))
 
 
 def _decade(value: float) -> str:
-    """A power of ten in Unicode; "" for other values.
+    """Format a power of ten in Unicode; "" for other values.
 
     Example:
         >>> _decade(1e-3), _decade(100.0), _decade(2.0)
@@ -279,7 +282,7 @@ def _decade(value: float) -> str:
 
 
 def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
-    """Directions covered and not covered on Mollweide's map, with samples, axes and gaps."""
+    """Draw covered and uncovered directions on a Mollweide map, with samples, axes and gaps."""
     from matplotlib.colors import ListedColormap
 
     lon, lat = np.meshgrid(np.radians(np.linspace(-180, 180, 121)), np.radians(np.linspace(-90, 90, 61)))
@@ -290,7 +293,7 @@ def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
     if not covered.all():
         ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["///"])
     unit = torch.nn.functional.normalize(_thinned(directions), dim=-1).numpy()
-    # projected here, or the lines between them, which nobody draws, would be projected too, at 75 places each
+    # projected here, because matplotlib would also interpolate the undrawn lines between points, 75 times each
     place = ax.transProjection.transform(np.stack(_lon_lat(unit), -1))
     on_page = ax.transAffine + ax.transAxes
     ax.plot(*place.T, ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True, transform=on_page)
@@ -319,7 +322,7 @@ def _shade(ax: Any, c: Calibrated) -> None:
 
 
 def _kinds(rejected: np.ndarray) -> tuple[tuple[np.ndarray, str, str], ...]:
-    """Samples in use and rejected ones, with their colours and names."""
+    """Masks of used and rejected samples, with their colours and labels."""
     return (~rejected, BLUE, term("picture.in_use")), (rejected, ORANGE, term("label.rejected"))
 
 
@@ -340,7 +343,7 @@ def _cloud(ax: Any, points: Tensor, rejected: Tensor, near: np.ndarray, i: int, 
 
 
 def _square(ax: Any, x: np.ndarray, y: np.ndarray, *, include_origin: bool) -> None:
-    """Equal scales around the outline; rejected samples far away would shrink it, so they may lie outside."""
+    """Set equal scales around the outline; distant rejected samples may lie outside."""
     half = 0.62 * max(np.ptp(x), np.ptp(y))
     middle = 0.5 * (x.max() + x.min()), 0.5 * (y.max() + y.min())
     if include_origin and max(abs(middle[0]), abs(middle[1])) < half:
@@ -364,13 +367,13 @@ def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray
     grid = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1).reshape(-1, 3)
     unit = torch.nn.functional.normalize(_thinned(directions).float(), dim=-1)
     places, least = torch.from_numpy(grid).float(), float(np.cos(np.radians(NEAR_DEGREES)))
-    left = torch.arange(len(grid))
-    # a few samples from all of the recording cover most places; the others are compared with the rest
+    uncovered = torch.arange(len(grid))
+    # a few samples from the whole recording cover most directions; the rest is compared with the other samples
     for first in range(min(_SHARES, len(unit))):
-        for part in unit[first::_SHARES].split(256):  # what is compared stays in the cache
-            left = left[~((places[left] @ part.mT).amax(-1) > least)]
+        for part in unit[first::_SHARES].split(256):  # parts that fit into the cache
+            uncovered = uncovered[~((places[uncovered] @ part.mT).amax(-1) > least)]
     covered = np.ones(len(grid))
-    covered[left.numpy()] = 0.0
+    covered[uncovered.numpy()] = 0.0
     return covered.reshape(lon.shape)
 
 

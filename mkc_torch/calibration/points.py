@@ -1,4 +1,4 @@
-"""Points in space and their weights, checked."""
+"""Check points in space and their weights."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
 __all__ = ["MIN_POINTS", "prepared", "refuse_no_points"]
 
 MIN_POINTS = 9
-"""One for each coefficient of an ellipsoid."""
+"""Fewest points: as many as coefficients of an ellipsoid."""
 
 
 def refuse_no_points(points: Tensor) -> None:
+    """Raise an error unless ``points`` is a real tensor of shape (*, N, 3)."""
     refuse_not_real("points", points)
     if points.dim() < 2 or points.shape[-1] != 3:
-        mend = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
+        remedy = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
         if points.shape == (3,):
-            mend = "; one point is points[None]"
-        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{mend}.")
+            remedy = "; for a single point use points[None]"
+        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{remedy}.")
 
 
 def prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Checked points and weights; what a point of weight 0 holds is replaced, so that it can be anything."""
+    """Check points and weights; points of weight 0 may hold any values, which are replaced by those of a used point."""
     refuse_no_points(points)
     if points.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected argument `points` of dtype float32 or float64 but got {points.dtype}; use .float().")
@@ -33,7 +34,7 @@ def prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tens
         if sample_weight.shape != points.shape[:-1] and sample_weight.shape != points.shape[-2:-1]:
             raise ValueError(
                 f"Expected argument `sample_weight` of shape {tuple(points.shape[:-1])} "
-                f"but got {tuple(sample_weight.shape)}; it has one weight for each point."
+                f"but got {tuple(sample_weight.shape)}; give a weight for each point."
             )
         weight = sample_weight.to(points).expand(points.shape[:-1])
     count = points.shape[-2] if weight is None else int((weight > 0).sum(-1).min())

@@ -1,4 +1,4 @@
-"""The ellipsoid of a recording: refused where rest, coarse digits, or single samples would draw one."""
+"""Fit the ellipsoid of a recording; reject fits that only rest, coarse digits or single samples determine."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from mkc_torch.recording.recording import Recording
 __all__ = ["recorded_ellipsoid"]
 
 _ERRORS = 3.0
-"""Standard errors by which two fits to the same samples may differ."""
+"""Largest difference between two fits to the same samples, in standard errors."""
 
 
 _MOST_ALONG = 5000
-"""Samples of the sensor's way that a second fit takes, at least, evenly: it is compared by several standard errors."""
+"""Fewest samples of the sensor's path in the second fit, taken evenly; its standard errors must stay small."""
 
 
 def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
-    """The ellipsoid through the samples of a magnetometer by MKC-EM, a time series in the order of its rows.
+    """Fit an ellipsoid to the samples of a magnetometer by MKC-EM, as a time series in the order of its rows.
 
     Args:
-        recording: finite ``mag_x``, ``mag_y``, ``mag_z``, sorted by ``time`` where there is one; standard errors do not
-            reach from one ``experiment`` to the next.
-        seed: of the robust start.
+        recording: finite ``mag_x``, ``mag_y``, ``mag_z``, sorted by ``time`` if there is a time; standard errors treat
+            the runs of ``experiment`` as independent.
+        seed: seed of the robust start.
 
     Raises:
-        NotIdentifiableError: they do not determine one, or only by rest, coarse digits, or samples that stand apart.
+        NotIdentifiableError: the samples do not determine an ellipsoid, or only by rest, coarse digits or outliers.
 
     Example:
         >>> from mkc_torch.recording.demonstration import simulated_recording
@@ -49,7 +49,7 @@ def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
         fit = EllipsoidFit(estimator).fit(series, weight)
         _refuse_lattice(fit, points)
     except NotIdentifiableError:
-        # a sensor at rest is the better reason
+        # a sensor at rest is the better explanation
         refuse_at_rest(points, turns[0] if len(runs) == 1 else turning(points), recording.units["mag_x"])
         raise
     ways = [way(points[run], found) for run, found in zip(runs, turns, strict=True)]
@@ -61,14 +61,14 @@ def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
 
 
 def _refuse_lattice(fit: EllipsoidFit, points: Tensor) -> None:
-    """Refuse an ellipsoid no wider than a few steps of the digits: one passes through the points of a lattice.
+    """Reject an ellipsoid only a few digital steps wide: an ellipsoid passes through the points of any small lattice.
 
     Raises:
         NotIdentifiableError: the steps of a column are a large share of the shortest semi-axis.
     """
     steps = [column.unique().diff() for column in points.unbind(-1)]
     share = max(float(step.min()) for step in steps if len(step) > 0) / float(fit.semi_axes_[0])
-    # few points can be as far apart without any steps, but hardly two of them are equal then
+    # a few points can be as far apart without digital steps, but then hardly two of them are equal
     if share > MAX_SCATTER and 2 * len(distinct_rows(points)) <= len(points):
         raise NotIdentifiableError(
             f"Not identifiable: the measurements come in steps of {100.0 * share:.0f} % of the ellipsoid's shortest "
@@ -78,19 +78,19 @@ def _refuse_lattice(fit: EllipsoidFit, points: Tensor) -> None:
 
 
 def _along(fit: EllipsoidFit, went: Tensor, taken: Tensor) -> EllipsoidFit:
-    """The fit to the sensor's way, which samples that stand apart do not move."""
+    """Fit an ellipsoid to the sensor's path, on which single outliers have no influence."""
     try:
         return fit.fit(went, taken)
     except NotIdentifiableError as error:
-        told = f"{error} Single samples that stand apart from those before and after them do not count here."
-        raise NotIdentifiableError(told, error.coverage, error.directions) from None
+        message = f"{error} Single samples that differ from their neighbours are not used here."
+        raise NotIdentifiableError(message, error.coverage, error.directions) from None
 
 
 def _refuse_other(fit: EllipsoidFit, along: EllipsoidFit, went: Tensor) -> None:
-    """Refuse a fit that the sensor's way does not confirm: outliers to one side can draw a surface of their own.
+    """Reject a fit that the fit to the sensor's path does not confirm: one-sided outliers can form their own surface.
 
     Raises:
-        NotIdentifiableError: centre or semi-axes are others, by more than errors explain.
+        NotIdentifiableError: centre or semi-axes differ by more than their errors explain.
     """
     apart = torch.cat([along.center_ - fit.center_, along.semi_axes_ - fit.semi_axes_]).abs() / fit.radius_
     error = torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_
@@ -100,8 +100,8 @@ def _refuse_other(fit: EllipsoidFit, along: EllipsoidFit, went: Tensor) -> None:
     assert isinstance(found, Coverage)
     missing = "; ".join(str(gap) for gap in found.gaps)
     raise NotIdentifiableError(
-        "Not identifiable: single samples decide on the ellipsoid. Without those that stand apart from the ones before "
-        f"and after them, its centre or a semi-axis is off by {100.0 * float(apart.max()):.0f} % of the radius."
+        "Not identifiable: single samples determine the ellipsoid. Without samples that differ from their neighbours, "
+        f"its centre or a semi-axis changes by {100.0 * float(apart.max()):.0f} % of the radius."
         f"{f' Directions not covered: {missing}.' if missing else ''} Record again away from what disturbs the sensor, "
         "and turn it through all directions.",
         found,

@@ -1,4 +1,4 @@
-"""Stretches in which a column holds one value: where they lie, and what a change after one is measured by."""
+"""Find runs of equal samples, and measure the changes, digital steps and noise to compare them with."""
 
 from __future__ import annotations
 
@@ -13,25 +13,31 @@ if TYPE_CHECKING:
 __all__ = ["Repeat", "quietest_noise", "repeats", "step_of_digits", "usual_move"]
 
 _AFTER = 5
-"""Samples whose median is where a sensor is next: two that are disturbed do not move it."""
+"""Number of samples whose median is the next position of a sensor; two outliers do not change it."""
 
-_ORDER, _WINDOW = 4, 25
+_ORDER = 4
+"""Order of the differences from which noise is estimated."""
+
+_WINDOW = 25
+"""Differences in a window from which noise is estimated."""
+
 _DIFFERENCED = 70.0**0.5
-"""Root of the sum of squares of the binomial coefficients: what fourth differences make of independent noise. What
-moves smoothly has next to none, at any speed at which the samples still follow it."""
+"""Factor from the standard deviation of white noise to that of its fourth differences: the root of the sum of squared
+binomial coefficients. Smooth motion that the samples resolve has almost no fourth differences."""
 
 _QUIETEST = 0.05
+"""Quantile of the windows' noise that counts as the quietest."""
 
 
 class Repeat(NamedTuple):
-    """Rows ``start`` to ``end``, the latter not among them, that are equal."""
+    """Equal rows ``start`` to ``end``, excluding ``end``."""
 
     start: int
     end: int
 
 
 def repeats(values: Float[Tensor, "N k"], ends: list[int], least: int) -> list[Repeat]:
-    """Runs of at least so many equal rows; none reaches over the row numbers in ``ends``.
+    """Find sequences of at least ``least`` equal rows; no sequence crosses the row numbers in ``ends``.
 
     Example:
         >>> repeats(torch.tensor([[1.0], [2.0], [2.0], [2.0], [3.0]]), [], 2)
@@ -46,17 +52,17 @@ def repeats(values: Float[Tensor, "N k"], ends: list[int], least: int) -> list[R
 
 
 def next_place(values: Float[Tensor, "N k"], row: int, end: int) -> Float[Tensor, " k"] | None:
-    """Where the sensor is from a row on, before another row; None if there are too few samples to say."""
+    """The median position of the sensor after ``row`` and before ``end``, (k,); None with too few samples."""
     following = values[row : min(row + _AFTER, end)]
     return None if len(following) < _AFTER else following.median(0).values
 
 
 def usual_move(values: Float[Tensor, "N k"], free: Bool[Tensor, " N"]) -> float:
-    """How far a sensor goes, at the most usually, from one sample to the middle of the next five.
+    """99th percentile of a sensor's distance from a sample to the median of the next five.
 
     Args:
-        values: columns of one sensor.
-        free: rows to learn it from.
+        values: columns of a sensor.
+        free: mask of the rows from which it is estimated.
     """
     if len(values) <= _AFTER:
         return float("inf")
@@ -66,9 +72,9 @@ def usual_move(values: Float[Tensor, "N k"], free: Bool[Tensor, " N"]) -> float:
 
 
 def step_of_digits(column: Float[Tensor, " N"]) -> float:
-    """The least difference between two values; 0 where there is one value alone.
+    """The smallest difference between two values; 0 if there is only a single value.
 
-    Differences of rounding, which numbers that were multiplied have, are none.
+    Differences by rounding, as of scaled numbers, are ignored.
     """
     values = column.unique()
     steps = values.diff()
@@ -77,7 +83,7 @@ def step_of_digits(column: Float[Tensor, " N"]) -> float:
 
 
 def quietest_noise(column: Float[Tensor, " N"]) -> float:
-    """Standard deviation of the noise where it is least: of fourth differences in the quietest windows; 0 if few."""
+    """Standard deviation of the noise in the quietest windows, by fourth differences; 0 with too few samples."""
     differences = column.diff(n=_ORDER)
     if len(differences) < _WINDOW:
         return 0.0

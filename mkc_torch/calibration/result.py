@@ -1,4 +1,4 @@
-"""A calibration: what it holds and does, and calibration.json, its text of the schema "mkc-calibration/1"."""
+"""The result of a calibration, and its file calibration.json of the schema "mkc-calibration/1"."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SCHEMA = "mkc-calibration/1"
 
 
 class RestBias(NamedTuple):
-    """Bias of a gyroscope at rest and its standard errors, in rad/s, and for how long it rested, in s."""
+    """Bias of a gyroscope at rest and its standard errors, in rad/s, and the duration of the rest, in s."""
 
     value: Vector
     standard_error: Vector
@@ -47,36 +47,37 @@ class RestBias(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a recording says about its magnetometer: ``field = matrix @ (measured - center)``.
+    """The calibration of a magnetometer: ``field = matrix @ (measured - center)``.
 
-    Lengths are in ``unit``, the recording's, but for the corrected field, which is in ``field_unit``.
+    Lengths are in ``unit``, the unit of the recording; the corrected field is in ``field_unit``.
 
     Attributes:
         recording: name of the recording.
-        samples: samples in the fit.
-        unit: of what was measured.
+        samples: number of samples in the fit.
+        unit: unit of the measurements.
         center, center_se: offset (hard iron) and its standard errors.
-        semi_axes, semi_axes_se: of the ellipsoid, ascending.
+        semi_axes, semi_axes_se: semi-axes of the ellipsoid, ascending, and their standard errors.
         rotation: columns along the semi-axes, determinant +1.
-        matrix, matrix_se: the calibration matrix, symmetric.
+        matrix, matrix_se: the calibration matrix, symmetric, and its standard errors.
         radius: geometric mean of the semi-axes.
-        field_strength, field_unit: the length of the corrected field: the radius, unless it was given.
+        field_strength, field_unit: length of the corrected field and its unit; the radius unless it was given.
         sigma, d, bound: MKC density of :meth:`algebraic_residual`, no units; ``sigma`` is inf for Gaussian residuals.
-        before: of the measured norm about its median.
-        after: of :meth:`norm_residual`, rejected samples included.
-        rejected: number of samples of weight below one half.
-        disturbed: where rejected samples stand close together.
-        disturbed_unit: of it: "s", or "row", counted from 1, where the recording has no time.
-        aid: what stood in for turns that are missing, and what it did not determine; None of an ellipsoid. The matrix
-            then also turns the sensor's axes into those of the gyroscope or the attitude, and need not be symmetric.
-        sensor: "mag", or "accel" of an accelerometer, whose field is gravity.
-        rest_bias: of the gyroscope, while it rested; None without one, or without a rest.
-        coverage: of directions, by the samples in use.
-        warnings: sentences about the recording and the fit.
-        name: what the sensor is called: the recording's name, unless another was given.
-        tails: of :meth:`algebraic_residual`: whether heavier than a Gaussian's, and the share of the errors expected
-            beyond 3 d; None of an exact fit, and of a file that does not have them.
-        used: the samples that it was made from, which the pictures show; None where it was read from a file.
+        before: spread of the measured norm about its median.
+        after: spread of :meth:`norm_residual`, including rejected samples.
+        rejected: number of samples with a weight below 0.5.
+        disturbed: intervals in which most samples are rejected.
+        disturbed_unit: unit of ``disturbed``: "s", or "row" (counted from 1) if the recording has no time.
+        aid: the aiding data that replaced missing turns, and what remains undetermined; None for a plain ellipsoid fit.
+            With an aid, the matrix also rotates the sensor's axes into those of the gyroscope or the attitude, and
+            need not be symmetric.
+        sensor: "mag", or "accel" for an accelerometer, whose field is gravity.
+        rest_bias: bias of the gyroscope at rest; None without a gyroscope or a rest.
+        coverage: coverage of directions by the samples in use.
+        warnings: warnings about the recording and the fit.
+        name: name of the sensor; the recording's name unless another name was given.
+        tails: tails of :meth:`algebraic_residual` compared with a Gaussian's, and the expected share of errors beyond
+            3 d; None for an exact fit, and for a file without them.
+        used: the samples of the fit, for plots; None if the calibration was read from a file.
     """
 
     recording: str
@@ -111,7 +112,7 @@ class Calibration:
 
     @property
     def plot(self) -> CalibrationPlot:
-        """The pictures of the report as axes of matplotlib, such as ``calibration.plot.residual()``."""
+        """The plots of the report on matplotlib axes, such as ``calibration.plot.residual()``."""
         return CalibrationPlot(self, self.used)
 
     def __repr__(self) -> str:
@@ -138,12 +139,12 @@ class Calibration:
         return self.rejected / self.samples
 
     def corrected(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """The field in ``field_unit`` from measurements in ``unit``."""
+        """The corrected field in ``field_unit`` of measurements in ``unit``."""
         center, matrix = points.new_tensor(self.center), points.new_tensor(self.matrix)
         return (points - center) @ matrix.mT
 
     def norm_residual(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Length of the corrected field less what it should be, in ``unit``."""
+        """Length of the corrected field minus its nominal length, in ``unit``."""
         relative = torch.linalg.vector_norm(self.corrected(points), dim=-1) / self.field_strength
         return self.radius * (relative - 1.0)
 
@@ -152,13 +153,15 @@ class Calibration:
         return (self.corrected(points) / self.field_strength).square().sum(-1) - 1.0
 
     def weight(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """The weight in [0, 1] with which measurements enter the fit."""
+        """The weight in [0, 1] of measurements in the fit."""
         return mkc_weight(self.algebraic_residual(points), self.sigma, self.d)
 
     def apply(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
-        """The corrected field of a recording, row by row: ``time`` where it has one, ``field_x``, ``field_y``,
-        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field. Of an
-        accelerometer, what ``accel_*`` measured is corrected.
+        """Correct a recording row by row: ``time`` if it has a time, ``field_x``, ``field_y``, ``field_z`` in
+        ``field_unit``.
+
+        No row is dropped; the field is NaN where a measurement is missing. For an accelerometer, ``accel_*`` is
+        corrected.
 
         Raises:
             MissingColumnError: the recording has no ``mag_x``, ``mag_y`` or ``mag_z``.
@@ -178,30 +181,30 @@ class Calibration:
         return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
 
     def to_json(self) -> str:
-        """The calibration as JSON of the schema "mkc-calibration/1", from which :meth:`from_json` makes it again.
+        """Encode the calibration as JSON of the schema "mkc-calibration/1", the inverse of :meth:`from_json`.
 
-        Numbers round-trip exactly. JSON has no infinity and no NaN: ``sigma`` is the string "inf" where the residuals
-        are Gaussian, and a standard error that is not known is null.
+        Numbers round-trip exactly. JSON has no infinity and no NaN: ``sigma`` is the string "inf" for Gaussian
+        residuals, and an unknown standard error is null.
         """
         return calibration_to_json(self)
 
     @staticmethod
     def from_json(text: str) -> Calibration:
-        """The calibration of a JSON text.
+        """Decode a calibration from a JSON text.
 
         Raises:
-            CalibrationFileError: not JSON, of another schema, or a value that is missing or of the wrong kind.
+            CalibrationFileError: not JSON, another schema, or a value that is missing or of the wrong kind.
 
         Example:
             >>> Calibration.from_json('{"schema": "mkc-model/1"}')
             Traceback (most recent call last):
-            mkc_torch.calibration.file.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
+            mkc_torch.calibration.file.CalibrationFileError: this is not a calibration: its schema is "mkc-model/1", ...
         """
         return calibration_from_json(text)
 
 
 def calibration_to_json(calibration: Calibration) -> str:
-    """The text of calibration.json; see :meth:`Calibration.to_json`."""
+    """Encode a calibration; see :meth:`Calibration.to_json`."""
     c = calibration
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -250,22 +253,22 @@ def calibration_to_json(calibration: Calibration) -> str:
     if c.aid is not None:
         content["aided"] = aid_to_json(c.aid)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
-    # lists of numbers on one line; a text in JSON holds no line end, so none is touched
+    # join lists of numbers to a line; a JSON string contains no line break, so none is changed
     return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
 
 
 def calibration_from_json(text: str) -> Calibration:
-    """The calibration of a text; see :meth:`mkc_torch.calibration.Calibration.from_json`."""
+    """Decode a calibration; see :meth:`mkc_torch.calibration.Calibration.from_json`."""
     try:
         content = json.loads(text, parse_constant=refuse_constant)
     except json.JSONDecodeError as error:
         raise CalibrationFileError(
-            f"this is no calibration: line {error.lineno} is not JSON ({error.msg}); give it a calibration.json."
+            f"this is not a calibration: line {error.lineno} is not JSON ({error.msg}); give a calibration.json."
         ) from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA:
-        told = f'its schema is "{schema}", not "{SCHEMA}"' if isinstance(schema, str) else "it names no schema"
-        raise CalibrationFileError(f"this is no calibration: {told}; give it a calibration.json.")
+        reason = f'its schema is "{schema}", not "{SCHEMA}"' if isinstance(schema, str) else "it has no schema"
+        raise CalibrationFileError(f"this is not a calibration: {reason}; give a calibration.json.")
     c = CheckedValues(content)
     return Calibration(
         recording=c.text("recording"),

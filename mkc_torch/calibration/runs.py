@@ -1,4 +1,4 @@
-"""The runs of a recording: what follows one another in one run does, what lies in two does not."""
+"""Split a recording into runs, and keep samples of different runs independent."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ __all__ = ["apart", "in_each_run", "run_ends", "run_slices"]
 _EXPERIMENT = "experiment"
 
 _FARTHEST = 1.1447 * 1078.0 ** (1.0 / 3.0)
-"""Times the cube root of the number of samples: the widest bandwidth that Andrews' rule gives, at the correlation of
-0.97 at which it stops."""
+"""Largest bandwidth of Andrews' rule over the cube root of the number of samples, at its largest correlation, 0.97."""
 
 
 def run_slices(recording: Recording) -> tuple[slice, ...]:
-    """Where each run lies: the rows between two changes of ``experiment``, or all of them without that column.
+    """The rows of each run: between two changes of ``experiment``, or all rows without that column.
 
     Example:
         >>> run_slices(Recording({"experiment": torch.tensor([1, 1, 2])}))
@@ -38,24 +37,25 @@ def run_slices(recording: Recording) -> tuple[slice, ...]:
 
 
 def in_each_run(
-    points: Float[Tensor, "N 3"], runs: tuple[slice, ...], of_one: Callable[[Tensor], Tensor | None]
+    points: Float[Tensor, "N 3"], runs: tuple[slice, ...], function: Callable[[Tensor], Tensor | None]
 ) -> Tensor | None:
-    """What a function of consecutive samples says of each run, joined; None where it says nothing of one of them."""
-    found = [of_one(points[run]) for run in runs]
-    return None if any(one is None for one in found) else torch.cat([one for one in found if one is not None])
+    """Apply a function of consecutive samples to each run and join the results; None if it returns None for any run."""
+    found = [function(points[run]) for run in runs]
+    return None if any(part is None for part in found) else torch.cat([part for part in found if part is not None])
 
 
 def apart(
     runs: tuple[slice, ...], points: Float[Tensor, "N 3"], weight: Bool[Tensor, " N"]
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
-    """Points and weights with samples of weight 0 between the runs, so many that no bandwidth reaches over them.
+    """Insert samples of weight 0 between the runs, more than the largest bandwidth of a time series' standard errors.
 
-    Standard errors of a time series sum the products of samples that follow one another; of two runs none do.
+    Standard errors of a time series sum the products of neighbouring samples; samples of different runs are not
+    neighbours.
 
     Args:
-        runs: of :func:`run_slices`.
-        points: in the order of time within each run.
-        weight: which of them to take.
+        runs: from :func:`run_slices`.
+        points: points in the order of time within each run.
+        weight: mask of the points in use.
 
     Example:
         >>> points, weight = apart((slice(0, 2), slice(2, 5)), torch.ones(5, 3), torch.ones(5, dtype=torch.bool))
@@ -74,5 +74,5 @@ def apart(
 
 
 def run_ends(recording: Recording) -> Iterator[int]:
-    """The first row of each run but the first."""
+    """Yield the first row of each run except the first."""
     yield from (run.start for run in run_slices(recording)[1:])

@@ -1,4 +1,4 @@
-"""Where a sensor turns, and where it rests: a place where it stays is one direction, however long it stays there."""
+"""Detect where a sensor turns and where it rests, so that a rest counts as a single direction."""
 
 from __future__ import annotations
 
@@ -16,38 +16,43 @@ if TYPE_CHECKING:
 
 __all__ = ["refuse_at_rest", "thin_at_rest", "turning", "way"]
 
-_PARTS, _WIDEST = 200, 25
-"""The way is taken over windows of a hundredth of a recording, and of no more than so many samples to either side."""
+_PARTS = 200
+"""Number of half windows in a recording."""
+
+_WIDEST = 25
+"""Most samples of a window to either side of its centre."""
 
 _FAR = 9.0
-"""A window's way, over a sample's noise and the root of the window's length, from which it is a turn: three times what
-noise alone goes, which is the difference of two medians in three channels."""
+"""Smallest displacement of a turning window, in multiples of a sample's noise over the root of the window's length;
+noise alone, the difference of two medians in three channels, makes a third of it."""
 
 _ORDERED = 0.2
-"""Noise from sample to sample, over the distance from the middle within which nine in ten samples lie, at which they
-still come in an order."""
+"""Largest noise between samples of an ordered series, as a share of the radius that holds nine in ten samples."""
 
 _FEWEST = 20
+"""Fewest samples."""
 
 _SINGLE = 3
-"""Of a way, samples to either side of its middle: so many that stand apart together do not move it."""
+"""Samples to either side of the running median of the path; as many adjacent outliers do not change it."""
 
 _BENT = 0.3
-"""How far a sensor may turn in so many samples, as an angle in rad, for its way not to cut the corners."""
+"""Largest turn within half a window of the path, in rad; beyond it the running median cuts corners."""
 
-_AT_REST, _TURNS = 0.1, 0.1
-"""Distance from the middle as a share of the field, and share of turning samples, below which a sensor is at rest."""
+_AT_REST = 0.1
+"""Largest distance from the middle, as a share of the field, of a sensor at rest."""
+
+_TURNS = 0.1
+"""Largest share of turning samples of a sensor at rest."""
 
 
 def turning(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
-    """Whether the sensor turns at each sample: a running median goes further than noise takes it.
+    """Mask of the samples at which the sensor turns: a running median moves further than by noise.
 
     Args:
         points: measurements in the order of time, in any unit.
 
     Returns:
-        None where the samples are few or show no order: each is as far from the next as from any other, and hardly one
-        turns.
+        The mask (N,); None if the samples are few or unordered, that is, as far from the next sample as from any other.
 
     Example:
         >>> angle = torch.cat([torch.zeros(300), torch.linspace(0.0, 6.0, 300)])
@@ -62,13 +67,13 @@ def turning(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
     N = len(points)
     if N < _FEWEST:
         return None
-    # what is smooth has no second differences
+    # smooth motion has no second differences
     noise = robust_scale(points.diff(n=2, dim=0)).square().mean().sqrt() / math.sqrt(6.0)
     half = _half(N)
     middle = _running_median(points, half, half)
     number = torch.arange(N)
     before, after = (number - half).clamp(min=0), (number + half).clamp(max=N - 1)
-    # at the ends of the recording there is half of the way to be seen
+    # at the ends of the recording only half of the window exists
     far = torch.linalg.vector_norm(middle[after] - middle[before], dim=-1) * (2 * half / (after - before))
     found = far > _FAR * noise / math.sqrt(2 * half + 1)
     return None if bool(noise > _ORDERED * _reach(points)) and int(found.sum()) < _FEWEST else found
@@ -77,14 +82,14 @@ def turning(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
 def thin_at_rest(
     points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Literal["find"] | None = "find"
 ) -> Bool[Tensor, " N"]:
-    """Which samples to take, so that a stretch of rest counts as one window of turning does: of it so many, evenly.
+    """Mask of the samples to use: a rest is thinned evenly to as many samples as a window of turning has.
 
     Args:
         points: measurements in the order of time, in any unit.
-        turns: what :func:`turning` returns for them; "find" calls it.
+        turns: result of :func:`turning` for them; "find" computes it.
 
     Returns:
-        All of them where too few would be left.
+        The mask (N,); all samples if too few would remain.
 
     Example:
         >>> angle = torch.cat([torch.zeros(300), torch.linspace(0.0, 6.0, 300)])
@@ -106,14 +111,14 @@ def thin_at_rest(
 def way(
     points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Literal["find"] | None = "find"
 ) -> Float[Tensor, "N 3"] | None:
-    """Where the sensor went: a running median of seven samples, which single ones that stand apart do not move.
+    """The path of the sensor: a running median of seven samples, without single outliers.
 
     Args:
         points: measurements in the order of time, in any unit.
-        turns: what :func:`turning` returns for them; "find" calls it.
+        turns: result of :func:`turning` for them; "find" computes it.
 
     Returns:
-        None where samples are few, show no order, or are too rare: the sensor turns too far from one to the next.
+        The path (N, 3); None if samples are few, unordered, or too sparse for the sensor's turns.
 
     Example:
         >>> angle = torch.linspace(0.0, 6.0, 300)
@@ -133,21 +138,21 @@ def way(
 
 
 def refuse_at_rest(points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | None, unit: str) -> None:
-    """Refuse a sensor that does not turn: a ball of noise would pass for a small ellipsoid.
+    """Reject a sensor that does not turn: its ball of noise would pass for a small ellipsoid.
 
     Args:
         points: measurements in the order of time.
-        turns: what :func:`turning` says of them.
-        unit: of the measurements, for the sentence.
+        turns: result of :func:`turning` for them.
+        unit: unit of the measurements, for the message.
 
     Raises:
-        NotIdentifiableError: the measurements lie close together, and those that follow one another no closer.
+        NotIdentifiableError: the measurements are close together, and neighbours in time are no closer than others.
 
     Example:
         >>> rest = 40.0 + torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
         >>> refuse_at_rest(rest, turning(rest), "µT")
         Traceback (most recent call last):
-        mkc_torch.calibration.not_identifiable.NotIdentifiableError: Not identifiable: the sensor is at rest, ...
+        mkc_torch.calibration.not_identifiable.NotIdentifiableError: Not identifiable: the sensor is at rest; ...
     """
     middle = points.median(0).values
     spread = (points - middle).square().sum(-1).median()
@@ -156,23 +161,23 @@ def refuse_at_rest(points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Non
     if close and (turns is None or float(turns.double().mean()) < _TURNS):
         within = f"{float(spread.sqrt()):.2g} {unit}".rstrip()
         raise NotIdentifiableError(
-            f"Not identifiable: the sensor is at rest, half of its measurements stay within {within} of one value. "
+            f"Not identifiable: the sensor is at rest; half of its measurements are within {within} of a single value. "
             "Turn the sensor through all directions while recording."
         )
 
 
 def _reach(points: Tensor) -> Tensor:
-    """The distance from the middle within which nine in ten samples lie."""
+    """The radius about the median that holds nine in ten samples."""
     away = torch.linalg.vector_norm(points - points.median(0).values, dim=-1, keepdim=True)
     return order_statistic(away, None, math.ceil(0.9 * len(points)))
 
 
 def _running_median(points: Tensor, half: int, more: int) -> Tensor:
-    """Of so many samples to either side, and as if the recording went on, mirrored, for so many more at its ends."""
+    """Running median of ``half`` samples to either side; the ends are padded by ``more`` mirrored samples."""
     padded = torch.nn.functional.pad(points.mT, (more, more), mode="reflect")
     return padded.unfold(-1, 2 * half + 1, 1).median(-1).values.mT
 
 
 def _half(N: int) -> int:
-    """Samples of a window to either side of its middle."""
+    """Number of samples of a window to either side of its centre."""
     return min(max(N // _PARTS, 2), _WIDEST)

@@ -1,4 +1,4 @@
-"""Exact intervals of shares, and a test that numbers are uniform."""
+"""Exact confidence intervals of shares, and a test for uniformity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 @dataclass(frozen=True)
 class Share:
-    """``count`` of ``total``, with its interval."""
+    """The share ``count / total`` with its confidence interval."""
 
     count: int
     total: int
@@ -20,12 +20,12 @@ class Share:
 
     @property
     def value(self) -> float:
-        """NaN of nothing."""
+        """The share; NaN if ``total`` is 0."""
         return self.count / self.total if self.total else math.nan
 
 
 def share(count: int, total: int, level: float = 0.95) -> Share:
-    """The share with the interval of Clopper and Pearson (1934), which covers at least at the level.
+    """Return the share with its Clopper-Pearson interval (1934), whose coverage is at least the level.
 
     Example:
         >>> found = share(0, 10)
@@ -41,7 +41,7 @@ def share(count: int, total: int, level: float = 0.95) -> Share:
 
 
 def _at_least(count: int, total: int, p: float) -> float:
-    """P(X >= count) of a binomial."""
+    """Return P(X >= count) for a binomial variable."""
     k = torch.arange(count, total + 1, dtype=torch.float64)
     n = torch.tensor(float(total), dtype=torch.float64)
     ways = torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)
@@ -57,7 +57,7 @@ def _root(increasing: Callable[[float], float]) -> float:
 
 
 def uniformity(values: Sequence[float]) -> tuple[float, float]:
-    """Kolmogorov's distance of numbers from the uniform distribution on [0, 1], and its p-value.
+    """Return the Kolmogorov distance from the uniform distribution on [0, 1], and its p-value.
 
     References:
         Stephens, "EDF statistics for goodness of fit and some comparisons", JASA 69 (1974), table 1A, for the factor.
@@ -73,7 +73,7 @@ def uniformity(values: Sequence[float]) -> tuple[float, float]:
     steps = torch.arange(n + 1, dtype=torch.float64) / n
     distance = max(float((steps[1:] - x).max()), float((x - steps[:-1]).max()))
     scaled = distance * (math.sqrt(n) + 0.12 + 0.11 / math.sqrt(n))
-    if scaled < 0.2:  # the series does not settle there, and p is 1 to twelve digits
+    if scaled < 0.2:  # the series does not converge here; p is 1 to twelve digits
         return round(distance, 12), 1.0
     series = sum((-1) ** (k - 1) * math.exp(-2.0 * (k * scaled) ** 2) for k in range(1, 101))
     return round(distance, 12), min(max(2.0 * series, 0.0), 1.0)

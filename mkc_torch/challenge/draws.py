@@ -1,4 +1,4 @@
-"""Random numbers of the blind proof: every one comes from a generator that the case's address seeds."""
+"""Random numbers of the blind proof, from generators that are seeded by the address of a case."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Choice = TypeVar("Choice")
 
 
 def generator(*address: int | str) -> Generator:
-    """A generator of its own for each address, such as ``(seed, index, "noise")``.
+    """Return a separate generator for each address, such as ``(seed, index, "noise")``.
 
     Example:
         >>> bool(normal(generator(1, 2), 1) == normal(generator(1, 2), 1))
         True
     """
     digest = hashlib.sha256("/".join(map(str, address)).encode()).digest()
-    # torch's CPU generator takes 32 bits of its seed
+    # torch's CPU generator uses 32 bits of the seed
     return Generator().manual_seed(int.from_bytes(digest[:4], "big"))
 
 
@@ -41,7 +41,7 @@ def happens(g: Generator, share: float) -> bool:
 
 
 def whole(g: Generator, low: int, high: int) -> int:
-    """A whole number from ``low`` to ``high``, both included."""
+    """Draw an integer from ``low`` to ``high``, both included."""
     return int(torch.randint(low, high + 1, (), generator=g))
 
 
@@ -55,12 +55,12 @@ def normal(g: Generator, *shape: int) -> Tensor:
 
 
 def direction(g: Generator) -> Float[Tensor, " 3"]:
-    """A unit vector, uniform on the sphere."""
+    """Draw a unit vector, uniformly on the sphere."""
     return torch.nn.functional.normalize(normal(g, 3), dim=0)
 
 
 def unit_variance(g: Generator, family: str, *shape: int) -> Tensor:
-    """Independent errors of variance 1: ``gaussian``, ``laplace`` or ``student`` with five degrees of freedom.
+    """Draw independent errors of variance 1: ``gaussian``, ``laplace`` or ``student`` with five degrees of freedom.
 
     Example:
         >>> bool(abs(unit_variance(generator(0), "laplace", 20000).var() - 1) < 0.05)
@@ -80,11 +80,11 @@ def unit_variance(g: Generator, family: str, *shape: int) -> Tensor:
 
 
 def smooth(g: Generator, samples: int, columns: int, step: float, period: float) -> Float[Tensor, "N k"]:
-    """Band-limited paths of variance 1: normal errors under a Gaussian window of width ``period / 4`` seconds.
+    """Draw band-limited paths of variance 1, (N, k): white noise filtered by a Gaussian of width ``period / 4`` s.
 
     Args:
         step: time between samples in s.
-        period: shortest period that still has strength, in s.
+        period: shortest period with notable power, in s.
     """
     width = max(period / 4.0 / step, 1e-3)
     reach = max(math.ceil(4.0 * width), 1)

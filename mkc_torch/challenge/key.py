@@ -1,4 +1,4 @@
-"""The key to a recording: what was hidden in it, and how well it could be seen."""
+"""The key of a recording: its hidden physics, and how detectable it is."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class KeyParameter:
-    """A number that a diagnosis may state: ``value`` is the best a linear effect could say.
+    """True value of a parameter that a diagnosis may report.
 
-    ``scored`` is false where the linear form leaves so much of the true effect unsaid that an interval around it
-    means nothing.
+    ``value`` is that of the best linear approximation of the effect. ``scored`` is false if that approximation is
+    too coarse for an interval around it to be meaningful.
     """
 
     name: str
@@ -25,9 +25,9 @@ class KeyParameter:
 
 @dataclass(frozen=True)
 class KeyRival:
-    """Another explanation, and the number of standard deviations by which the data speak against it.
+    """Another explanation; ``z_sep`` is the number of standard errors by which the data reject it.
 
-    ``at`` is where it acts, of several places that a simulation has for it.
+    ``at`` names its ports, if the simulation has several.
     """
 
     effect: str
@@ -40,8 +40,8 @@ class KeyRival:
 class KeyEffect:
     """One hidden effect.
 
-    ``drivers`` are the columns it follows, empty where there is none or it was withheld; ``at`` the places of which a
-    diagnosis has to name one, of several that a simulation has, and empty where it has one only.
+    ``drivers`` are its columns; empty if it has none or its driver is withheld. ``at`` are the ports of which a
+    diagnosis has to name one; empty if the simulation has a single port.
     """
 
     effect: str
@@ -60,13 +60,12 @@ class KeyEffect:
 
 @dataclass(frozen=True)
 class Key:
-    """What the diagnosis is not told.
+    """Everything about a recording that the diagnosis does not get.
 
-    ``kind`` is ``empty``, ``single``, ``double`` or ``outside`` (of the catalogue); ``mode`` is what the recording
-    offers: ``norm``, ``gyro`` or ``attitude``, or the name of a system. Outliers are sample numbers. ``sensor`` holds
-    the true parameters of the sensor or the system. ``oracle_rms`` is the residual that a fit which knows the effect's
-    form and the noise leaves on the second recording's good samples: in µT, or in standard deviations of a system's
-    errors.
+    ``kind`` is ``empty``, ``single``, ``double`` or ``outside`` (of the catalogue). ``mode`` is the kind of recording,
+    ``norm``, ``gyro`` or ``attitude``, or the name of a system. Outliers are sample numbers. ``sensor`` holds the true
+    parameters of the sensor or the system. ``oracle_rms`` is the residual on the inliers of the second recording of a
+    fit that knows the effect's form and the noise: in µT, or in standard deviations of a system's errors.
     """
 
     name: str
@@ -84,12 +83,12 @@ class Key:
     columns: tuple[str, ...] = field(default=())
 
     def numbers(self) -> dict[str, Any]:
-        """The same as JSON would have it."""
+        """Return the key as JSON data."""
         return json.loads(json.dumps(asdict(self)))
 
 
 def canonical(keys: Sequence[Any]) -> str:
-    """One text for one set of keys, which are dataclasses: JSON without spaces, names in order.
+    """Return the canonical text of keys, which are dataclasses: JSON without spaces, with sorted names.
 
     Example:
         >>> canonical([])
@@ -99,12 +98,12 @@ def canonical(keys: Sequence[Any]) -> str:
 
 
 def digest(text: str) -> str:
-    """SHA-256 of the text in UTF-8, in hexadecimal."""
+    """Return the SHA-256 of the UTF-8 text, in hexadecimal."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def key_from(numbers: Mapping[str, Any]) -> Key:
-    """A key from its JSON.
+    """Read a key from JSON data.
 
     Example:
         >>> effect = KeyEffect("hard_iron_step", "", (), "", 4.0, 1.0, (), 9.0, 8.0, None, ())

@@ -1,4 +1,4 @@
-"""The proof's result for a reader: one HTML page with its pictures in it, and a summary in Markdown."""
+"""The result of the proof: an HTML page with pictures, and a summary in Markdown."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _SHARED = Path(__file__).parents[1] / "report" / "templates"
 def challenge_page(
     score: Score, baselines: Mapping[str, Score], keys: Sequence[Key], settings: Mapping[str, Any]
 ) -> str:
-    """The page. Needs the ``cli`` extra.
+    """Return the HTML page. Needs the ``cli`` extra.
 
     Args:
-        score: of the diagnosis.
-        baselines: name to score of what it is compared with.
-        keys: of all cases.
-        settings: of the run.
+        score: score of the diagnosis.
+        baselines: scores of the methods it is compared with, by name.
+        keys: keys of all cases.
+        settings: settings of the run.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
     from markupsafe import Markup
@@ -56,9 +56,9 @@ def challenge_page(
 
 
 def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str, Any]) -> str:
-    """The numbers in Markdown."""
+    """Return the numbers in Markdown."""
     lines = ["# The blind proof", "", *(f"- {name}: {value}" for name, value in settings.items()), ""]
-    lines += ["| asked | measured | holds |", "|---|---|---|"]
+    lines += ["| threshold | measured | holds |", "|---|---|---|"]
     lines += [
         f"| {m.threshold.sentence} | {measured_text(m)} | {'yes' if m.holds else '**no**'} |" for m in score.measured
     ]
@@ -67,13 +67,13 @@ def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str,
     lines += [f"| {label} | {' | '.join(cells)} |" for label, cells in comparison(score, baselines)]
     lines += ["", "| hidden | named first |", "|---|---|"]
     for hidden, row in score.confusion.items():
-        told = ", ".join(f"{name} {count}" for name, count in sorted(row.items(), key=lambda item: -item[1]))
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(row.items(), key=lambda item: -item[1]))
         lines.append(f"| {hidden} | {told} |")
     return "\n".join(lines) + "\n"
 
 
 def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, list[str]]]:
-    """Rows of the table that sets the diagnosis beside the baselines, but for what there were no recordings of."""
+    """Return the rows that compare the diagnosis with the baselines; a row without recordings is left out."""
     scores = [score, *baselines.values()]
     asked: Sequence[tuple[str, Callable[[Score], Share]]] = (
         ("false alarms on empty recordings", lambda s: s.false_alarms),
@@ -87,14 +87,14 @@ def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, 
     if sum(score.doubles.values()):
         rows.append(("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]))
     said = [
-        (f"said of empty recordings: {verdict}", [str(s.verdicts[verdict]) for s in scores])
+        (f"empty recordings: {verdict}", [str(s.verdicts[verdict]) for s in scores])
         for verdict in (ADEQUATE, UNEXPLAINED, UNFIT)
     ]
     return [*rows, *said, ("failed", [str(len(s.failed)) for s in scores])]
 
 
 def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:
-    """For each effect how often it was hidden, and how well it could be seen."""
+    """Return for each effect how often it was hidden, and how detectable it was."""
     found: dict[str, list[tuple[float, float]]] = {}
     for key in keys:
         for effect in key.effects:
@@ -112,7 +112,7 @@ def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:
 
 
 def share_text(share: Share) -> str:
-    """With its 95 % interval.
+    """Return a share with its 95 % interval.
 
     Example:
         >>> share_text(Share(3, 60, 0.01, 0.139))
@@ -129,7 +129,7 @@ def number_text(value: float) -> str:
 
 
 def measured_text(measured: MeasuredThreshold) -> str:
-    """What was measured, in per cent where that was asked for.
+    """Return a measured value, in per cent if the threshold is in per cent.
 
     Example:
         >>> from mkc_torch.challenge.thresholds import THRESHOLDS

@@ -1,4 +1,4 @@
-"""The pictures of the proof, as inline SVG whose text stays text."""
+"""The pictures of the proof, as inline SVG with selectable text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from mkc_torch.challenge.score import Bin, Score
 
-# Okabe and Ito's colours, told apart with any colour vision
+# Okabe and Ito's colours, distinguishable with any colour vision
 _BLUE, _ORANGE, _INK, _GREY, _PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
 _STYLE = {
     "font.family": "sans-serif",
@@ -38,7 +38,7 @@ _STYLE = {
 
 
 def power_curves(score: Score, baselines: Mapping[str, Score]) -> str:
-    """Shares found and named over z and over z_sep, with their intervals."""
+    """Plot the shares found and named over z and z_sep, with their intervals."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10.0, 3.8), layout="constrained")
         for ax, measure, title in zip(
@@ -60,7 +60,7 @@ def power_curves(score: Score, baselines: Mapping[str, Score]) -> str:
 
 
 def p_values(score: Score) -> str:
-    """Histogram of the p-values of empty recordings."""
+    """Plot a histogram of the p-values of empty recordings."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(10.0, 3.0), layout="constrained")
         ax = figure.subplots()
@@ -74,7 +74,7 @@ def p_values(score: Score) -> str:
 
 
 def confusion(score: Score) -> str:
-    """What was hidden against what was named."""
+    """Plot the confusion matrix of hidden and named effects."""
     hidden = list(score.confusion)
     named = sorted({name for row in score.confusion.values() for name in row})
     counts = np.array([[score.confusion[row].get(name, 0) for name in named] for row in hidden], dtype=float)
@@ -91,7 +91,7 @@ def confusion(score: Score) -> str:
         ax.set_yticks(range(len(hidden)), hidden)
         ax.set_xlabel("named first")
         ax.set_ylabel("hidden")
-        return _svg(figure, "confusion", "Confusion matrix: what was hidden against what was named first")
+        return _svg(figure, "confusion", "Confusion matrix: hidden effects and the effects named first")
 
 
 def _curve(ax: Any, x: np.ndarray, shares: Sequence[Any], color: str, label: str) -> None:
@@ -109,7 +109,7 @@ def _edge(b: Bin) -> str:
 
 
 def _svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an SVG element; its ids get a prefix, so that several can stand on one page."""
+    """Return the figure as an SVG element. Its ids get a prefix, so that a page can hold several."""
     FigureCanvasSVG(figure)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

@@ -1,4 +1,4 @@
-"""What every proof does with its recordings: processes to work in, stages that are told, diagnoses that may fail."""
+"""Shared by the proofs: processes, progress of stages, and diagnoses that may fail."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ R = TypeVar("R")
 
 
 def diagnose_batch(diagnose: Diagnose, folder: Path, paths: list[Path]) -> None:
-    """Have recordings diagnosed into a folder; one that cannot be leaves a text that says why."""
+    """Diagnose recordings into a folder. A failed diagnosis writes a text file with the error."""
     try:
         diagnose(paths, folder)
     except Exception as error:
-        # what is missing afterwards is scored as failed
+        # a missing diagnosis is scored as failed
         (folder / f"{paths[0].stem}.error.txt").write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
 
 
 def content_of(path: Path) -> dict[str, Any] | None:
-    """Of a JSON file; None where there is none.
+    """Return the content of a JSON file; None if there is no such file.
 
     Example:
         >>> content_of(Path("nowhere.json"))
@@ -45,7 +45,7 @@ def content_of(path: Path) -> dict[str, Any] | None:
 
 
 class Pool:
-    """Processes, or for one worker none."""
+    """A pool of processes; a single worker runs in this process."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
@@ -73,17 +73,17 @@ def every(
     run: Callable[[Callable[[T], R], Sequence[T]], Iterable[R]],
     job: Callable[[T], R],
     items: Sequence[T],
-    tell: Callable[[int, int], None],
+    report: Callable[[int, int], None],
 ) -> list[R]:
-    """What a job makes of all items; ``tell`` hears how many are done."""
-    return list(_told(run(job, items), len(items), tell))
+    """Return the results of a job for all items. ``report`` is called with the number done."""
+    return list(_reported(run(job, items), len(items), report))
 
 
-def _told(results: Iterable[R], total: int, tell: Callable[[int, int], None]) -> Iterator[R]:
+def _reported(results: Iterable[R], total: int, report: Callable[[int, int], None]) -> Iterator[R]:
     for done, result in enumerate(results, start=1):
-        tell(done, total)
+        report(done, total)
         yield result
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
+    """Ignore progress."""

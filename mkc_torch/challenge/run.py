@@ -1,4 +1,4 @@
-"""The proof from end to end: draw, seal, diagnose, open the key, score."""
+"""Run the proof: draw, seal the key, diagnose, open the key, score."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from mkc_torch.challenge.subject import Subject
 from mkc_torch.recording.recording import Recording, write_table
 
 Apply = Callable[[Path, Path], Mapping[str, Tensor]]
-"""From ``model.json`` and a recording the corrected columns, a row for a row."""
+"""Returns the corrected columns, row by row, given ``model.json`` and a recording."""
 
 SEED = 1
 
 SIMULATIONS = "simulations.py"
-"""Name of the file with the simulations in the proof's folder."""
+"""File of the nominal simulations in the proof's folder."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What a worker needs to know; it has no key in it."""
+    """The task of a worker; it does not contain the key."""
 
     subject: Subject
     seed: int
@@ -54,24 +54,24 @@ def run_challenge(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Score:
-    """Draw recordings, have them diagnosed, and only then compare with what was hidden.
+    """Draw recordings, diagnose them, and then compare the diagnoses with the keys.
 
     Into ``output`` go ``recordings/`` and ``second/`` (CSV), ``key_hash.txt`` before the first diagnosis,
-    ``diagnoses/``, then ``key.json``, ``score.json``, ``challenge.html`` and ``summary.md``; of differential equations
-    also ``simulations.py`` beside the recordings, what a user would have written.
+    ``diagnoses/``, then ``key.json``, ``score.json``, ``challenge.html`` and ``summary.md``; for
+    differential equations also ``simulations.py``, the simulations that a user would have written.
 
     Args:
-        diagnose: as a user would run it. A recording for which it writes nothing, or raises, counts as failed. With
-            more than one worker it has to be picklable, and so has ``apply``.
+        diagnose: diagnoses recordings as a user would. A recording without a written diagnosis counts as failed. With
+            several workers, ``diagnose`` and ``apply`` have to be picklable.
         apply: corrects a second recording.
-        subject: what the proof is about; default the magnetometer.
-        cases: recordings with something hidden; default the subject's own number.
-        empty: recordings with nothing hidden; default in the subject's own proportion to the cases.
-        seed: of everything that is drawn.
+        subject: family of recordings; default: the magnetometer.
+        cases: recordings with hidden physics; default: that of the subject.
+        empty: recordings without hidden physics; default: in the proportion of the subject.
+        seed: seed of all draws.
         output: a folder that is empty or does not exist.
-        workers: processes.
+        workers: number of processes.
         overwrite: accept a folder with files in it.
-        progress: called with a stage, how many are done, and of how many.
+        progress: called with the stage, the number done and the total.
     """
     subject = magnetometer() if subject is None else subject
     cases = subject.cases if cases is None else cases
@@ -84,20 +84,20 @@ def run_challenge(
         source = subject.simulations.read_text(encoding="utf-8")
         write_atomically(output / SIMULATIONS, source, overwrite=overwrite)
     work = _Work(subject, seed, output)
-    tell = progress or silent
+    report = progress or silent
     addresses = list(enumerate(_which_are_empty(seed, cases, empty)))
     with Pool(workers) as pool:
-        keys = every(pool, partial(_write_case, work), addresses, partial(tell, "draw"))
+        keys = every(pool, partial(_write_case, work), addresses, partial(report, "draw"))
         text = canonical(keys)
         write_atomically(output / "key_hash.txt", f"{digest(text)}\n", overwrite=overwrite)
         paths = [output / "recordings" / f"{key.name}.csv" for key in keys]
         batches = [paths[k : k + BATCH] for k in range(0, len(paths), BATCH)]
-        every(pool, partial(diagnose_batch, diagnose, output / "diagnoses"), batches, partial(tell, "diagnose"))
+        every(pool, partial(diagnose_batch, diagnose, output / "diagnoses"), batches, partial(report, "diagnose"))
         write_atomically(output / "key.json", f"{text}\n", overwrite=overwrite)
         hidden = [key for key in keys if key.kind != "empty"]
-        ratios = every(pool, partial(_second_ratio, apply, work), hidden, partial(tell, "second recordings"))
-        naive = {
-            name: every(pool, competitor, paths, partial(tell, "baseline"))
+        ratios = every(pool, partial(_second_ratio, apply, work), hidden, partial(report, "second recordings"))
+        baseline_results = {
+            name: every(pool, competitor, paths, partial(report, "baseline"))
             for name, competitor in subject.baselines.items()
         }
     names = [key.name for key in keys]
@@ -105,8 +105,8 @@ def run_challenge(
     found = {key.name: ratio for key, ratio in zip(hidden, ratios, strict=True)}
     result = score(keys, diagnoses, found, subject.thresholds)
     baselines = {
-        name: score(keys, dict(zip(names, told, strict=True)), thresholds=subject.thresholds)
-        for name, told in naive.items()
+        name: score(keys, dict(zip(names, results, strict=True)), thresholds=subject.thresholds)
+        for name, results in baseline_results.items()
     }
     settings = {
         "family": subject.name,

@@ -1,4 +1,4 @@
-"""One world of a proof: what noise and inputs are like in it, how its cases are drawn, and what is asked there."""
+"""A scenario of a proof: its kind of noise and inputs, how its cases are drawn, and its thresholds."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mkc_torch.recording.recording import Recording
 
 @dataclass(frozen=True)
 class KeyDisturbance:
-    """What disturbs without being recorded.
+    """An unrecorded disturbance.
 
     Attributes:
-        kind: name of the world that has such disturbances.
-        at: the state whose rate is pushed, or the sensor.
-        size: standard deviation in ``unit``; of white force noise the root of its spectral density.
-        over_noise: what it leaves in the fitted free run over the sensor's noise, root mean square.
-        words: its times in s and the like.
+        kind: name of the scenario with such disturbances.
+        at: the state whose rate is disturbed, or ``sensor``.
+        size: standard deviation in ``unit``; for white process noise the square root of its spectral density.
+        over_noise: RMS of the residual that it causes in the fitted open-loop run, over the sensor's noise.
+        words: further numbers by name, such as times in s.
     """
 
     kind: str
@@ -33,33 +33,33 @@ class KeyDisturbance:
 
 @dataclass(frozen=True)
 class ScenarioKey:
-    """What the diagnosis of a case is not told.
+    """Everything about a case that the diagnosis does not get.
 
     Attributes:
-        world: its name.
-        index: of the case among those of its world, with something hidden or with nothing.
-        key: what was hidden, if anything, and how well it could be seen.
-        push: what disturbs.
-        useless: why the simulation is of no use; "" where it is of use.
-        follows: of a useless one, the largest share of an output's variation that its best fit explains.
+        scenario: name of the scenario.
+        index: number of the case among those of its scenario with hidden physics, or among those without.
+        key: the hidden physics, if any, and how detectable it is.
+        disturbance: the disturbance, if any.
+        useless: why the simulation is unusable; "" for a usable simulation.
+        follows: for an unusable simulation, the largest share of an output's variation that its best fit explains.
     """
 
-    world: str
+    scenario: str
     index: int
     key: Key
-    push: KeyDisturbance | None = None
+    disturbance: KeyDisturbance | None = None
     useless: str = ""
     follows: float | None = None
 
     @property
     def name(self) -> str:
-        """Of the recording."""
+        """Name of the recording."""
         return self.key.name
 
 
 @dataclass(frozen=True)
 class ScenarioCase:
-    """``simulation`` is the text of the Python file that the diagnosis is given; "" for the family's own."""
+    """A drawn case. ``simulation`` is the Python source given to the diagnosis; "" for the simulation of the family."""
 
     recording: Recording
     simulation: str
@@ -67,22 +67,22 @@ class ScenarioCase:
 
 
 Draw = Callable[[int, int, bool, int], ScenarioCase]
-"""From the seed, the index, whether something is hidden, and the number in the recording's name."""
+"""Returns a case, given the seed, the index, whether physics is hidden, and the number in the recording's name."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One world. Its function is that of a module, which other processes can import.
+    """A scenario. ``draw`` is a top-level function, so that other processes can import it.
 
     Attributes:
-        name: as a user asks for it.
-        sentence: what it is like.
-        draw: a case of it.
-        aims: what is asked of diagnoses there.
-        hides: something may be hidden in it.
-        right_to_say, wrong_to_say: what is right to say in it, and what is not.
-        half: by default as many recordings have something hidden as have nothing; else a third as many.
-        apart: what is claimed in it is counted apart, and not in the row of all worlds.
+        name: value of ``--only``.
+        sentence: description.
+        draw: draws a case.
+        aims: thresholds for its diagnoses.
+        hides: whether physics may be hidden in it.
+        right_to_say, wrong_to_say: right and wrong results, for the page.
+        half: by default the recordings with hidden physics are as many as those without; otherwise a third.
+        apart: its claims are left out of the row of all scenarios.
     """
 
     name: str
@@ -96,7 +96,7 @@ class Scenario:
     apart: bool = False
 
     def hidden(self, empty: int, asked: int | None = None) -> int:
-        """How many recordings have something hidden, beside so many that have nothing, unless a number is asked for.
+        """Return the number of recordings with hidden physics, given the number without; ``asked`` overrides it.
 
         Example:
             >>> Scenario("white", "", lambda *_: None, ()).hidden(60)
@@ -111,9 +111,9 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Scenarios:
-    """All worlds of a family; ``totals`` are the aims of all of its useful recordings together."""
+    """All scenarios of a family. ``totals`` are the thresholds of its usable recordings together."""
 
     family: str
-    worlds: Sequence[Scenario]
+    scenarios: Sequence[Scenario]
     totals: Sequence[Threshold]
     settings: Mapping[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The score: what the diagnoses say against what the keys know."""
+"""The score: diagnoses compared with keys."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mkc_torch.challenge.verdict import (
     NOTHING,
     VERDICTS,
     StatedDiagnosis,
-    answer,
     covered,
     driver_right,
     located_right,
     named_right,
+    stated_diagnosis,
 )
 
 BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
@@ -32,12 +32,12 @@ BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
 T = TypeVar("T")
 
 ONSET_TOLERANCE = 1.0
-"""s."""
+"""Largest error of an onset that counts as right, s."""
 
 
 @dataclass(frozen=True)
 class Bin:
-    """Single effects with ``low <= z < high``: how many raised an alarm, and how many were named right."""
+    """Single effects with ``low <= z < high``: the shares that were found and named right."""
 
     low: float
     high: float
@@ -47,7 +47,7 @@ class Bin:
 
 @dataclass(frozen=True)
 class MeasuredThreshold:
-    """One threshold and what was measured."""
+    """A threshold and the measured value."""
 
     threshold: Threshold
     value: float
@@ -61,11 +61,11 @@ class MeasuredThreshold:
 class Score:
     """The result of a proof. Single effects with z and z_sep of at least ten are called strong.
 
-    A false alarm is a claim that physics is missing, of the empty recordings that were diagnosed; ``verdicts`` counts
-    what was said of all empty ones, and what failed.
-    ``confusion`` counts what was hidden (an effect, ``nothing``, or an effect with its driver withheld) against what
-    was named first; ``located`` how many strong ones were put at the right of several places; ``doubles`` how many of
-    two hidden effects were named; ``ratios`` are residuals on second recordings relative to the oracle's.
+    A false alarm is a claim of missing physics in an empty recording that was diagnosed. ``verdicts`` counts the
+    verdicts and failures of all empty recordings.
+    ``confusion`` counts hidden effects (an effect, ``nothing``, or an effect with its driver withheld) by the effect
+    named first. ``located`` is the share of strong effects found at the right port. ``doubles`` counts how many of two
+    hidden effects were named. ``ratios`` are residuals on second recordings relative to the oracle's.
     """
 
     false_alarms: Share
@@ -95,16 +95,16 @@ class Score:
     measured: tuple[MeasuredThreshold, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """As JSON has it; infinite and undefined numbers become null."""
+        """Return the score as JSON data; infinite and undefined numbers become null."""
         return plain_numbers(asdict(self) | {"holds": {m.threshold.measure: m.holds for m in self.measured}})
 
 
 @dataclass(frozen=True)
 class _Single:
-    """A recording with one hidden effect of the catalogue, and what was said about it."""
+    """A recording with one hidden effect of the catalogue, and its diagnosis."""
 
     truth: KeyEffect
-    said: StatedDiagnosis
+    stated: StatedDiagnosis
 
     @property
     def strong(self) -> bool:
@@ -112,15 +112,15 @@ class _Single:
 
     @property
     def named(self) -> bool:
-        return bool(self.said.claims) and named_right(self.said.claims[0].named, self.truth)
+        return bool(self.stated.claims) and named_right(self.stated.claims[0].named, self.truth)
 
     @property
     def driver(self) -> bool:
-        return bool(self.said.claims) and driver_right(self.said.claims[0].named, self.truth)
+        return bool(self.stated.claims) and driver_right(self.stated.claims[0].named, self.truth)
 
     @property
     def located(self) -> bool:
-        return bool(self.said.claims) and located_right(self.said.claims[0].named, self.truth)
+        return bool(self.stated.claims) and located_right(self.stated.claims[0].named, self.truth)
 
 
 def score(
@@ -132,18 +132,18 @@ def score(
     """Compare diagnoses with keys.
 
     Args:
-        keys: of all cases.
-        diagnoses: name of a recording to the content of its ``diagnosis.json``; a name that is missing failed.
-        ratios: name to the residual of the corrected second recording relative to the oracle's.
-        thresholds: what is asked for.
+        keys: keys of all cases.
+        diagnoses: contents of ``diagnosis.json`` by the recording's name; a missing name counts as failed.
+        ratios: residuals of the corrected second recordings relative to the oracle's, by name.
+        thresholds: thresholds of the proof.
     """
-    said = {key.name: answer(diagnoses.get(key.name)) for key in keys}
-    singles = [_Single(key.effects[0], said[key.name]) for key in keys if key.kind == "single"]
+    stated = {key.name: stated_diagnosis(diagnoses.get(key.name)) for key in keys}
+    singles = [_Single(key.effects[0], stated[key.name]) for key in keys if key.kind == "single"]
     strong = [case for case in singles if case.strong]
-    empty = [said[key.name] for key in keys if key.kind == "empty"]
+    empty = [stated[key.name] for key in keys if key.kind == "empty"]
     p_values = tuple(a.p_value for a in empty if a.p_value is not None)
     distance, p_uniform = uniformity(p_values)
-    told = [case for case in singles if case.truth.z_sep >= INSEPARABLE_BELOW and case.said.claims]
+    separable = [case for case in singles if case.truth.z_sep >= INSEPARABLE_BELOW and case.stated.claims]
     by_effect, missing = coverage(singles)
     strong_names = {k.name for k in keys if k.kind == "single" and min(k.effects[0].z, k.effects[0].z_sep) >= STRONG_Z}
     results: dict[str, Any] = {
@@ -152,15 +152,15 @@ def score(
         "p_values": p_values,
         "p_distance": distance,
         "p_uniform": p_uniform,
-        "confusion": confusion(keys, said),
+        "confusion": confusion(keys, stated),
         "strong": len(strong),
         "named": share_of(strong, lambda case: case.named),
         "driver": share_of([case for case in strong if not case.truth.at], lambda case: case.driver),
         "located": share_of([case for case in strong if case.truth.at], lambda case: case.located),
         "withheld_named": share_of([case for case in strong if case.truth.withheld], lambda case: case.named),
-        "extra": share_of(strong, lambda case: len(case.said.claims) > 1),
-        "separable": share_of(told, lambda case: not case.said.claims[0].others),
-        "candidates": _mean([1.0 + len(case.said.claims[0].others) for case in told]),
+        "extra": share_of(strong, lambda case: len(case.stated.claims) > 1),
+        "separable": share_of(separable, lambda case: not case.stated.claims[0].others),
+        "candidates": _mean([1.0 + len(case.stated.claims[0].others) for case in separable]),
         "onset_errors": onset_errors(strong),
         "onset_covered": onset_covered(singles),
         "coverage": share(sum(s.count for s in by_effect.values()), sum(s.total for s in by_effect.values())),
@@ -169,23 +169,23 @@ def score(
         "power_z": power(singles, lambda truth: truth.z),
         "power_z_sep": power(singles, lambda truth: truth.z_sep),
         "ratios": tuple(ratio for name, ratio in (ratios or {}).items() if name in strong_names),
-        "doubles": doubles(keys, said),
-        "failed": tuple(name for name, a in said.items() if a.verdict == FAILED),
+        "doubles": doubles(keys, stated),
+        "failed": tuple(name for name, a in stated.items() if a.verdict == FAILED),
     }
     return Score(**results, measured=_measured(results, thresholds))
 
 
-def confusion(keys: Sequence[Key], said: Mapping[str, StatedDiagnosis]) -> dict[str, dict[str, int]]:
-    """What was hidden, to what was named first, to how often; two at once are left out."""
+def confusion(keys: Sequence[Key], stated: Mapping[str, StatedDiagnosis]) -> dict[str, dict[str, int]]:
+    """Count the first names by hidden effect; cases with two effects are left out."""
     counts: dict[str, Counter[str]] = {}
     for key in keys:
         if key.kind != "double":
-            counts.setdefault(hidden_name(key), Counter())[said[key.name].name] += 1
+            counts.setdefault(hidden_name(key), Counter())[stated[key.name].name] += 1
     return {hidden: dict(counter) for hidden, counter in sorted(counts.items())}
 
 
 def hidden_name(key: Key) -> str:
-    """The row of a case in the confusion matrix."""
+    """Return the row of a case in the confusion matrix."""
     if not key.effects:
         return NOTHING
     effect = key.effects[0]
@@ -193,10 +193,10 @@ def hidden_name(key: Key) -> str:
 
 
 def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
-    """s, of steps that were named; infinite where no onset was given."""
+    """Return the onset errors of named steps, s; infinite if no onset was reported."""
     errors = []
     for case in cases:
-        truth, findings = case.truth, case.said.claims
+        truth, findings = case.truth, case.stated.claims
         if truth.effect == "hard_iron_step" and findings and findings[0].named.effect == truth.effect:
             onset = findings[0].onset
             errors.append(math.inf if onset is None or truth.onset is None else abs(onset - truth.onset))
@@ -204,50 +204,50 @@ def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
 
 
 def onset_covered(cases: Sequence[_Single]) -> Share:
-    """Of the steps that were named, those whose onset lies in the interval that was told with it."""
-    told = [
-        (case.truth.onset, case.said.claims[0].onset_interval)
+    """Return the share of named steps whose onset lies in the reported interval."""
+    onsets = [
+        (case.truth.onset, case.stated.claims[0].onset_interval)
         for case in cases
-        if case.named and case.said.claims[0].named.effect == case.truth.effect and case.truth.onset is not None
+        if case.named and case.stated.claims[0].named.effect == case.truth.effect and case.truth.onset is not None
     ]
     inside = [
-        onset is not None and interval is not None and interval[0] <= onset <= interval[1] for onset, interval in told
+        onset is not None and interval is not None and interval[0] <= onset <= interval[1] for onset, interval in onsets
     ]
     return share(sum(inside), len(inside))
 
 
 def coverage(cases: Sequence[_Single]) -> tuple[dict[str, Share], int]:
-    """Of the numbers of effects named right, by effect; and how many parameters the diagnoses do not have."""
+    """Return the coverage of intervals by effect, for right names, and the number of missing parameters."""
     inside: dict[str, list[bool]] = {}
     missing = 0
     for case in cases:
-        if not (case.named and case.driver) or case.said.claims[0].named.effect != case.truth.effect:
+        if not (case.named and case.driver) or case.stated.claims[0].named.effect != case.truth.effect:
             continue
         for parameter in case.truth.parameters:
             if not parameter.scored:
                 continue
-            found = covered(case.said.claims[0], parameter)
+            found = covered(case.stated.claims[0], parameter)
             missing += found is None
             inside.setdefault(case.truth.effect, []).extend(found or [])
     return {effect: share(sum(hits), len(hits)) for effect, hits in sorted(inside.items())}, missing
 
 
 def power(cases: Sequence[_Single], measure: Callable[[KeyEffect], float]) -> tuple[Bin, ...]:
-    """Shares found and named right, in bins of z or z_sep."""
+    """Return the shares found and named right, in bins of z or z_sep."""
     bins = []
     for low, high in pairwise(BINS):
         part = [case for case in cases if low <= measure(case.truth) < high]
-        found = share_of(part, lambda case: case.said.found)
+        found = share_of(part, lambda case: case.stated.found)
         bins.append(Bin(low, high, found, share_of(part, lambda case: case.named)))
     return tuple(bins)
 
 
-def doubles(keys: Sequence[Key], said: Mapping[str, StatedDiagnosis]) -> dict[int, int]:
-    """How many of two hidden effects were named, to how often."""
+def doubles(keys: Sequence[Key], stated: Mapping[str, StatedDiagnosis]) -> dict[int, int]:
+    """Count the cases with two effects by the number of effects named right."""
     counts = {0: 0, 1: 0, 2: 0}
     for key in keys:
         if key.kind == "double":
-            left = [finding.named for finding in said[key.name].claims]
+            left = [finding.named for finding in stated[key.name].claims]
             right = 0
             for truth in key.effects:
                 match = next((k for k, named in enumerate(left) if named_right(named, truth)), None)
@@ -278,7 +278,7 @@ def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tu
 
 
 def share_of(cases: Sequence[T], holds: Callable[[T], bool]) -> Share:
-    """The share of cases for which it holds, with its interval.
+    """Return the share of cases for which a condition holds, with its interval.
 
     Example:
         >>> share_of([1, 2, 3], lambda number: number > 2).count
@@ -292,7 +292,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def plain_numbers(value: Any) -> Any:
-    """As JSON can hold it: lists for tuples, null for what is not finite.
+    """Return the value as JSON data: lists for tuples, null for numbers that are not finite.
 
     Example:
         >>> plain_numbers({"a": (1.0, math.inf)})

@@ -1,4 +1,4 @@
-"""What a proof is about: how its cases are drawn, what is asked of them, and what stands beside the diagnosis."""
+"""The subject of a proof: how its cases are drawn, its thresholds, and the baselines."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mkc_torch.challenge.thresholds import Threshold
 from mkc_torch.recording.recording import Recording
 
 Ratio = Callable[[Mapping[str, Tensor], Recording, Key], float]
-"""From what a corrected model makes of a second recording, that recording and its key: residual over the oracle's."""
+"""Returns the residual relative to the oracle's, given the corrected second recording, the recording and its key."""
 
-Naive = Callable[[Path], Mapping[str, Any] | None]
-"""What a naive competitor would write into ``diagnosis.json`` of a recording's file; None where it fails."""
+Baseline = Callable[[Path], Mapping[str, Any] | None]
+"""Returns the content of ``diagnosis.json`` by a simple method, given the recording's file; None if it fails."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """``second`` is of the same sensor in another motion, with the effect still acting; None for an empty case."""
+    """A drawn case. ``second`` is another recording of the same sensor with the same effect; None for an empty case."""
 
     recording: Recording
     second: Recording | None
@@ -31,17 +31,17 @@ class Case:
 
 @dataclass(frozen=True)
 class Subject:
-    """One family of simulations. Its functions are those of modules, which other processes can import.
+    """A family of simulations. Its functions are top-level functions, so that other processes can import them.
 
     Attributes:
-        name: as a user asks for it.
-        cases, empty: recordings with something hidden and with nothing, by default.
-        draw: the case of a seed and an index, which is ``empty`` or not.
-        ratio: how well a second recording is corrected.
-        thresholds: what is asked for.
-        baselines: naive competitors by their names.
-        settings: what of it is printed with the result.
-        simulations: a Python file that the diagnosis is given a copy of, beside the recordings.
+        name: value of ``--family``.
+        cases, empty: default numbers of recordings with and without hidden physics.
+        draw: returns a case, given the seed, the index, and whether it is empty.
+        ratio: residual of a corrected second recording, relative to the oracle's.
+        thresholds: thresholds of the proof.
+        baselines: simple methods to compare with, by name.
+        settings: settings that are printed with the result.
+        simulations: a Python file that is copied next to the recordings for the diagnosis.
     """
 
     name: str
@@ -50,6 +50,6 @@ class Subject:
     draw: Callable[[int, int, bool], Case]
     ratio: Ratio
     thresholds: Sequence[Threshold]
-    baselines: Mapping[str, Naive] = field(default_factory=dict)
+    baselines: Mapping[str, Baseline] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     simulations: Path | None = None

@@ -1,16 +1,16 @@
-"""What the proof asks for. Set before the first scored run."""
+"""Thresholds of the proof. Set before the first scored run."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 INSEPARABLE_BELOW = 6.0
-"""Rivals that the data speak against by fewer standard deviations may be named: "rightly inseparable"."""
+"""A rival below this z_sep counts as a right name: it is "rightly inseparable"."""
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A measure, the range it has to lie in, and the sentence it comes from."""
+    """The accepted range of a measure, and its sentence for reports."""
 
     measure: str
     low: float
@@ -18,13 +18,15 @@ class Threshold:
     sentence: str
 
     def holds(self, value: float) -> bool:
-        """False for a value that could not be measured."""
+        """Whether the value is in the range; False for NaN."""
         return self.low <= value <= self.high
 
 
 LEVEL = 0.05
+"""Accepted rate of false alarms in a diagnosis."""
+
 STRONG_Z = 10.0
-"""Effects with z and z_sep of at least this have to be named."""
+"""Effects whose z and z_sep are at least this have to be named."""
 
 COVERAGE_FACTOR = 1.6448536269514722
 """Half-width of a 90 % interval in standard errors."""
@@ -32,7 +34,7 @@ COVERAGE_FACTOR = 1.6448536269514722
 THRESHOLDS = (
     Threshold("empty_cases", 400, float("inf"), "Empty recordings, at least 400 at level 0.05"),
     Threshold("false_alarms", 0.0, 0.07, "at most 7 % false alarms"),
-    Threshold("p_uniform", 0.01, 1.0, "p-values of empty recordings uniform: Kolmogorov and Smirnov's p at least 0.01"),
+    Threshold("p_uniform", 0.01, 1.0, "p-values of empty recordings uniform: Kolmogorov-Smirnov p at least 0.01"),
     Threshold("strong_cases", 150, float("inf"), "z and z_sep at least 10, at least 150 recordings"),
     Threshold("named_right", 0.95, 1.0, "named right in at least 95 %"),
     Threshold("driver_right", 0.95, 1.0, "driver right or rightly inseparable in at least 95 %"),

@@ -1,4 +1,4 @@
-"""What a diagnosis says, in the terms of the score, and whether it is right."""
+"""The statements of a diagnosis in terms of the score, and whether they are right."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ NOTHING, UNKNOWN, FAILED = "nothing", "unknown", "failed"
 UNFIT, ADEQUATE, EXPLAINED, UNEXPLAINED = "unfit", "adequate", "explained", "unexplained"
 VERDICTS = (UNFIT, ADEQUATE, EXPLAINED, UNEXPLAINED, FAILED)
 
-CLAIMS = ("left out", "real but small")
-"""Grades of findings that say: this physics is missing. One without a grade says it too."""
+CLAIMS = ("left_out", "small")
+"""Grades of findings that claim missing physics. A finding without a grade is a claim, too."""
 
-NEAREST = "nearest in the catalogue"
+NEAREST = "nearest"
 
 _WITHHELD = ("offset_drift", "hard_iron_step", UNKNOWN)
-"""The time course of a driver that was not recorded is all there is to name."""
+"""Right names if the driver was not recorded: only its time course can be found."""
 
 _NO_DRIVERS = frozenset(("time", "field", "mag_x", "mag_y", "mag_z"))
 
 
 @dataclass(frozen=True)
 class StatedCandidate:
-    """``at`` is where it acts: the channels of a finding."""
+    """An effect with its drivers and, in ``at``, the channels it acts on."""
 
     effect: str
     drivers: frozenset[str]
@@ -38,7 +38,7 @@ class StatedCandidate:
 
 @dataclass(frozen=True)
 class StatedFinding:
-    """``others`` are the alternatives that the diagnosis says its data cannot rule out; ``grade`` is "" without one."""
+    """A finding. ``others`` are alternatives that the recording cannot rule out; ``grade`` is "" if there is none."""
 
     named: StatedCandidate
     others: tuple[StatedCandidate, ...]
@@ -49,17 +49,19 @@ class StatedFinding:
 
     @property
     def claimed(self) -> bool:
-        """It says that this physics is missing."""
+        """Whether the finding claims that this physics is missing."""
         return not self.grade or self.grade in CLAIMS
 
 
 @dataclass(frozen=True)
 class StatedDiagnosis:
-    """A diagnosis; ``verdict`` is ``failed`` where there is none.
+    """A diagnosis; ``verdict`` is ``failed`` if there is none.
 
     Example:
-        >>> said = answer({"verdict": "unexplained", "findings": [{"effect": "backlash", "grade": "not confirmed"}]})
-        >>> said.alarm, said.name
+        >>> stated = stated_diagnosis(
+        ...     {"verdict": "unexplained", "findings": [{"effect": "backlash", "grade": "unconfirmed"}]}
+        ... )
+        >>> stated.alarm, stated.name
         (False, 'unknown')
     """
 
@@ -69,34 +71,34 @@ class StatedDiagnosis:
 
     @property
     def claims(self) -> tuple[StatedFinding, ...]:
-        """What it says is missing, strongest first."""
+        """The findings that claim missing physics, strongest first."""
         return tuple(finding for finding in self.findings if finding.claimed)
 
     @property
     def nearest(self) -> tuple[StatedFinding, ...]:
-        """What it says is only the nearest that the catalogue has."""
+        """The findings that are only the nearest effects in the catalogue."""
         return tuple(finding for finding in self.findings if finding.grade == NEAREST)
 
     @property
     def alarm(self) -> bool:
-        """It claims that physics is missing; "unexplained" without a claim, "unfit" and a refusal do not."""
+        """Whether it claims missing physics; "unexplained" without a claim, "unfit" and a refusal do not."""
         return bool(self.claims)
 
     @property
     def found(self) -> bool:
-        """It says that something is there, named or not."""
+        """Whether it reports something, named or not."""
         return self.verdict not in (ADEQUATE, FAILED) or bool(self.findings)
 
     @property
     def name(self) -> str:
-        """The effect it claims first."""
+        """The name of the first claim, or what stands for it."""
         if self.claims:
             return self.claims[0].named.effect
         return {ADEQUATE: NOTHING, FAILED: FAILED, UNFIT: UNFIT}.get(self.verdict, UNKNOWN)
 
 
-def answer(diagnosis: Mapping[str, Any] | None) -> StatedDiagnosis:
-    """From the content of ``diagnosis.json``; None for a diagnosis that failed."""
+def stated_diagnosis(diagnosis: Mapping[str, Any] | None) -> StatedDiagnosis:
+    """Read the content of ``diagnosis.json``; None is a failed diagnosis."""
     if diagnosis is None:
         return StatedDiagnosis(FAILED, None, ())
     p_value = diagnosis.get("p_value")
@@ -125,14 +127,14 @@ def _candidate(numbers: Mapping[str, Any]) -> StatedCandidate:
 
 
 def named_right(named: StatedCandidate, truth: KeyEffect) -> bool:
-    """It is the hidden effect, or a rival that the data cannot tell from it."""
+    """Whether it is the hidden effect, or a rival that the data cannot distinguish from it."""
     if truth.withheld:
         return named.effect in _WITHHELD or _is_inseparable(named, truth)
     return named.effect == truth.effect or _is_inseparable(named, truth)
 
 
 def driver_right(named: StatedCandidate, truth: KeyEffect) -> bool:
-    """Its drivers are those of the hidden effect, or of a rival that the data cannot tell from it."""
+    """Whether its drivers are those of the hidden effect, or of a rival that the data cannot distinguish from it."""
     if truth.effect == "field_gradient" and truth.drivers:
         own = bool(named.drivers) and named.drivers <= frozenset(POSITION)
     else:
@@ -141,7 +143,7 @@ def driver_right(named: StatedCandidate, truth: KeyEffect) -> bool:
 
 
 def located_right(named: StatedCandidate, truth: KeyEffect) -> bool:
-    """It acts at one of the places of the hidden effect, or of a rival that the data cannot tell from it."""
+    """Whether it acts at a port of the hidden effect, or of a rival that the data cannot distinguish from it."""
     return bool(named.at & set(truth.at)) or any(named.at & set(rival.at) for rival in truth.inseparable)
 
 
@@ -154,9 +156,9 @@ def _is_inseparable(named: StatedCandidate, truth: KeyEffect) -> bool:
 
 
 def covered(finding: StatedFinding, truth: KeyParameter) -> list[bool] | None:
-    """For each number of the parameter, whether the 90 % interval covers it; None where the diagnosis has no such one.
+    """Return for each number of a parameter whether the 90 % interval covers it; None if there is no counterpart.
 
-    A parameter of the diagnosis answers to the key's if it has its unit and shape.
+    A parameter of the diagnosis corresponds to that of the key if unit and shape agree.
     """
     value = torch.tensor(truth.value, dtype=torch.float64)
     for parameter in finding.parameters:

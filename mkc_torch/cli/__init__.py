@@ -1,4 +1,4 @@
-"""``mkc``: the command line. The commands themselves are in ``mkc_torch.cli.app`` and need the ``cli`` extra."""
+"""``mkc``: the entry point of the command line. The commands are in ``mkc_torch.cli.app``; extra ``cli``."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ def main() -> None:
     """Run ``mkc`` with the arguments of the process.
 
     Raises:
-        SystemExit: always; 0 when all was done, 1 when something failed, 2 for a command that makes no sense, 130 when
-            it was interrupted.
+        SystemExit: always. Exit codes: 0 success, 1 failure, 2 wrong arguments, 130 interrupted.
     """
     usual = signal.getsignal(signal.SIGINT)
-    if usual is signal.default_int_handler:  # and not what ignores it, as in the background of a shell
+    if usual is signal.default_int_handler:  # a background job ignores the signal; leave that
         signal.signal(signal.SIGINT, _quit)
-    # found, not imported: what is missing is said at once and not after the work, and what is not needed costs no time
+    # find_spec does not import: a missing package is reported at once, and no time is spent on imports
     missing = next((name for name in _EXTRA if find_spec(name) is None), None)
     if missing is not None:
         sys.exit(f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.')
@@ -36,18 +35,18 @@ def main() -> None:
             stream.reconfigure(errors="replace")  # a pipe's encoding may lack σ and ±
     try:
         app(prog_name="mkc")
-    except KeyboardInterrupt:  # a second one, while the first was being dealt with
+    except KeyboardInterrupt:  # a second Ctrl-C while the first is handled
         sys.exit(130)
     except OSError as error:
         if error.filename is not None:
             raise
-        # what streams still hold would fail again when Python ends
-        os.write(2, f"mkc: what it says could not be written: {error.strerror}.\n".encode())
+        # flushing the streams when Python exits would fail again
+        os.write(2, f"mkc: the output could not be written: {error.strerror}.\n".encode())
         os._exit(1)
 
 
 def _begin(usual: Callable[[int, FrameType | None], object] | int | None) -> None:
-    """Make the process the command's own, now that it has loaded what it needs."""
+    """Prepare the process after its imports: keep modules, allow forks, restore the interrupt handler."""
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import keep_modules
 
@@ -57,6 +56,6 @@ def _begin(usual: Callable[[int, FrameType | None], object] | int | None) -> Non
 
 
 def _quit(_signal: int, _frame: FrameType | None) -> None:
-    """End at once: what is being imported may take an exception for a failure of its own, and nothing is open yet."""
+    """Exit at once: an import in progress may swallow an exception, and no file is open yet."""
     os.write(2, b"mkc: interrupted; nothing was written.\n")
     os._exit(130)

@@ -1,7 +1,7 @@
-"""The commands of ``mkc``, one a file, each a function that typer makes a command of.
+"""The typer application of ``mkc``: each command is a function in a file of its own.
 
-What takes long to import, torch before all, is imported where a command has understood its options, so that help and
-mistakes are answered at once.
+A command imports torch and other slow packages after its options are checked, so that help and wrong arguments are
+answered at once.
 """
 
 from typing import Annotated, Any
@@ -22,18 +22,18 @@ __all__ = ["app"]
 
 
 class _Commands(TyperGroup):
-    """The commands; which one is asked for, and how it is asked for help, is known without pydantic."""
+    """A typer group that does not import pydantic to show help."""
 
     def get_help_option(self, ctx: Any) -> Any:
         option = super().get_help_option(ctx)
         if option is not None:
-            option.default = False  # None is checked by pydantic, which takes longer to import than all the rest
+            option.default = False  # pydantic validates None; importing it takes longer than all other imports
         return option
 
 
 app = typer.Typer(
     cls=_Commands,
-    help="Find what a simulation lacks, calibrate, apply. `mkc demo` shows it, no file needed.",
+    help="Find the physics that a simulation lacks; calibrate sensors; correct recordings. `mkc demo` needs no file.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -41,8 +41,8 @@ app = typer.Typer(
 )
 
 
-def _say_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         from mkc_torch import __version__
 
         typer.echo(f"mkc {__version__}")
@@ -52,10 +52,10 @@ def _say_version(asked: bool) -> None:
 @app.callback()
 def _all_commands(
     version: Annotated[
-        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say which version this is.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Options of no command in particular."""
+    """Options of ``mkc`` itself."""
 
 
 app.command()(diagnose)

@@ -1,8 +1,9 @@
-"""``mkc calibrate``: recordings in, a calibration and a report each out."""
+"""``mkc calibrate``: write a calibration and a report for each recording."""
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ from mkc_torch.cli.console import (
     FAILURES,
     complain,
     err,
-    interrupts_told,
+    interrupts_reported,
     not_written,
     out,
     parsed_columns,
@@ -21,63 +22,88 @@ from mkc_torch.cli.console import (
 )
 from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
 from mkc_torch.cli.loading import loading
-from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
+from mkc_torch.cli.units_option import (
+    CONVERT_HELP,
+    CONVERT_METAVAR,
+    LABEL_HELP,
+    SENSOR_HELP,
+    parsed_units,
+    split_trailing_pairs,
+)
+
+
+class Quantity(str, Enum):
+    """The vector that a sensor measures."""
+
+    mag = "mag"
+    accel = "accel"
 
 
 def calibrate(
-    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header.")],
-    output: Annotated[Path, typer.Option(help="Folder; each REC gets a folder of its name in it.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs.")
+    ],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
     columns: Annotated[
         str | None,
-        typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,mag_y=my,mag_z=mz"),
+        typer.Option(metavar="NAME=COLUMN,...", help="Names of the columns in the file: mag_x=mx,mag_y=my,mag_z=mz"),
     ] = None,
     field_strength: Annotated[
         float | None,
-        typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
+        typer.Option(
+            metavar="µT",
+            help="Length of the corrected field in µT (accelerometer: m/s²); default: as measured.",
+        ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="What the sensor is called in all results; default: the recording's name.")
+        str | None, typer.Option(help="Name of the sensor in all results; default: the name of the recording.")
     ] = None,
-    against: Annotated[
+    compare_with: Annotated[
         Path | None,
-        typer.Option(metavar="OLD.json", help="An older calibration.json to set the new one beside."),
+        typer.Option(metavar="OLD.json", help="An earlier calibration.json to compare the new one with."),
     ] = None,
     export: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Also write it as px4, ardupilot, c-header, ros-yaml or json; may be given several times.",
+            help="Also write the calibration as px4, ardupilot, c-header, ros-yaml or json; repeatable.",
         ),
     ] = None,
     instance: INSTANCE = None,
     device_id: DEVICE_ID = None,
-    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    convert: Annotated[list[str] | None, typer.Option(metavar=CONVERT_METAVAR, help=CONVERT_HELP)] = None,
+    unit_label: Annotated[str | None, typer.Option(metavar="UNIT", help=LABEL_HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
+    quantity: Annotated[
+        Quantity, typer.Option(help="Calibrate the magnetometer, or the accelerometer in accel_x, accel_y, accel_z.")
+    ] = Quantity.mag,
     place: Annotated[
         str | None,
         typer.Option(
-            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m: the field's length, with --date."
+            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m; with --date this sets the field's length."
         ),
     ] = None,
-    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded, with --place.")] = None,
+    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded; needs --place.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
-    """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
+    """Calibrate a magnetometer: estimate offset, gains and cross-axis coupling while the sensor is turned.
 
-    A file with several magnetometers gets a calibration of each, in a folder of its name in that of the file.
+    A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
 
-    Exits with 0 when every recording was calibrated and 1 when some were not.
+    The exit code is 0 if every recording was calibrated, and 1 otherwise.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if name is not None and (not name.strip() or len(recordings) > 1):
-        raise typer.BadParameter("--name is the name of one sensor: give it with one REC, and not empty.")
+        raise typer.BadParameter("--name names one sensor: give it with one REC, and not empty.")
     if (place is None) != (date is None):
-        raise typer.BadParameter("--place and --date belong together: the field changes from year to year.")
+        raise typer.BadParameter("--place and --date need each other, because the field changes from year to year.")
+    if sensor is not None and quantity is Quantity.accel:
+        raise typer.BadParameter("--sensor names a magnetometer; leave it out with --quantity accel.")
     exports = checked_exports("--export", export or [], instance, device_id)
-    recordings, texts = without_units(recordings, unit or [])
-    units = parsed_units(texts)
+    recordings, conversions = split_trailing_pairs(recordings, convert or [])
+    units = parsed_units(conversions, unit_label)
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
@@ -93,26 +119,27 @@ def calibrate(
         except (ValueError, ImportError) as error:
             raise typer.BadParameter(f"--place {place} --date {date}: {error}") from None
     try:
-        old = None if against is None else read_calibration(against)
+        old = None if compare_with is None else read_calibration(compare_with)
     except FAILURES as error:
-        complain(str(against), error)
+        complain(str(compare_with), error)
         raise typer.Exit(1) from None
-    asked = CalibrationRequest(
+    request = CalibrationRequest(
         columns=names,
         units=units,
         sensor=sensor,
+        quantity=quantity.value,
         field_strength=field_strength,
         name=None if name is None else name.strip(),
         old=old,
-        old_file=against,
+        old_file=compare_with,
         exports=exports,
         to=Destination(instance, device_id),
         earth=earth,
     )
     console, total, failed, left = out(), 0, 0, list(recordings)
-    with progress(len(recordings), output, lines=True) as step, interrupts_told(lambda: not_written(left, output)):
+    with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
-            for subject, outcome in calibrations_of(path, output / path.stem, asked, force=force, step=step):
+            for subject, outcome in calibrations_of(path, output / path.stem, request, force=force, step=step):
                 total += 1
                 with step.aside():
                     if isinstance(outcome, Exception):
@@ -127,6 +154,6 @@ def calibrate(
             step(None)
     if total > 1 and failed:
         things = "recordings" if total == len(recordings) else "sensors"
-        what = "not done in full" if asked.exports or asked.old else "not calibrated"
+        what = "not done in full" if request.exports or request.old else "not calibrated"
         err().print(f"mkc: {failed} of {total} {things} were {what}.", soft_wrap=True)
     raise typer.Exit(1 if failed else 0)

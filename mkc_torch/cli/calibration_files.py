@@ -1,4 +1,4 @@
-"""From a recording's file to the files of its calibrations, one for each magnetometer in it."""
+"""Calibrate each magnetometer of a file and write the results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import as_magnetometer
 from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove_if_empty
 from mkc_torch.cli.correction import read_correction
-from mkc_torch.cli.exported import exports_of, left_from_before
+from mkc_torch.cli.exported import exports_of, stale_exports
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
 
@@ -25,30 +25,32 @@ __all__ = ["CalibrationOutcome", "CalibrationRequest", "calibrations_of", "read_
 
 
 ACCELEROMETER = "accel"
-"""The sensor that is no magnetometer."""
+"""The quantity of an accelerometer; that of a magnetometer is ``mag``."""
 
 Step = Callable[[str], None]
-"""Takes the name of a stage of the work."""
+"""Reports the stage that begins."""
 
 
 class CalibrationRequest(NamedTuple):
-    """What a user asked for, of all recordings.
+    """Options for calibrating recordings.
 
     Attributes:
-        columns, units: of the recordings' files.
-        sensor: one of those in a file, or "accel"; None for all magnetometers.
-        field_strength: in µT, where it is known.
-        name: of the sensor; None for the recording's.
-        old, old_file: the calibration that the new one is set beside, and where it is from.
-        exports: kinds of further files.
-        to: for these.
-        earth: the field at the place of the recordings, where it is known.
+        columns, units: names and units of the columns in the files.
+        sensor: name of a magnetometer in the file; None for all.
+        quantity: ``mag`` or ``accel``.
+        field_strength: length of the field in µT, of gravity in m/s²; None if unknown.
+        name: name of the sensor; None for the recording's name.
+        old, old_file: the calibration to compare with, and its file.
+        exports: formats of additional files.
+        to: the vehicle's sensor that the exports are for.
+        earth: the Earth's field at the place of the recordings, if known.
     """
 
     columns: Mapping[str, str]
     units: Mapping[str, str]
     sensor: str | None
     field_strength: float | None
+    quantity: str = "mag"
     name: str | None = None
     old: Calibration | None = None
     old_file: Path | None = None
@@ -58,14 +60,14 @@ class CalibrationRequest(NamedTuple):
 
 
 class CalibrationOutcome(NamedTuple):
-    """A calibration and what came of it.
+    """A calibration, its files, and the requests that failed.
 
     Attributes:
-        calibration: of the recording.
-        files: that were written.
-        differences: from the old one.
-        notes: what to notice of the exports.
-        refused: what was asked for besides the calibration and could not be done.
+        calibration: the result.
+        files: paths of the written files.
+        differences: differences from the old calibration.
+        notes: remarks on the exports.
+        refused: errors of the comparison and the exports.
     """
 
     calibration: Calibration
@@ -76,10 +78,10 @@ class CalibrationOutcome(NamedTuple):
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The calibration of a file.
+    """Read a calibration from a file.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the file is not a calibration.
         OSError: the file cannot be read.
     """
     known = read_correction(path)
@@ -89,27 +91,28 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def calibrations_of(
-    path: Path, folder: Path, asked: CalibrationRequest, *, force: bool, step: Step | None = None
+    path: Path, folder: Path, request: CalibrationRequest, *, force: bool, step: Step | None = None
 ) -> Iterator[tuple[str, CalibrationOutcome | Exception]]:
-    """Calibrate each magnetometer of a file: one alone into the folder, several into folders of their names in it.
+    """Calibrate each magnetometer of a file. Several sensors get a subfolder each.
 
     Args:
-        path: of the file.
-        folder: for the results.
-        asked: what a user asked for.
-        force: replace results.
+        path: the file.
+        folder: folder for the results.
+        request: the options.
+        force: replace existing results.
         step: called with a text at the beginning of each stage.
 
     Yields:
-        What it is of, for messages, and the calibration with its files, or why there is none.
+        The subject for messages, and its calibration with the files, or the error.
     """
-    say = step or (lambda _: None)
+    report_stage = step or (lambda _: None)
     try:
-        say(f"reading {path.name}")
+        report_stage(f"reading {path.name}")
         topics = read_topics(path)
-        names = sensor_names(path, asked.columns, asked.sensor, topics)
+        accel = request.quantity == ACCELEROMETER
+        names = [None] if accel else sensor_names(path, request.columns, request.sensor, topics)
         if len(names) > 1:
-            _refuse_for_one(path, asked, [str(name) for name in names])
+            _refuse_for_one(path, request, [str(name) for name in names])
             claim_folder(folder, overwrite=force)
     except FAILURES as error:
         yield str(path), error
@@ -119,83 +122,83 @@ def calibrations_of(
         subject, which = str(path), path.name
         if len(names) > 1:
             subject, which = f"{path}, sensor {name}", f"{path.name}, sensor {name} ({number} of {len(names)})"
-        say(f"calibrating {which}")
-        drawing = partial(say, f"drawing the report on {which}")
+        report_stage(f"calibrating {which}")
+        drawing = partial(report_stage, f"drawing the report on {which}")
         try:
-            yield subject, _calibrate(path, place, asked._replace(sensor=name), topics, drawing, force=force)
+            yield subject, _calibrate(path, place, request._replace(sensor=name), topics, drawing, force=force)
         except FAILURES as error:
             yield subject, error
     remove_if_empty(folder)
 
 
-def _refuse_for_one(path: Path, asked: CalibrationRequest, names: list[str]) -> None:
-    """Refuse what is of one sensor where there are several."""
-    for option, given in (("--name", asked.name), ("--compare-with", asked.old)):
+def _refuse_for_one(path: Path, request: CalibrationRequest, names: list[str]) -> None:
+    """Raise if an option for a single sensor is given and the file holds several."""
+    for option, given in (("--name", request.name), ("--compare-with", request.old)):
         if given is not None:
             raise ValueError(
-                f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is of one; give "
-                f"`--sensor {names[0]}` beside it, and each of the others a call of its own."
+                f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is for one "
+                f"sensor; add `--sensor {names[0]}`, and calibrate each of the others in a call of its own."
             )
 
 
 def _calibrate(
     path: Path,
     folder: Path,
-    asked: CalibrationRequest,
+    request: CalibrationRequest,
     topics: Sequence[Topic],
     drawing: Callable[[], None],
     *,
     force: bool,
 ) -> CalibrationOutcome:
-    """Write calibration.json and report.html of a recording; where it is refused, the report alone says why.
+    """Write calibration.json and report.html of a recording. A refusal writes only a report with the reason.
 
     ``topics`` are the tables of the file; ``drawing`` is called before the report is drawn.
     """
-    accel = asked.sensor == ACCELEROMETER
+    accel = request.quantity == ACCELEROMETER
     if accel:
-        recording, said = read_accelerometer(path, asked.columns, asked.units, topics), True
+        recording, said = read_accelerometer(path, request.columns, request.units, topics), True
     else:
-        recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor, topics)
-        said = bool(found.said & {"mag_x", "mag_y", "mag_z"})
+        recording, found = read_magnetometer(path, request.columns, request.units, request.sensor, topics)
+        said = bool(found.with_stated_unit & {"mag_x", "mag_y", "mag_z"})
     from mkc_torch.report import calibration_report, refusal_report
 
     report, result = folder / "report.html", folder / "calibration.json"
-    if asked.old_file is not None and result.exists() and result.samefile(asked.old_file):
-        raise ValueError(f"{result} is what the new one is set beside, and is not replaced; choose another --output.")
-    files = (report.name, result.name, *(EXPORTS[kind].file for kind in asked.exports))
+    if request.old_file is not None and result.exists() and result.samefile(request.old_file):
+        raise ValueError(f"--output would replace {result}, which --compare-with reads; choose another.")
+    files = (report.name, result.name, *(EXPORTS[kind].file for kind in request.exports))
     claim_folder(folder, overwrite=force, files=files)
     with folder_written(folder):
         try:
             calibration = fit(
                 recording,
-                field_strength=asked.field_strength,
-                name=asked.name,
-                earth=asked.earth,
+                field_strength=request.field_strength,
+                name=request.name,
+                earth=request.earth,
                 sensor=ACCELEROMETER if accel else "mag",
             )
         except NotIdentifiableError as error:
             page = refusal_report(as_magnetometer(recording) if accel else recording, error)
             write_atomically(report, page, overwrite=force)
-            result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
-            told = " ".join([f"{error} See {report}.", *left_from_before(folder, ())])
-            raise NotIdentifiableError(told, error.coverage, error.directions) from None
+            result.unlink(missing_ok=True)  # an old result would be taken for that of this run
+            message = " ".join([f"{error} See {report}.", *stale_exports(folder, ())])
+            raise NotIdentifiableError(message, error.coverage, error.directions) from None
         if not said:
             refuse_likely_size(path, calibration.radius)
-        beside, refused = _beside(calibration, asked.old)
-        texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), asked.exports, asked.to)
+        compared, refused = _compared(calibration, request.old)
+        texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), request.exports, request.to)
         drawing()
-        page = calibration_report(calibration, recording, against=beside)
+        page = calibration_report(calibration, recording, against=compared)
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)
         for name, text in texts.items():
             write_atomically(folder / name, text, overwrite=force)
-        notes += left_from_before(folder, list(texts))
+        notes += stale_exports(folder, list(texts))
     written = [result, report, *(folder / name for name in texts)]
-    return CalibrationOutcome(calibration, written, beside, notes, [*refused, *not_exported])
+    return CalibrationOutcome(calibration, written, compared, notes, [*refused, *not_exported])
 
 
-def _beside(calibration: Calibration, old: Calibration | None) -> tuple[Differences | None, list[ValueError]]:
-    """The differences from an old one, over the samples in use; or why there are none."""
+def _compared(calibration: Calibration, old: Calibration | None) -> tuple[Differences | None, list[ValueError]]:
+    """Return the differences from an old calibration over the inliers, or the error."""
     if old is None or calibration.used is None:
         return None, []
     points = calibration.used.magnetometer()

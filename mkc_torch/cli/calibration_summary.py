@@ -1,4 +1,4 @@
-"""A calibration on the terminal: one small table, then what to notice and where the files are."""
+"""Print a calibration: a table of numbers, the warnings, and the paths of the files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def show(
     console: Console,
     c: Calibration,
     files: Sequence[Path],
-    beside: Differences | None = None,
+    compared: Differences | None = None,
     notes: Sequence[str] = (),
 ) -> None:
-    """Print the summary of a calibration, what it differs in from another, and the files that hold it."""
+    """Print a summary of a calibration, its differences from an earlier one, and its files."""
     console.print()
     console.print(Text(c.name or c.recording or term("label.recording"), style="bold"))
     table = Table.grid(padding=(0, 3, 0, 0))
@@ -58,15 +58,15 @@ def show(
     for warning in (*c.warnings, *notes):
         facts.add_row(Text(term("label.warning"), style="bold yellow"), Text(warning))
     console.print(facts)
-    if beside is not None:
-        _show_differences(console, beside)
+    if compared is not None:
+        _show_differences(console, compared)
     for file in files:
-        # outside the table, where a long path would be broken and could not be copied
+        # outside the table, so that a long path is not broken and can be copied
         console.print(Text.assemble(f"{term('label.written'):<11}", (str(file), "cyan")), soft_wrap=True)
 
 
 def _show_differences(console: Console, found: Differences) -> None:
-    """Print what differs from an older calibration."""
+    """Print the differences from an earlier calibration."""
     console.print(Text(term("section.against", name=found.name), style="bold"))
     table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
     table.add_column("", no_wrap=True)

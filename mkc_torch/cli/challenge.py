@@ -1,4 +1,4 @@
-"""``mkc challenge``: the blind proof of this installation's own diagnosis."""
+"""``mkc challenge``: the blind proof of this installation's diagnosis."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mkc_torch.cli.console import FAILURES, complain, interrupts_told, progress
+from mkc_torch.cli.console import FAILURES, complain, interrupts_reported, progress
 from mkc_torch.cli.loading import loading
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Family(str, Enum):
-    """What a proof is about."""
+    """Family of the simulated recordings."""
 
     magnetometer = "magnetometer"
     dynamics = "dynamics"
@@ -29,79 +29,86 @@ def challenge(
         "mkc_challenge"
     ),
     family: Annotated[
-        Family, typer.Option(help="A magnetometer, or differential equations as a user writes them.")
+        Family, typer.Option(help="Recordings of a magnetometer, or of systems of differential equations.")
     ] = Family.magnetometer,
     cases: Annotated[
         int | None,
-        typer.Option(metavar="N", min=0, help="Recordings with something hidden; default: 240, of dynamics 100."),
+        typer.Option(metavar="N", min=0, help="Recordings with hidden physics; default: 240, for dynamics 100."),
     ] = None,
     empty: Annotated[
         int | None,
         typer.Option(
-            metavar="M", min=0, help="Recordings with nothing hidden; default: 5 for 3 others, of dynamics 3 for 2."
+            metavar="M", min=0, help="Recordings without; default: 5 for every 3 with, for dynamics 3 for every 2."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Of all that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed of all random draws.")] = 1,
     duration: Annotated[
         float | None,
-        typer.Option(metavar="s", min=10.0, help="Length of a magnetometer's recording in s; default: 90."),
+        typer.Option(metavar="s", min=10.0, help="Length of a magnetometer recording in s; default: 90."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="W", min=1, help="Processes; default: as many as cores.")
+        int | None, typer.Option(metavar="W", min=1, help="Number of processes; default: the number of cores.")
     ] = None,
-    worlds: Annotated[
+    scenarios: Annotated[
         bool,
         typer.Option(
-            "--worlds",
-            help="Worlds of noise, inputs and misfits, each drawn and reported on its own, instead.",
+            "--scenarios",
+            help="Run scenarios of noise, inputs and wrong simulations, each with its own score.",
         ),
     ] = False,
     only: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="With --worlds: this world alone; may be repeated.")
+        list[str] | None, typer.Option(metavar="NAME", help="With --scenarios: run only this scenario; repeatable.")
     ] = None,
-    per_world: Annotated[
+    per_scenario: Annotated[
         int | None,
-        typer.Option(metavar="N", min=0, help="With --worlds: recordings with nothing hidden in each; default: 60."),
+        typer.Option(
+            metavar="N", min=0, help="With --scenarios: recordings in each without hidden physics; default: 60."
+        ),
     ] = None,
-    hidden_per_world: Annotated[
+    hidden_per_scenario: Annotated[
         int | None,
         typer.Option(
             metavar="H",
             min=0,
-            help="With --worlds: recordings with something hidden in each; default: what each world asks for.",
+            help="With --scenarios: recordings with hidden physics in each; default: set by the scenario.",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
-    """Hide physics in simulated recordings, have them diagnosed by who was not told, and only then open the key.
+    """Hide physics in simulated recordings, diagnose them without the key, then open the key and score.
 
-    A hash of the key is written before the first diagnosis, so that it can be shown not to have changed.
+    A hash of the key is written before the first diagnosis. It proves that the key did not change afterwards.
     """
-    _refuse_mixed(worlds, {"--cases": cases, "--empty": empty}, "leave it out with --worlds, which has --per-world")
-    own = {"--only": only or None, "--per-world": per_world, "--hidden-per-world": hidden_per_world}
-    _refuse_mixed(not worlds, own, "add --worlds")
+    plain = {"--cases": cases, "--empty": empty}
+    _refuse_mixed(scenarios, plain, "does not apply to --scenarios; use --per-scenario")
+    own = {"--only": only or None, "--per-scenario": per_scenario, "--hidden-per-scenario": hidden_per_scenario}
+    _refuse_mixed(not scenarios, own, "needs --scenarios; add --scenarios")
     if family is Family.dynamics and duration is not None:
-        raise typer.BadParameter("--duration is of the magnetometer's recordings; each system has a length of its own.")
+        raise typer.BadParameter("--duration applies to the magnetometer; each dynamic system has a length of its own.")
     with loading():
         from mkc_torch._parallel.pool import allow_copies
         from mkc_torch._parallel.processes import cores, keep_memory, one_thread
         from mkc_torch.challenge import run
         from mkc_torch.cli.challenge_jobs import JOBS
         from mkc_torch.cli.challenge_summary import show_challenge
-    if worlds:
-        _in_worlds(family, duration, only or [], per_world, hidden_per_world, seed, output, workers, force)
+    if scenarios:
+        _run_scenarios(family, duration, only or [], per_scenario, hidden_per_scenario, seed, output, workers, force)
         return
     subject = _subject(family, duration)
     cases = subject.cases if cases is None else cases
     empty = round(cases * subject.empty / subject.cases) if empty is None else empty
     if cases + empty == 0:
-        raise typer.BadParameter("--cases and --empty are both 0; ask for one recording at least.")
+        raise typer.BadParameter("--cases and --empty are both 0; at least one recording is needed.")
     diagnose, correct_one = JOBS[family.value]
     one_thread()
     keep_memory()
-    allow_copies(0)  # the workers are as many processes as was asked for
+    allow_copies(0)  # the number of processes is that of the workers
+    results = f"the results so far are in {output}."
     try:
-        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(cases + empty, output) as step:
+        with (
+            interrupts_reported(lambda: results),
+            progress(cases + empty, output) as step,
+        ):
             score = run.run_challenge(
                 diagnose, correct_one, subject=subject, cases=cases, empty=empty, seed=seed, output=output,
                 overwrite=force, workers=min(workers or cores(), cases + empty), progress=step.count,
@@ -124,14 +131,14 @@ def _subject(family: Family, duration: float | None) -> Subject:
 def _refuse_mixed(refused: bool, given: Mapping[str, object], advice: str) -> None:
     for name, value in given.items():
         if refused and value is not None:
-            raise typer.BadParameter(f"{name} is not of this kind of proof; {advice}.")
+            raise typer.BadParameter(f"{name} {advice}.")
 
 
-def _in_worlds(
+def _run_scenarios(
     family: Family,
     duration: float | None,
     only: list[str],
-    per_world: int | None,
+    per_scenario: int | None,
     hidden: int | None,
     seed: int,
     output: Path,
@@ -141,36 +148,37 @@ def _in_worlds(
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import cores, keep_memory, one_thread
     from mkc_torch.challenge.scenarios import run
-    from mkc_torch.cli.challenge_jobs import diagnose_in_world
-    from mkc_torch.cli.worlds_summary import show_worlds
+    from mkc_torch.cli.challenge_jobs import diagnose_in_scenario
+    from mkc_torch.cli.worlds_summary import show_scenarios
 
-    asked = _worlds(family, duration)
-    per_world = run.PER_WORLD if per_world is None else per_world
+    family_scenarios = _scenarios(family, duration)
+    per_scenario = run.PER_SCENARIO if per_scenario is None else per_scenario
     try:
-        total = run.count(asked, only, per_world, hidden)
+        total = run.count(family_scenarios, only, per_scenario, hidden)
     except ValueError as error:
         raise typer.BadParameter(f"--only: {error}") from None
     if total == 0:
-        raise typer.BadParameter("--per-world and --hidden-per-world are both 0; ask for one recording at least.")
+        raise typer.BadParameter("--per-scenario and --hidden-per-scenario are both 0; a recording is needed.")
     one_thread()
     keep_memory()
-    allow_copies(0)  # the workers are as many processes as was asked for
+    allow_copies(0)  # the number of processes is that of the workers
+    results = f"the results so far are in {output}."
     try:
-        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(total, output) as step:
-            score = run.run_worlds(
-                diagnose_in_world, asked, only=only, per_world=per_world, hidden=hidden, seed=seed, output=output,
-                overwrite=force, workers=min(workers or cores(), total), progress=step.count,
+        with interrupts_reported(lambda: results), progress(total, output) as step:
+            score = run.run_scenarios(
+                diagnose_in_scenario, family_scenarios, only=only, per_scenario=per_scenario, hidden=hidden, seed=seed,
+                output=output, overwrite=force, workers=min(workers or cores(), total), progress=step.count,
             )  # fmt: skip
     except FAILURES as error:
         complain(output, error)
         raise typer.Exit(1) from None
-    show_worlds(score, total, output)
+    show_scenarios(score, total, output)
 
 
-def _worlds(family: Family, duration: float | None) -> Scenarios:
-    from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
-    from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
+def _scenarios(family: Family, duration: float | None) -> Scenarios:
+    from mkc_torch.challenge.dynamics.scenarios import dynamics_scenarios
+    from mkc_torch.challenge.magnetometer.scenarios import magnetometer_scenarios
 
     if family is Family.magnetometer:
-        return magnetometer_worlds() if duration is None else magnetometer_worlds(duration)
-    return dynamics_worlds()
+        return magnetometer_scenarios() if duration is None else magnetometer_scenarios(duration)
+    return dynamics_scenarios()

@@ -1,4 +1,4 @@
-"""What a blind proof has done with its recordings: they are diagnosed and corrected as the commands of that do it."""
+"""Diagnose and correct the recordings of a blind proof as ``mkc diagnose`` and ``mkc apply`` do."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["JOBS", "correct_dynamics", "correct_unseen", "diagnose_dynamics", "diagnose_in_world", "diagnose_unseen"]
+__all__ = ["JOBS", "correct_dynamics", "correct_unseen", "diagnose_dynamics", "diagnose_in_scenario", "diagnose_unseen"]
 
 _QUIET = ConsoleStyle(terminal=False, width=100)
 
 
 def diagnose_unseen(paths: list[Path], folder: Path) -> None:
-    """Diagnose recordings as ``mkc diagnose`` does, but for the reports, which nobody reads in this number."""
+    """Diagnose magnetometer recordings as ``mkc diagnose`` does, without reports."""
     for path in paths:
         _diagnose(path, folder, Request(force=True, report=False))
 
 
 def diagnose_dynamics(paths: list[Path], folder: Path) -> None:
-    """The same with ``--simulation``, of the proof's own file."""
+    """Diagnose recordings with the simulations in the proof's folder, without reports."""
     for path in paths:
         _diagnose(path, folder, Request(simulation=_simulation(path), force=True, report=False))
 
 
-def diagnose_in_world(paths: list[Path], folder: Path) -> None:
-    """The same with ``--simulation``, of the file that lies ready for a recording, if there is one."""
+def diagnose_in_scenario(paths: list[Path], folder: Path) -> None:
+    """Diagnose recordings of a scenario, each with the simulation file written for it, if there is one."""
     from mkc_torch.challenge.dynamics.subject import simulation_class
     from mkc_torch.challenge.scenarios.run import SIMULATIONS
 
@@ -46,7 +46,7 @@ def diagnose_in_world(paths: list[Path], folder: Path) -> None:
 
 def _diagnose(path: Path, folder: Path, request: Request) -> None:
     place = folder / path.stem
-    for old in ("diagnosis.json", "model.json"):  # of an earlier run, which would be scored in place of a failure
+    for old in ("diagnosis.json", "model.json"):  # an old result would be scored if the diagnosis failed
         (place / old).unlink(missing_ok=True)
     for outcome in diagnose_file(path, place, request, _QUIET):
         if outcome.failed:
@@ -54,18 +54,18 @@ def _diagnose(path: Path, folder: Path, request: Request) -> None:
 
 
 def correct_unseen(model: Path, recording: Path) -> Mapping[str, Tensor]:
-    """A recording corrected as ``mkc apply`` does."""
+    """Correct a recording as ``mkc apply`` does."""
     return correct(read_correction(model), Recording.read(recording)).columns
 
 
 def correct_dynamics(model: Path, recording: Path) -> Mapping[str, Tensor]:
-    """The same with ``--simulation``."""
+    """Correct a recording of a dynamic system as ``mkc apply --simulation`` does."""
     simulation = named_simulation(_simulation(recording))
     return correct(read_correction(model, simulation), Recording.read(recording)).columns
 
 
 def _simulation(recording: Path) -> str:
-    """``FILE.py:CLASS`` of a recording in a proof's folder."""
+    """Return ``FILE.py:CLASS`` for a recording in a proof's folder."""
     from mkc_torch.challenge.dynamics.subject import simulation_class
     from mkc_torch.challenge.run import SIMULATIONS
 
@@ -76,4 +76,4 @@ JOBS = {
     "magnetometer": (diagnose_unseen, correct_unseen),
     "dynamics": (diagnose_dynamics, correct_dynamics),
 }
-"""How a recording of each family is diagnosed, and how it is corrected."""
+"""The functions that diagnose and correct the recordings of each family."""

@@ -1,4 +1,4 @@
-"""What the terminal says of a blind proof."""
+"""Print the score of a blind proof."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from mkc_torch.cli.console import out
 __all__ = ["show_challenge"]
 
 
-def _counts(measured: MeasuredThreshold) -> bool:
-    """Whether it is a number of recordings."""
+def _is_count(measured: MeasuredThreshold) -> bool:
+    """Whether the threshold is a minimum number of recordings."""
     return math.isinf(measured.threshold.high)
 
 
-def _not(measured: MeasuredThreshold) -> str:
-    return "too few" if _counts(measured) else "no"
+def _reason(measured: MeasuredThreshold) -> str:
+    return "too few" if _is_count(measured) else "no"
 
 
 def show_challenge(score: Score, cases: int, empty: int, output: Path) -> None:
-    """Print what was measured, beside what was asked, and where the rest stands."""
+    """Print the measured values, their thresholds, and the paths of the files."""
     console = out()
     console.print()
-    console.print(Text(f"Blind proof: {cases + empty:,} recordings, something hidden in {cases:,}", style="bold"))
+    console.print(Text(f"Blind proof: {cases + empty:,} recordings, hidden physics in {cases:,}", style="bold"))
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
-    table.add_column("asked", overflow="fold")
+    table.add_column("threshold", overflow="fold")
     table.add_column("measured", justify="right")
     table.add_column("holds")
     for m in score.measured:
         table.add_row(
             Text(m.threshold.sentence),
             measured_text(m),
-            Text("—") if math.isnan(m.value) else Text("yes") if m.holds else Text(_not(m), style="bold yellow"),
+            Text("—") if math.isnan(m.value) else Text("yes") if m.holds else Text(_reason(m), style="bold yellow"),
         )
     console.print(table)
-    if few := [m for m in score.measured if _counts(m) and not m.holds]:
+    if few := [m for m in score.measured if _is_count(m) and not m.holds]:
         found = " and ".join(f"{m.value:.0f} of at least {m.threshold.low:.0f}" for m in few)
         console.print(
-            f"Too few recordings to tell ({found}): what holds here, and what does not, may be chance. Leave out "
-            "--cases and --empty for a run of full size."
+            f"Too few recordings ({found}): these results may be chance. Leave out --cases and --empty for a run of "
+            "full size."
         )
     facts = Table.grid(padding=(0, 3, 0, 0))
     facts.add_column(no_wrap=True)
     facts.add_column(overflow="fold")
-    facts.add_row("said of empty", ", ".join(f"{verdict} {count}" for verdict, count in score.verdicts.items()))
+    facts.add_row("verdicts, empty", ", ".join(f"{verdict} {count}" for verdict, count in score.verdicts.items()))
     facts.add_row("false alarms", share_text(score.false_alarms))
     facts.add_row("named right", share_text(score.named))
     if score.driver.total:
@@ -59,5 +59,5 @@ def show_challenge(score: Score, cases: int, empty: int, output: Path) -> None:
     facts.add_row("failed", ", ".join(score.failed) or "none")
     console.print(facts)
     for name in ("challenge.html", "summary.md", "key_hash.txt"):
-        # outside the table, where a long path would be broken and could not be copied
+        # outside the table, so that a long path is not broken and can be copied
         console.print(Text.assemble(f"{'written':<15}", (str(output / name), "cyan")), soft_wrap=True)

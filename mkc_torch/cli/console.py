@@ -1,4 +1,4 @@
-"""What the commands share: where they write, how they name columns, and how failures become one sentence."""
+"""Shared by the commands: consoles, options of name=value pairs, progress, and messages of failures."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ from mkc_torch._support.files import folder_held
 from mkc_torch._words.terms import term
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
-"""What bad input, a full disk or a numerical breakdown raises."""
+"""Errors of bad input, a full disk or a numerical breakdown."""
 
-_WIDTH_IN_A_PIPE = 100
+_PIPE_WIDTH = 100
+"""Columns of text that is not printed on a terminal."""
 
 
 @dataclass(frozen=True)
 class ConsoleStyle:
-    """How text is set for where it goes; another process can set it too, and this one print it."""
+    """Style and width of a console. Another process can render text in it for this one to print."""
 
     terminal: bool
     width: int
@@ -51,19 +52,19 @@ class ConsoleStyle:
         return cls(console.is_terminal, console.width)
 
     def set(self, show: Callable[[Console], None]) -> str:
-        """What ``show`` prints."""
+        """Return the text that ``show`` prints."""
         text = io.StringIO()
         show(_console(self.terminal, width=self.width, file=text))
         return text.getvalue()
 
 
 def out() -> Console:
-    """Standard output: coloured on a terminal, plain text of a fixed width in a pipe."""
+    """Return standard output: coloured on a terminal, plain text of a fixed width in a pipe."""
     return _console(sys.stdout.isatty())
 
 
 def err() -> Console:
-    """Standard error, likewise."""
+    """Return standard error, in the same style."""
     return _console(sys.stderr.isatty(), stderr=True)
 
 
@@ -72,25 +73,25 @@ def _console(
 ) -> Console:
     return Console(
         file=file, stderr=stderr, soft_wrap=False,
-        highlight=False, markup=False, emoji=False,  # what a user wrote is printed as it is
+        highlight=False, markup=False, emoji=False,  # print the user's text unchanged
         force_terminal=terminal, no_color=None if terminal else True,
-        width=width if terminal else width or _WIDTH_IN_A_PIPE,
+        width=width if terminal else width or _PIPE_WIDTH,
     )  # fmt: skip
 
 
 def complain(subject: str | Path, error: BaseException) -> None:
-    """One line on standard error: which file, and why."""
+    """Print one line on standard error: the file and the error."""
     sentence = sentence_of(error)
-    sentence = sentence.removeprefix(f"{Path(subject).stem}: ")  # a recording is called so in Python
+    sentence = sentence.removeprefix(f"{Path(subject).stem}: ")  # the name of a recording in Python
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
     err().print(term("command.failed", sentence=sentence), soft_wrap=True)
 
 
 def sentence_of(error: BaseException) -> str:
-    """What an error says, on one line but for the code that a user's own file raised it in.
+    """Return the message of an error on one line. An error in the user's simulation file keeps its code lines.
 
-    The system's own errors name the file.
+    Errors of the operating system name the file.
 
     Example:
         >>> sentence_of(PermissionError(13, "Permission denied", "report.html"))
@@ -107,10 +108,10 @@ def sentence_of(error: BaseException) -> str:
 
 
 def parsed_columns(text: str | None) -> dict[str, str]:
-    """``mag_x=mx,mag_y=my`` as names and the names they have in the file.
+    """Parse ``mag_x=mx,mag_y=my`` into names and the columns' names in the file.
 
     Raises:
-        typer.BadParameter: a part that is no such pair, or a name given twice.
+        typer.BadParameter: a part is not a pair, or a name is given twice.
 
     Example:
         >>> parsed_columns("mag_x=mx, mag_y=my")
@@ -130,10 +131,10 @@ def parsed_columns(text: str | None) -> dict[str, str]:
 
 
 def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, str]:
-    """Pairs of an option that can be given several times, each time with several pairs.
+    """Parse the pairs of a repeatable option; each value holds one or more pairs.
 
     Raises:
-        typer.BadParameter: a part that is no pair, or a name given twice.
+        typer.BadParameter: a part is not a pair, or a name is given twice.
 
     Example:
         >>> parsed_pairs("--noise", ["angle=0.005", "rate=0.1, level=2"], "angle=0.005")
@@ -151,22 +152,22 @@ def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, s
 
 
 def refuse_same_names(recordings: Sequence[Path]) -> None:
-    """Refuses recordings whose results would go to one place, or to one outside of ``--output``.
+    """Raise if two recordings would share a folder of results, or if a folder would lie outside ``--output``.
 
     Raises:
-        typer.BadParameter: two have the same name, but for the ending and for capitals; or one has no name but dots.
+        typer.BadParameter: two names differ only in suffix or case, or a name consists of dots.
     """
     taken: dict[str, Path] = {}
     for path in recordings:
         if not path.stem.strip("."):
-            raise typer.BadParameter(term("command.no_folder", one=path))
+            raise typer.BadParameter(term("command.no_folder", path=path))
         other = taken.setdefault(path.stem.casefold(), path)
         if other is not path:
-            raise typer.BadParameter(term("command.same_folder", one=other, other=path, folder=path.stem))
+            raise typer.BadParameter(term("command.same_folder", path=other, other=path, folder=path.stem))
 
 
 def folder_names(labels: list[str]) -> list[str]:
-    """A folder's name for each label, no two alike on any file system.
+    """Return a folder name for each label, distinct on every file system.
 
     Example:
         >>> folder_names(["run 1", "a/b", "A:B", "..", ""])
@@ -186,11 +187,11 @@ def folder_names(labels: list[str]) -> list[str]:
 
 
 class Steps:
-    """What is being done, how much of it is, and for how long.
+    """Progress of a command, shown as a bar on a terminal.
 
     Attributes:
-        name: of what is being done.
-        done, total: how many things are done, and how many there are.
+        name: the current item.
+        done, total: number of finished items, and of all.
     """
 
     def __init__(self, bar: Progress | None, total: int) -> None:
@@ -201,7 +202,7 @@ class Steps:
         self._timed = None if bar is None else bar.add_task("", total=None, visible=False)
 
     def __call__(self, name: str | None) -> None:
-        """To be called with the name of each thing begun, and with None when one is done."""
+        """Report the name of an item that begins, or None when it is done."""
         if name is None:
             self.done += 1
         else:
@@ -215,7 +216,7 @@ class Steps:
             self._bar.update(self._task, description=name)
 
     def part(self, thing: str, done: int, total: int) -> None:
-        """How many of the things that the stage is made of are done."""
+        """Report how many parts of the current stage are done."""
         known = self._part
         self._part = thing, done, total
         if self._bar is None or self._timed is None:
@@ -227,16 +228,16 @@ class Steps:
 
     @property
     def on_a_terminal(self) -> bool:
-        """Whether a bar shows it."""
+        """Whether a progress bar is shown."""
         return self._bar is not None
 
     @property
     def part_done(self) -> str:
-        """The thing that is being done, of how many, and how long the rest takes at the rate so far."""
+        """Return the current part, the number of parts, and the remaining time at the rate so far."""
         if self._part is None or self._part[1] >= self._part[2]:
             return ""
         thing, done, total = self._part
-        task = None if self._bar is None else next(one for one in self._bar.tasks if one.id == self._timed)
+        task = None if self._bar is None else next(task for task in self._bar.tasks if task.id == self._timed)
         if task is None or task.time_remaining is None:
             return term("command.part", thing=thing, number=done + 1, total=total)
         return term(
@@ -244,14 +245,14 @@ class Steps:
         )
 
     def count(self, name: str, done: int, total: int) -> None:
-        """Name what is being done, and how much of it is."""
+        """Report the current item and the number of finished items."""
         self.name, self.done, self.total = name, done, total
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, description=name, completed=done, total=total)
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """The bar is out of the way of what is printed meanwhile."""
+        """Hide the bar while other text is printed."""
         if self._bar is None:
             yield
             return
@@ -262,55 +263,56 @@ class Steps:
 
 
 drawing = RLock()
-"""Held while something is drawn, and while this process is forked: a copy finds none of the locks of others taken."""
+"""Held while drawing and while forking, so that a forked process inherits no locked console."""
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=drawing.acquire, after_in_parent=drawing.release, after_in_child=drawing.release)
 
-_EVERY = 0.2  # s
+_REFRESH_S = 0.2
+"""Seconds between refreshes of the bar."""
 
-_LINE_EVERY = 10.0
-"""Seconds between lines on standard error where it is no terminal."""
+_LINE_S = 10.0
+"""Seconds between lines of progress in a pipe."""
 
-_NOTED_EVERY = 60.0
-"""Seconds after which a line on long work is added to a file."""
+_FILE_LINE_S = 60.0
+"""Seconds between lines in ``progress.txt``."""
 
 
 @contextmanager
 def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> Iterator[Steps]:
-    """What is being done and for how long, on a terminal, with a bar over several things.
+    """Show progress on a terminal, with a bar over several items.
 
-    Work of more than a minute adds a line a minute to ``progress.txt`` in the folder, if there is one to write into.
+    Every minute, a line is added to ``progress.txt`` in the folder, if one is given and can be written.
 
     Args:
-        total: how many things are done one after the other.
-        folder: for ``progress.txt``.
-        lines: where standard error is no terminal, write the stage to it every ten seconds; nothing otherwise.
+        total: number of items.
+        folder: folder of ``progress.txt``.
+        lines: if standard error is not a terminal, write the stage to it every ten seconds.
     """
     begin = monotonic()
     with _shown(total) as steps, ExitStack() as threads:
         if folder is not None:
-            threads.enter_context(_repeated(lambda: _note(steps, folder, monotonic() - begin), _NOTED_EVERY))
+            threads.enter_context(_repeated(lambda: _note(steps, folder, monotonic() - begin), _FILE_LINE_S))
         if lines and not steps.on_a_terminal:
-            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_EVERY))
+            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_S))
         yield steps
 
 
 def _write_line(steps: Steps, elapsed: float) -> None:
-    """Write the stage and the seconds so far to standard error."""
+    """Write the stage and the elapsed seconds to standard error."""
     text = term("command.progress", seconds=f"{elapsed:.0f}", stage=_stage(steps))
     err().print(text, soft_wrap=True)
 
 
 def _stage(steps: Steps) -> str:
-    """How many things are done, of several, and what is being done."""
+    """Return the number of finished items, the current item and its part."""
     count = f"{steps.done} of {steps.total} done, " if steps.total > 1 else ""
     return count + "; ".join(filter(None, [steps.name, steps.part_done]))
 
 
 def _note(steps: Steps, folder: Path, elapsed: float) -> None:
-    """Add a line on what is being done."""
-    with suppress(OSError):  # no place for it is no reason to end the work
+    """Add a line on the current stage to ``progress.txt``."""
+    with suppress(OSError):  # the work goes on without the file
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "progress.txt").open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {_stage(steps)}\n")
@@ -329,25 +331,25 @@ def _shown(total: int) -> Iterator[Steps]:
         Progress(
             *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
         ) as bar,
-        _repeated(lambda: bar.refresh() if bar.live.is_started else None, _EVERY),
+        _repeated(lambda: bar.refresh() if bar.live.is_started else None, _REFRESH_S),
     ):
         part.steps = Steps(bar, total)
         yield part.steps
 
 
 class _PartColumn(ProgressColumn):
-    """How much of a stage is done."""
+    """Column with the part of the stage that is being done."""
 
     steps: Steps | None = None
 
     def render(self, task: Task) -> Text:  # noqa: ARG002
-        """The words, as of now."""
+        """Return the current text."""
         return Text("" if self.steps is None else self.steps.part_done)
 
 
 @contextmanager
 def _repeated(work: Callable[[], None], every: float) -> Iterator[None]:
-    """Something that is done from time to time; a thread of its own does it, for the main work gives it no moment."""
+    """Call ``work`` repeatedly in a thread, every so many seconds, while the block runs."""
     over = Event()
 
     def repeat() -> None:
@@ -365,8 +367,8 @@ def _repeated(work: Callable[[], None], every: float) -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
-    """One line on standard error when the user interrupts, with what ``left`` says of what there is and is not."""
+def interrupts_reported(left: Callable[[], str]) -> Iterator[None]:
+    """Print one line on standard error when the user interrupts; ``left`` returns what was written."""
     try:
         yield
     except KeyboardInterrupt:
@@ -375,26 +377,26 @@ def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
 
 
 def not_written(recordings: Iterable[Path], output: Path) -> str:
-    """Which recordings were not begun or left nothing behind, and for which something is there.
+    """Return a sentence on which recordings have no results, partial results or those of a stopped search.
 
     Example:
         >>> not_written([Path("a.csv"), Path("b.csv")], Path("results"))
         'nothing was written for a.csv, b.csv.'
     """
     paths = list(recordings)
-    stopped = [path for path in paths if _holds_a_stopped_one(output / path.stem)]
+    stopped = [path for path in paths if _holds_stopped_diagnosis(output / path.stem)]
     there = [path for path in paths if path not in stopped and (output / path.stem).is_dir()]
     absent = ", ".join(str(path) for path in paths if path not in there and path not in stopped)
     known = ", ".join(str(path) for path in stopped)
-    told = [term("command.stopped", recordings=known)] if known else []
-    told += [term("command.nothing_written", recordings=absent)] if absent else []
+    sentences = [term("command.stopped", recordings=known)] if known else []
+    sentences += [term("command.nothing_written", recordings=absent)] if absent else []
     folders = ", ".join(str(output / path.stem) for path in there)
-    told += [term("command.incomplete", folders=folders)] if there else []
-    return f"{'; '.join(told)}." if told else term("command.all_written")
+    sentences += [term("command.incomplete", folders=folders)] if there else []
+    return f"{'; '.join(sentences)}." if sentences else term("command.all_written")
 
 
-def _holds_a_stopped_one(folder: Path) -> bool:
-    """Whether a folder has a diagnosis in it, of a recording or an experiment of it, that was stopped by the user."""
+def _holds_stopped_diagnosis(folder: Path) -> bool:
+    """Whether a folder holds a diagnosis of a recording, or of one of its runs, that the user stopped."""
     for file in folder.rglob("diagnosis.json"):
         with suppress(OSError, ValueError, KeyError, TypeError):
             if json.loads(file.read_text(encoding="utf-8"))["search"]["stopped"]["reason"] == "interrupt":
@@ -403,17 +405,17 @@ def _holds_a_stopped_one(folder: Path) -> bool:
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Remove a folder with nothing in it."""
+    """Remove a folder if it is empty."""
     with suppress(OSError):
         folder.rmdir()
 
 
 @contextmanager
 def folder_written(folder: Path) -> Iterator[None]:
-    """No other process writes into a folder meanwhile; an empty one is removed when what was to be written failed.
+    """Lock a folder for writing. If the block fails, the folder is removed when it is empty.
 
     Raises:
-        FileExistsError: another process writes into it.
+        FileExistsError: another process is writing into the folder.
     """
     with folder_held(folder):
         try:

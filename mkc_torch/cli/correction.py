@@ -1,4 +1,4 @@
-"""Recordings as a calibration or a model corrects them: what `mkc apply` and `mkc challenge` both run."""
+"""Correct recordings with a calibration or a model, for `mkc apply` and `mkc challenge`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
 from mkc_torch.diagnosis.io import model as diagnosed_model
 from mkc_torch.diagnosis.io.model import refuse_unknown
-from mkc_torch.recording.kept_columns import write_beside
+from mkc_torch.recording.kept_columns import write_with_columns
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size
 
@@ -31,25 +31,25 @@ __all__ = ["Corrected", "correct", "read_correction", "show_correction", "unit_o
 _NOT_MEASURED = ("time", "experiment")
 
 _OTHER_LENGTH = 1.5
-"""How many times longer or shorter a field is that is not the one a correction was made in."""
+"""Ratio of field lengths, up or down, beyond which a recording is suspected to be of another unit or place."""
 
 
 def write_correction(
     recording: Path, output: Path, table: Recording, corrected: Corrected, *, topic: int = 0, force: bool
 ) -> Corrected:
-    """Writes the file, with the columns of the recording where the rows are its rows; says so where they are not."""
+    """Write the corrected columns, with the recording's other columns if the rows correspond, or with a note if not."""
     if not _row_by_row(table, corrected):
         write_table(output, corrected.columns, labels=table.labels, overwrite=force)
-        note = "the rows are not those of the recording, so its other columns are not kept."
+        note = "the rows do not correspond to those of the recording, so its other columns are not kept."
         return replace(corrected, notes=(*corrected.notes, note))
     of_file = {name for name in _NOT_MEASURED if name in table}
     own = {name: values for name, values in corrected.columns.items() if name not in of_file}
-    write_beside(recording, output, own, topic=topic, overwrite=force)
+    write_with_columns(recording, output, own, topic=topic, overwrite=force)
     return corrected
 
 
 def _row_by_row(table: Recording, corrected: Corrected) -> bool:
-    """Whether what was corrected stands in the rows of the recording."""
+    """Whether the corrected rows are those of the recording."""
     if len(next(iter(corrected.columns.values()))) != len(table):
         return False
     time = corrected.columns.get("time")
@@ -57,7 +57,7 @@ def _row_by_row(table: Recording, corrected: Corrected) -> bool:
 
 
 def show_correction(table: Recording, corrected: Corrected, output: Path) -> None:
-    """Print what was written, and what to notice of it."""
+    """Print warnings, notes and a summary of the written file."""
     console = out()
     columns = {name: values for name, values in corrected.columns.items() if name not in _NOT_MEASURED}
     values = torch.stack(list(columns.values()), -1)
@@ -71,26 +71,25 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
         what = "field" if is_field else f"value of {', '.join(columns)}"
         console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", soft_wrap=True)
     if not is_field:
-        told = f"{len(values):,} rows of {', '.join(columns)} simulated with what was found"
+        summary = f"{len(values):,} rows of {', '.join(columns)} simulated with the findings"
     elif missing < len(values):
         length = float(torch.linalg.vector_norm(values, dim=-1).nanmedian())
-        if sentence := _other(length, corrected):
+        if sentence := _other_length(length, corrected):
             console.print(f"warning: {sentence}", soft_wrap=True)
-        told = f"{len(values):,} rows corrected, median length {length:.5g} {corrected.unit}".rstrip()
+        summary = f"{len(values):,} rows corrected, median length {length:.5g} {corrected.unit}".rstrip()
     else:
-        told = f"{len(values):,} rows corrected"
-    console.print(f"{told}: {output}", soft_wrap=True)
+        summary = f"{len(values):,} rows corrected"
+    console.print(f"{summary}: {output}", soft_wrap=True)
 
 
-def _other(length: float, corrected: Corrected) -> str | None:
-    """A sentence about a field of quite another length than that of the recording which the correction is from."""
+def _other_length(length: float, corrected: Corrected) -> str | None:
+    """Return a warning if the field's length is far from that of the calibrated recording, else None."""
     expected, unit = corrected.length, corrected.unit
     if expected is None or not length > 0 or abs(math.log(length / expected)) < math.log(_OTHER_LENGTH):
         return None
     return (
         f"the corrected field's median length is {size(length)}, {size(length / expected)} times the "
-        f"{size(expected)} {unit} of the recording that this was made from: is this one in another unit, or of another "
-        "sensor or place?"
+        f"{size(expected)} {unit} of the calibrated recording; check the unit, the sensor and the place."
     ).replace("  ", " ")
 
 
@@ -99,10 +98,10 @@ class Corrected:
     """The corrected columns of a recording.
 
     Attributes:
-        columns: name to values.
-        unit: of the corrected field, if it is known.
-        length: of the field where the correction was made, if it is known.
-        notes: sentences about what was left out.
+        columns: values by name.
+        unit: unit of the corrected field, if known.
+        length: length of the field in the calibrated recording, if known.
+        notes: sentences on effects that were not applied.
     """
 
     columns: dict[str, Tensor]
@@ -112,14 +111,14 @@ class Corrected:
 
 
 def read_correction(path: Path, simulation: Simulation | None = None) -> Calibration | DiagnosedModel:
-    """What a file holds, a calibration or a model, by its schema.
+    """Read a calibration or a model from a file, by its schema.
 
     Args:
-        path: of the file.
-        simulation: the user's own that was diagnosed. A file never says what code is run.
+        path: the file.
+        simulation: the user's own simulation that was diagnosed. A file never selects the code that is run.
 
     Raises:
-        ValueError: neither of the two, or a model of a simulation that is not given.
+        ValueError: the file is neither, or a model whose simulation is not given.
         OSError: the file cannot be read.
     """
     text = _text(path)
@@ -134,8 +133,8 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
         known = DiagnosedModel.from_json(text, simulation=simulation)
         refuse_unknown(known.simulation, simulation)
         return known
-    if schema in diagnosis_file.SCHEMAS:
-        raise ValueError("this is what a diagnosis says; give the model.json beside it.")
+    if schema == diagnosis_file.SCHEMA:
+        raise ValueError("this is a diagnosis.json; give the model.json in the same folder.")
     found = "missing" if schema is None else json.dumps(schema)
     raise ValueError(
         f"this is neither a calibration nor a model: its schema is {found}; give a calibration.json of `mkc calibrate` "
@@ -144,7 +143,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
 
 
 def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:
-    """The recording as the calibration or the model corrects it."""
+    """Correct a recording with a calibration or a model."""
     if isinstance(known, Calibration):
         return Corrected(known.apply(recording), known.field_unit, known.field_strength, ())
     columns, notes = known.correct(recording)
@@ -153,16 +152,16 @@ def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Correc
 
 
 def unit_of(known: Calibration | DiagnosedModel) -> str:
-    """The unit of the measurements that a calibration or a model was made from; empty where it has none."""
+    """Return the unit of the measurements behind a calibration or model, "" if there is none."""
     return known.unit if isinstance(known, Calibration) else str(known.state.get("unit", ""))
 
 
 def _text(path: Path) -> str:
     if path.is_dir():
-        raise ValueError(f"{path}: this is a folder; name the calibration.json or model.json in it.")
+        raise ValueError(f"{path}: this is a folder; give the calibration.json or model.json in it.")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file.")
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: the file is not text; give a calibration.json or a model.json.") from None
+        raise ValueError(f"{path}: the file is not a text file; give a calibration.json or a model.json.") from None

@@ -1,4 +1,4 @@
-"""``mkc demo``: the whole way on simulated sensors, whose truth is known."""
+"""``mkc demo``: calibrate, diagnose and correct simulated sensors whose true parameters are known."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Annotated
 import typer
 
 from mkc_torch._support.files import claim_folder
-from mkc_torch.cli.console import FAILURES, complain, folder_written, interrupts_told, out, progress
+from mkc_torch.cli.console import FAILURES, complain, folder_written, interrupts_reported, out, progress
 from mkc_torch.cli.loading import loading
 
 
 def demo(
-    output: Annotated[Path, typer.Option(help="Folder for recordings, results and reports.")] = Path("mkc_demo"),
+    output: Annotated[Path, typer.Option(help="Folder for the recordings, results and reports.")] = Path("mkc_demo"),
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
-    """Calibrate, diagnose and correct embedded SIMULATED sensors and compare with the truth; needs no file."""
+    """Calibrate, diagnose and correct SIMULATED sensors, and compare with the truth. No file is needed."""
     with loading():
         from mkc_torch._parallel.processes import keep_memory, one_thread
         from mkc_torch.cli.demonstration import (
@@ -37,7 +37,7 @@ def demo(
         claim_folder(output, overwrite=force, files=FILES)
         place = claim_folder(output / CONCEALED, overwrite=force, files=WRITTEN)
         with (
-            interrupts_told(lambda: _written(output)),
+            interrupts_reported(lambda: _written(output)),
             folder_written(output),
             folder_written(place),
             progress(1) as step,
@@ -46,15 +46,15 @@ def demo(
             calibration, rows, files = calibrate_simulated(output, force=force)
             with step.aside():
                 show_calibration(console, calibration, rows, files)
-            step("diagnosing a simulated sensor beside a cable")
+            step("diagnosing a simulated sensor next to a cable")
             diagnosis, found = diagnose_simulated(output, force=force)
-            step("correcting a second recording of it")
+            step("correcting a second recording")
             second = correct_second(output, diagnosis, force=force)
             with step.aside():
                 show_diagnosis(console, diagnosis, found, second)
     except FAILURES as error:
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-            raise  # of the terminal's, not of a file's
+            raise  # an error of the terminal, not of a file
         complain(output, error)
         raise typer.Exit(1) from None
     console.print(f"\nNext: open {files[-1]} and {output / CONCEALED / 'report.html'}, or", soft_wrap=True)
@@ -64,5 +64,5 @@ def demo(
 
 
 def _written(output: Path) -> str:
-    """What an interrupt left."""
+    """Return a sentence on what an interrupt left in the folder."""
     return f"{output} may be incomplete." if output.is_dir() else f"nothing was written to {output}."

@@ -1,4 +1,4 @@
-"""The steps of `mkc demo`: what is simulated, computed, written and shown."""
+"""The steps of `mkc demo`: simulate, compute, write and print."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mkc_torch.cli.diagnosis_files import write_diagnosis
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.linear import LeastSquares
 from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, Truth, concealed_recording, simulated_recording
-from mkc_torch.recording.kept_columns import write_beside
+from mkc_torch.recording.kept_columns import write_with_columns
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number
@@ -46,12 +46,12 @@ __all__ = [
 
 _NOTE = (
     "SIMULATED: no sensor recorded this. A program turned a sensor with a known offset and known gains through all "
-    "directions for 90 s while a loudspeaker was carried past it, so the truth can stand beside the result."
+    "directions for 90 s while a loudspeaker was carried past it, so the result can be compared with the truth."
 )
 _CONCEALED_NOTE = (
-    "SIMULATED: no sensor recorded this. A program turned the same sensor for 60 s beside a cable, whose current adds "
+    "SIMULATED: no sensor recorded this. A program turned the same sensor for 60 s next to a cable, whose current adds "
     f"{measured(FIELD_PER_AMPERE, None, 'µT/A')[0]} to the field, and made one sample in twenty an outlier. The "
-    "diagnosis was not told."
+    "diagnosis does not know this."
 )
 FILES = ("recording.csv", "calibration.json", "report.html", "concealed.csv", "second.csv", "corrected.csv")
 CONCEALED = "concealed"
@@ -97,7 +97,13 @@ def diagnose_simulated(folder: Path, *, force: bool) -> tuple[Diagnosis, list[Pa
 
 @dataclass(frozen=True)
 class Second:
-    """How far the length of a second recording's field scatters, and the files."""
+    """Scatter of the field length in a second recording, µT, and the files.
+
+    Attributes:
+        calibrated: corrected by a calibration alone.
+        corrected: corrected by the model with the findings.
+        files: paths of the written files.
+    """
 
     calibrated: float
     corrected: float
@@ -105,14 +111,14 @@ class Second:
 
 
 def correct_second(folder: Path, diagnosis: Diagnosis, *, force: bool) -> Second:
-    """Correct another recording by the model, and by what a calibration of the first one alone makes of it."""
+    """Correct a second recording by the model, and by a calibration of the first recording alone."""
     second = concealed_recording(seed=1)
     assert diagnosis.model is not None
     corrected = diagnosis.model(second)
     files = [folder / "second.csv", folder / "corrected.csv"]
     write_table(files[0], second.columns, overwrite=force)
     field = {name: values for name, values in corrected.items() if name not in second.columns}
-    write_beside(files[0], files[1], field, overwrite=force)
+    write_with_columns(files[0], files[1], field, overwrite=force)
     alone = calibrate(concealed_recording()).apply(second)
     return Second(_scatter(alone), _scatter(corrected), files)
 
@@ -123,8 +129,8 @@ def _scatter(field: dict[str, Tensor]) -> float:
 
 
 def show_calibration(console: Console, calibration: Calibration, rows: list[Comparison], files: list[Path]) -> None:
-    told = "1  Calibrate. SIMULATED sensor: turned by hand for 90 s while a loudspeaker is carried past it."
-    console.print(Text(told, style="bold"))
+    heading = "1  Calibrate. SIMULATED sensor: turned by hand for 90 s while a loudspeaker is carried past it."
+    console.print(Text(heading, style="bold"))
     show(console, calibration, files)
     console.print()
     console.print(_table(rows))
@@ -146,8 +152,8 @@ def _table(rows: list[Comparison]) -> Table:
 
 
 def show_diagnosis(console: Console, diagnosis: Diagnosis, files: list[Path], second: Second) -> None:
-    told = "2  Diagnose. SIMULATED sensor beside a cable, whose field, below the noise, was left out."
-    console.print(Text(f"\n{told}", style="bold"))
+    heading = "2  Diagnose. SIMULATED sensor next to a cable. The cable's field, below the noise, was left out."
+    console.print(Text(f"\n{heading}", style="bold"))
     diagnosis_summary.show(console, diagnosis, files)
     table = Table.grid(padding=(0, 3, 0, 0))
     table.add_row("truth", Text(*measured(FIELD_PER_AMPERE, None, "µT/A, SIMULATED")))
@@ -155,9 +161,9 @@ def show_diagnosis(console: Console, diagnosis: Diagnosis, files: list[Path], se
         table.add_row("found", Text(*measured(found.value, found.standard_error, found.unit)))
     console.print()
     console.print(table)
-    told = "3  Correct a second recording of that sensor: how far the length of its field scatters"
-    console.print(Text(f"\n{told}", style="bold"))
+    heading = "3  Correct a second recording of that sensor: scatter of the field's length"
+    console.print(Text(f"\n{heading}", style="bold"))
     console.print(f"by a calibration alone             {second.calibrated:.2f} µT")
-    console.print(f"by the model with what was found   {second.corrected:.2f} µT")
+    console.print(f"by the model with the findings     {second.corrected:.2f} µT")
     for file in second.files:
         console.print(Text.assemble(f"{term('label.written'):<12}", (str(file), "cyan")), soft_wrap=True)

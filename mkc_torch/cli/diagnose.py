@@ -1,4 +1,4 @@
-"""``mkc diagnose``: recordings in, and out for each what its simulation lacks, a model with it, and a report."""
+"""``mkc diagnose``: find the physics that a simulation lacks; write a diagnosis, a model and a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mkc_torch.cli.console import (
     Steps,
     complain,
     err,
-    interrupts_told,
+    interrupts_reported,
     not_written,
     out,
     parsed_columns,
@@ -26,7 +26,7 @@ from mkc_torch.cli.console import (
     refuse_same_names,
 )
 from mkc_torch.cli.diagnosis_request import (
-    BETWEEN,
+    INPUT_HOLDS,
     LEVEL,
     MAGNETOMETER,
     SIMULATIONS,
@@ -37,82 +37,92 @@ from mkc_torch.cli.diagnosis_request import (
     is_file_of_a_simulation,
 )
 from mkc_torch.cli.loading import loading
-from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
+from mkc_torch.cli.units_option import (
+    CONVERT_HELP,
+    CONVERT_METAVAR,
+    LABEL_HELP,
+    SENSOR_HELP,
+    parsed_units,
+    split_trailing_pairs,
+)
 
 
 def diagnose(
-    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header.")],
-    output: Annotated[Path, typer.Option(help="Folder; each REC gets a folder of its name in it.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs")
+    ],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
     simulation: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help=f"What they are compared with: {', '.join(SIMULATIONS)} (default where mag_x, mag_y and mag_z are "
-            "there), FILE.py:CLASS, or MODEL.fmu; the code in either file is run.",
+            help=f"Simulation to compare with: {', '.join(SIMULATIONS)} (default for a magnetometer's recording), "
+            "FILE.py:CLASS or MODEL.fmu. The code in the file is run.",
         ),
     ] = None,
-    simulated: Annotated[
+    simulator_output: Annotated[
         Path | None,
-        typer.Option(metavar="SIM.csv", help="Instead of --simulation: what a simulator wrote, in the same columns."),
+        typer.Option(
+            metavar="SIM.csv", help="Instead of --simulation: a simulator's output for REC, in the same columns."
+        ),
     ] = None,
     columns: Annotated[
         str | None,
-        typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,temperature=IMU_T"),
+        typer.Option(metavar="NAME=COLUMN,...", help="Names of the columns in the file: mag_x=mx,temperature=IMU_T"),
     ] = None,
-    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    convert: Annotated[list[str] | None, typer.Option(metavar=CONVERT_METAVAR, help=CONVERT_HELP)] = None,
+    unit_label: Annotated[str | None, typer.Option(metavar="UNIT", help=LABEL_HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
-    experiments: Annotated[
+    run_column: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
+        typer.Option(metavar="COLUMN", help="Column that separates the runs of a table; default: experiment, if any."),
     ] = None,
     together: Annotated[
         bool,
         typer.Option(
             "--together",
-            help="One simulation and one set of findings for all REC, each with its own start; into OUTPUT/together.",
+            help="Diagnose all REC as runs of one system, with one set of findings; into OUTPUT/together.",
         ),
     ] = False,
     noise: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=SIZE", help="White noise of an output's sensor, if it is known: angle=0.005"),
+        typer.Option(metavar="NAME=SIZE", help="Known standard deviation of an output's white noise: angle=0.005"),
     ] = None,
-    between: Annotated[
+    input_hold: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=HOW", help=f"What an input does between samples, if it is known: {', '.join(BETWEEN)}."
-        ),
+        typer.Option(metavar="NAME=HOLD", help=f"Known course of an input between samples: {', '.join(INPUT_HOLDS)}."),
     ] = None,
-    level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = LEVEL,
+    level: Annotated[float, typer.Option(metavar="RATE", help="Accepted rate of false alarms.")] = LEVEL,
     surrogates: Annotated[
         int | None,
-        typer.Option(metavar="N", help=f"Draws of noise for each p-value; default: {SURROGATES}, more at a low level."),
+        typer.Option(metavar="N", help=f"Surrogates for each p-value; default: {SURROGATES}, more at a low level."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the draws of noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Seed of the surrogates.")] = 0,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="A first look in less time: no p-values, false alarms not controlled."),
+        typer.Option("--quick", help="Faster, without p-values: false alarms are not controlled."),
     ] = False,
     time_limit: Annotated[
         str | None,
-        typer.Option(metavar="SECONDS", help="Stop after so long, for each REC, and write what is known then."),
+        typer.Option(metavar="SECONDS", help="Stop the search of each REC after this time; write the results so far."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
-    """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
+    """Find the physics that a simulation lacks: its place, size and form, the evidence, and the improvement.
 
-    Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html; with --together all of them get one of
-    each. Exits with 0 when every recording was diagnosed, whatever was found, also in the time limit, and 1 when some
-    were not. Ctrl-C stops the search, writes what is known, and exits with 130; a second one ends at once.
+    For each REC, diagnosis.json, model.json (for `mkc apply`) and report.html are written; with --together, one set
+    for all of them. The exit code is 0 if every recording was diagnosed, with or without findings, and 1 otherwise.
+    Ctrl-C stops the search, writes the results so far and exits with 130; a second Ctrl-C exits at once.
     """
-    recordings, texts = without_units(recordings, unit or [])
+    recordings, conversions = split_trailing_pairs(recordings, convert or [])
     request = Request(
-        simulation=_known(simulation, simulated),
-        simulated=simulated,
-        columns=_columns(columns, experiments),
-        units=_units(texts, simulation),
+        simulation=_known(simulation, simulator_output),
+        simulator_output=simulator_output,
+        columns=_columns(columns, run_column),
+        units=_units(conversions, unit_label, simulation),
         sensor=_sensor(sensor, simulation),
         noise=_noise(noise or []),
-        input_hold=_between(between or []),
+        input_hold=_input_hold(input_hold or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
         seed=seed,
@@ -125,7 +135,7 @@ def diagnose(
         from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
         from mkc_torch.cli.diagnosis_files import simulation_of
     total, failed, left = 0, 0, list(recordings)
-    with interrupts_told(lambda: not_written(left, output)):
+    with interrupts_reported(lambda: not_written(left, output)):
         _refuse_unusable(request, simulation_of)
     one_thread()
     keep_memory()
@@ -133,9 +143,9 @@ def diagnose(
     if together:
         raise typer.Exit(_all_together(output, request, look, recordings))
     with (
-        interrupts_told(lambda: not_written(left, output)),
+        interrupts_reported(lambda: not_written(left, output)),
         progress(len(recordings), output) as step,
-        # a single one is worked on in this process, and says which experiment it is at
+        # a single recording is diagnosed in this process, so that its run can be shown
         in_processes(
             partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
         ) as results,
@@ -143,7 +153,7 @@ def diagnose(
         for path, result in zip(recordings, results, strict=True):
             step(f"diagnosing {path.name}")
             outcomes = _waited_for(result, path)
-            _tell(outcomes, step)
+            _print_outcomes(outcomes, step)
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
             if any(outcome.interrupted for outcome in outcomes):
@@ -162,13 +172,13 @@ def _diagnosed(output: Path, request: Request, look: ConsoleStyle, step: Steps |
 
 
 def _all_together(output: Path, request: Request, look: ConsoleStyle, paths: list[Path]) -> int:
-    """Diagnoses the recordings as one; returns the exit code."""
+    """Diagnose the recordings together. Returns the exit code."""
     from mkc_torch.cli.diagnosis_files import diagnose_together
 
-    with interrupts_told(lambda: not_written([output / TOGETHER], output)), progress(1, output) as step:
+    with interrupts_reported(lambda: not_written([output / TOGETHER], output)), progress(1, output) as step:
         step("diagnosing the recordings together")
         outcomes = diagnose_together(paths, output / TOGETHER, request, look, step)
-        _tell(outcomes, step)
+        _print_outcomes(outcomes, step)
         if any(outcome.interrupted for outcome in outcomes):
             raise KeyboardInterrupt
         step(None)
@@ -179,10 +189,10 @@ def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome
     try:
         return result()
     except BrokenProcessPool:
-        return [Outcome(f"{path}: its process ended, perhaps for lack of memory; try it in a call of its own.", True)]
+        return [Outcome(f"{path}: the process ended, perhaps out of memory; diagnose this file alone.", True)]
 
 
-def _tell(outcomes: list[Outcome], step: Steps) -> None:
+def _print_outcomes(outcomes: list[Outcome], step: Steps) -> None:
     with step.aside():
         for note in dict.fromkeys(outcome.note for outcome in outcomes if outcome.note):
             err().print(f"mkc: {note}", soft_wrap=True)
@@ -193,80 +203,78 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
                 typer.echo(outcome.text, nl=False)
 
 
-def _known(simulation: str | None, simulated: Path | None) -> str:
-    if simulation is not None and simulated is not None:
+def _known(simulation: str | None, simulator_output: Path | None) -> str:
+    if simulation is not None and simulator_output is not None:
         raise typer.BadParameter(
-            "give one of --simulation and --simulator-output: a simulation's name, or the table that one wrote."
+            "give one of --simulation and --simulator-output: a simulation, or the table that a simulator wrote."
         )
     if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
         raise typer.BadParameter(
-            f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them, or one of '
-            "your own as FILE.py:CLASS or MODEL.fmu."
+            f'--simulation "{simulation}" is unknown; give {", ".join(SIMULATIONS)}, or your own simulation as '
+            "FILE.py:CLASS or MODEL.fmu."
         )
     return simulation or ""
 
 
 def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
-    """Said once, before anything is written, and not again for each recording."""
+    """Exit with one message, before anything is written, if the simulation cannot be loaded."""
     if request.undecided:
         return
     try:
         simulation_of(request)
     except FAILURES as error:
-        complain(request.simulated or request.simulation, error)
+        complain(request.simulator_output or request.simulation, error)
         raise typer.Exit(1) from None
 
 
-def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
+def _columns(columns: str | None, run_column: str | None) -> dict[str, str]:
     names = parsed_columns(columns)
-    if experiments is None:
+    if run_column is None:
         return names
-    if not experiments.strip():
+    if not run_column.strip():
         raise typer.BadParameter("--run-column is empty; name the column that separates the runs.")
-    if names.setdefault("experiment", experiments.strip()) != experiments.strip():
+    if names.setdefault("experiment", run_column.strip()) != run_column.strip():
         raise typer.BadParameter("--columns and --run-column name different columns for experiment; leave one out.")
     return names
 
 
-def _units(texts: list[str], simulation: str | None) -> dict[str, str]:
-    units = parsed_units(texts)
+def _units(conversions: list[str], label: str | None, simulation: str | None) -> dict[str, str]:
+    units = parsed_units(conversions, label)
     if "mag" in units and simulation not in (None, MAGNETOMETER):
         raise typer.BadParameter(
-            "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`. Its "
-            "time, and other columns by name, can be converted: --unit time=us."
+            "--unit-label and --convert mag=... apply to a magnetometer. Your own simulation declares its units in "
+            "`units`; its time and its columns can be converted by name: --convert time=us."
         )
     return units
 
 
 def _sensor(sensor: str | None, simulation: str | None) -> str | None:
     if sensor is not None and simulation not in (None, MAGNETOMETER):
-        raise typer.BadParameter(
-            "--sensor names a magnetometer; a simulation of your own takes columns by their names."
-        )
+        raise typer.BadParameter("--sensor names a magnetometer; your own simulation takes columns by name.")
     return sensor
 
 
 def _noise(texts: list[str]) -> dict[str, float]:
-    """Declared sizes of sensors' noise; whether the simulation has such outputs is known once it is loaded."""
+    """Parse the declared noise of each output. The names are checked when the simulation is loaded."""
     sizes: dict[str, float] = {}
     for name, text in parsed_pairs("--noise", texts, "angle=0.005").items():
         try:
             sizes[name] = float(text)
         except ValueError:
-            raise typer.BadParameter(f'--noise {name}="{text}" is no number; write the size, {name}=0.005.') from None
+            raise typer.BadParameter(f'--noise {name}="{text}" is not a number; write {name}=0.005.') from None
         if not (math.isfinite(sizes[name]) and sizes[name] > 0.0):
             raise typer.BadParameter(
-                f"--noise {name} must be above 0, in the output's unit, but is {text}; leave it out to have it "
+                f"--noise {name} must be above 0, in the output's unit, but is {text}; without it the noise is "
                 "estimated."
             )
     return sizes
 
 
-def _between(texts: list[str]) -> dict[str, str]:
+def _input_hold(texts: list[str]) -> dict[str, str]:
     pairs = parsed_pairs("--input-hold", texts, "torque=held")
-    for name, how in pairs.items():
-        if how not in BETWEEN:
-            raise typer.BadParameter(f'--input-hold {name}="{how}" is not known; known: {", ".join(BETWEEN)}.')
+    for name, hold in pairs.items():
+        if hold not in INPUT_HOLDS:
+            raise typer.BadParameter(f'--input-hold {name}="{hold}" is unknown; known: {", ".join(INPUT_HOLDS)}.')
     return pairs
 
 
@@ -291,7 +299,7 @@ def _time_limit(text: str | None) -> float | None:
 
 
 def _surrogates(count: int | None, level: float, *, quick: bool) -> int:
-    """Draws for each p-value: no p-value can be smaller than one over their number plus one."""
+    """Return the number of surrogates; the smallest p-value is 1 / (surrogates + 1)."""
     if quick and count is not None:
         raise typer.BadParameter("--quick draws no surrogates; leave out --surrogates, or --quick to have p-values.")
     fewest = math.ceil(1.0 / level - 1.0 - 1e-9)
@@ -299,7 +307,7 @@ def _surrogates(count: int | None, level: float, *, quick: bool) -> int:
         return max(SURROGATES, fewest)
     if count < fewest:
         raise typer.BadParameter(
-            f"--surrogates must be at least {fewest} at level {level:g}, for no p-value is smaller than "
+            f"--surrogates must be at least {fewest} at level {level:g}, because the smallest p-value is "
             f"1 / (surrogates + 1), but is {count}."
         )
     return count

@@ -1,4 +1,4 @@
-"""From a recording's file to the files of its diagnosis: what `mkc diagnose` and `mkc challenge` both run."""
+"""Diagnose a file and write the results, for `mkc diagnose` and `mkc challenge`."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def diagnose_file(
 ) -> list[Outcome]:
     """Diagnose a file into a folder.
 
-    Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
-    that takes several at once. One that fails does not keep the others from being done. ``step`` is told what is done.
+    If a table holds several runs, each run is diagnosed separately into a subfolder, unless the simulation fits runs
+    jointly. A failed run does not stop the others. ``step`` is called with each stage.
     """
     try:
         request, note = _decided(path, request)
@@ -65,8 +65,8 @@ def diagnose_file(
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
             which = f", run {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
-            told = StageProgress(step, f"diagnosing {path.name}{which}")
-            outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
+            stages = StageProgress(step, f"diagnosing {path.name}{which}")
+            outcomes.append(_outcome(path, label, simulation, part, place, request, look, stages))
             if outcomes[-1].interrupted:
                 break
         if all(outcome.failed for outcome in outcomes):
@@ -77,10 +77,9 @@ def diagnose_file(
 def diagnose_together(
     paths: Sequence[Path], folder: Path, request: Request, look: ConsoleStyle, step: Callable[[str], None] | None = None
 ) -> list[Outcome]:
-    """Diagnose files as one: one simulation and one set of findings for all of them, into one folder.
+    """Diagnose several files jointly, with one set of findings, into one folder.
 
-    A file that cannot be read keeps the others from being diagnosed, for it was asked for them all. ``step`` is told
-    what is done.
+    If a file cannot be read, nothing is diagnosed. ``step`` is called with each stage.
     """
     recordings, notes = [], []
     for path in paths:
@@ -97,52 +96,52 @@ def diagnose_together(
     except Exception as error:
         return [_failed(subject, "", error)]
     with folder_written(folder):
-        told = StageProgress(step, f"diagnosing {subject}")
-        outcome = _outcome(subject, "", simulation, recordings, folder, own, look, told)
+        stages = StageProgress(step, f"diagnosing {subject}")
+        outcome = _outcome(subject, "", simulation, recordings, folder, own, look, stages)
         if outcome.failed:
             remove_if_empty(folder)
     return [replace(outcome, note=next((note for note in notes if note), ""))]
 
 
 def _decided(path: Path, request: Request) -> tuple[Request, str]:
-    """The request with a simulation, by the recording's columns where none is named, and what to say of that."""
+    """Return the request with a simulation, chosen by the recording's columns if none is given, and a note on it."""
     if not request.undecided:
         return request, ""
     try:
         refuse_no_magnetometer(path, request.columns, request.sensor)
     except RecordingError as error:
         raise RecordingError(
-            "give one of --simulation and --simulator-output: without them a recording is compared with the magnetometer, and "
-            f"this one is of none. {error}"
+            "give --simulation or --simulator-output. Without them a recording is compared with the magnetometer, and "
+            f"this recording has none. {error}"
         ) from None
-    note = f"no --simulation is given; the recording is of a magnetometer, so it is `--simulation {MAGNETOMETER}`."
+    note = f"no --simulation is given; the recording has a magnetometer, so `--simulation {MAGNETOMETER}` is used."
     return replace(request, simulation=MAGNETOMETER), note
 
 
 def _read(path: Path, request: Request) -> Recording:
-    if request.simulated is None and request.simulation == MAGNETOMETER:
+    if request.simulator_output is None and request.simulation == MAGNETOMETER:
         return read_magnetometer(path, request.columns, request.units, request.sensor)[0]
     return read_table(path, request.columns, request.units)
 
 
 class StageProgress:
-    """What is being done with a subject, and how much of it is, told to the steps of a command; to nobody without.
+    """Report the stages of a diagnosis to the progress of a command.
 
     Args:
-        step: the steps, or what is called with each stage.
-        subject: what is worked on.
+        step: the progress, or a function called with each stage; None reports nothing.
+        subject: name of the work, such as ``diagnosing a.csv``.
     """
 
     def __init__(self, step: Callable[[str], None] | None, subject: str) -> None:
         self._step, self._subject = step, subject
 
     def __call__(self, stage: str) -> None:
-        """A stage has begun."""
+        """Report the stage that begins."""
         if self._step is not None:
             self._step(f"{self._subject}: {stage}")
 
     def count(self, thing: str, done: int, total: int) -> None:
-        """So many of so many things of the stage are done."""
+        """Report how many parts of the stage are done."""
         if isinstance(self._step, Steps):
             self._step.part(thing, done, total)
 
@@ -150,9 +149,9 @@ class StageProgress:
 def write_diagnosis(
     diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True, note: str = ""
 ) -> list[Path]:
-    """Write diagnosis.json, model.json and report.html of a diagnosis into a folder.
+    """Write diagnosis.json, model.json and report.html into a folder.
 
-    Of differential equations also corrected.py, the simulation with what was found. ``note`` is said in the report.
+    Differential equations also get corrected.py, the simulation with the findings. ``note`` is shown in the report.
     """
     from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
@@ -163,7 +162,7 @@ def write_diagnosis(
         with suppress(SourceError):
             texts["corrected.py"] = diagnosis.model.to_python(folder=folder)
     for name in {"model.json", "corrected.py"} - set(texts):
-        (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
+        (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
     if report:
         texts["report.html"] = diagnosis_report(diagnosis, note=note)
     for name, text in texts.items():
@@ -172,7 +171,7 @@ def write_diagnosis(
 
 
 def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
-    """The experiments of a table, with their labels and folders; itself, if it has none or they are taken together."""
+    """Yield the runs of a table with labels and folders, or the whole table if it is diagnosed at once."""
     if _EXPERIMENT not in recording or getattr(simulation, "joins_experiments", False):
         yield "", recording, folder
         return
@@ -192,7 +191,7 @@ def _outcome(
     progress: StageProgress,
 ) -> Outcome:
     try:
-        # the whole folder was claimed before
+        # without a label the folder is claimed already
         claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
         with folder_written(folder) if label else nullcontext():
             with stopped_by_interrupt():
@@ -218,7 +217,7 @@ def _outcome(
 
 
 def named_simulation(name: str) -> Simulation:
-    """The magnetometer, or a user's own of ``FILE.py:NAME``.
+    """Return the magnetometer, or load the user's simulation ``FILE.py:NAME``.
 
     Raises:
         SimulationFileError: the file cannot be used.
@@ -229,7 +228,7 @@ def named_simulation(name: str) -> Simulation:
 
 
 def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
-    """What a simulator wrote; columns are renamed like those of the recording, where it has them under those names.
+    """Read a simulator's output. Columns are renamed like those of the recording if they exist in the table.
 
     Raises:
         ValueError, OSError: the file cannot be used.
@@ -242,28 +241,27 @@ def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
 
 
 def simulation_of(request: Request) -> Simulation:
-    """What the recordings are compared with.
+    """Return the simulation that the recordings are compared with.
 
     Raises:
-        ValueError, OSError: a file of it cannot be used.
+        ValueError, OSError: its file cannot be used.
     """
-    if request.simulated is not None:
-        return paired_simulation(request.simulated, request.columns)
+    if request.simulator_output is not None:
+        return paired_simulation(request.simulator_output, request.columns)
     return named_simulation(request.simulation)
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:
     subject = f"{path}, run {label}" if label else str(path)
     sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
-    sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path says it
+    sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path has it already
     return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)
 
 
 def _unexpected(error: Exception) -> str:
-    """What is no fault of the user's, with the place to look at."""
+    """Return the message of an internal error, with its file and line."""
     frames = traceback.extract_tb(error.__traceback__)
     where = f" in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
-    told = sentence_of(error)
-    return (
-        f"an error of the program's own ({type(error).__name__}{where}{f': {told}' if told else ''}); please report it."
-    )
+    message = sentence_of(error)
+    detail = f": {message}" if message else ""
+    return f"internal error ({type(error).__name__}{where}{detail}); please report it."

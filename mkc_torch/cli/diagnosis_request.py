@@ -1,4 +1,4 @@
-"""What a diagnosis can be asked for on the command line, and its outcome; nothing here needs torch."""
+"""Options and outcome of a diagnosis on the command line. This file needs no torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 __all__ = [
-    "BETWEEN",
+    "INPUT_HOLDS",
     "LEVEL",
     "MAGNETOMETER",
     "SIMULATIONS",
@@ -20,26 +20,27 @@ __all__ = [
 
 MAGNETOMETER = "magnetometer"
 SIMULATIONS = (MAGNETOMETER,)
-"""Simulations that are known by name."""
+"""Simulations that `--simulation` accepts by name."""
 
-# those of mkc_torch.diagnosis, which cannot be imported without torch; a test holds them together
-BETWEEN = ("held", "linear", "smooth")
+# the same as in mkc_torch.diagnosis, which cannot be imported without torch; a test compares them
+INPUT_HOLDS = ("held", "linear", "smooth")
 LEVEL = 0.05
 SURROGATES = 99
 
 TOGETHER = "together"
-"""Folder of what is diagnosed with ``--together``."""
+"""Folder of the results of ``--together``."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one.
+    """Options for diagnosing each recording.
 
-    Where there is neither, it is compared with the magnetometer if it is of one.
+    A recording is compared with ``simulation``, or with the table ``simulator_output``. With neither of them, a
+    recording of a magnetometer is compared with :class:`~mkc_torch.simulation.Magnetometer`.
     """
 
     simulation: str = MAGNETOMETER
-    simulated: Path | None = None
+    simulator_output: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     sensor: str | None = None
@@ -55,15 +56,19 @@ class Request:
 
     @property
     def undecided(self) -> bool:
-        """Whether the recording's columns decide what it is compared with."""
-        return not self.simulation and self.simulated is None
+        """Whether the recording's columns select the simulation."""
+        return not self.simulation and self.simulator_output is None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A recording, or one experiment of it: its summary, or the sentence that says why there is none.
+    """Result for a recording, or for one run of it.
 
-    ``note`` is a sentence on what was decided for the user; ``interrupted`` says that the user stopped it.
+    Attributes:
+        text: the summary, or the error.
+        failed: whether ``text`` is an error.
+        note: a sentence on a choice made for the user.
+        interrupted: whether the user stopped the search.
     """
 
     text: str

@@ -1,4 +1,4 @@
-"""A diagnosis on the terminal: the verdict, the answers to its four questions, each finding, what to do, the files."""
+"""Print a diagnosis: the verdict, its four questions, the findings, the next steps and the files."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ from rich.text import Text
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import findings as sentences
 from mkc_torch.report.diagnosis import noise, numbers, unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import rows
 
-_LABEL = 11  # letters of the longest label
+_LABEL = 11
+"""Letters of the longest label."""
+
 _MOST_LINES = 6
+"""Most lines on the parameters of a finding."""
+
 _MOST_WARNINGS = 6
+"""Most warnings that are printed."""
+
 _STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
 
 
@@ -27,11 +33,11 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
     """Print the summary of a diagnosis and the files that hold it."""
     d = diagnosis
     console.print()
-    told = plain(d.recording) or term("label.recording")
+    heading = plain(d.recording) or term("label.recording")
     if d.simulation:
-        told = term("label.against", recording=told, simulation=plain(d.simulation))
-    console.print(Text(told, style="bold"))
-    for notice in top.said_first(d):
+        heading = term("label.against", recording=heading, simulation=plain(d.simulation))
+    console.print(Text(heading, style="bold"))
+    for notice in top.notices_first(d):
         console.print(Text(notice, style="bold yellow"))
     console.print(Text(top.headline(d), style=_STYLE[top.tone(d)]))
     console.print(_facts(_four_answers(d)))
@@ -41,37 +47,37 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
     console.print(_facts(_of_all(d)))
     for file in files:
-        # outside the table, where a long path would be broken and could not be copied
+        # outside the table, so that a long path is not broken and can be copied
         console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
 
 
 def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    """Does it follow, is what is left noise, what is named, and what is left without a name."""
+    """Yield the goodness of fit, the noise, the findings, and the unexplained rest."""
     d = diagnosis
     for line in world.output_lines(d):
         yield term("label.follows"), line
     if d.verdict == "unfit":
         for reason in top.reasons(d):
             yield _striking("label.why"), reason
-        yield term("label.named"), term("world.nothing_named")
+        yield term("label.named"), term("environment.nothing_named")
         return
     for line in world.noise_lines(d) or [noise.noise_model(d.noise)]:
         yield term("label.noise"), line
     yield term("label.named"), _named(d.findings)
-    yield term("label.unexplained"), top.left_in_short(d) or term("world.nothing")
+    yield term("label.unexplained"), top.unexplained_place(d) or term("environment.nothing")
 
 
 def _named(findings: Sequence[Finding]) -> str:
-    """What is named for sure; where nothing is, what is not."""
-    sure = [f for f in findings if f.grade in ("left out", "real but small")]
-    told = "; ".join(_graded(f) for f in sure or findings)
+    """Return the certain findings, or the uncertain ones if there are no others."""
+    sure = [f for f in findings if f.grade in ("left_out", "small")]
+    names = "; ".join(_graded(f) for f in sure or findings)
     if sure or not findings:
-        return told or term("world.nothing")
-    return term("world.nothing_sure", findings=told)
+        return names or term("environment.nothing")
+    return term("environment.nothing_sure", findings=names)
 
 
 def _graded(finding: Finding) -> str:
-    return term("world.graded", finding=say.finding_name(finding), grade=say.grade(finding))
+    return term("environment.graded", finding=sentences.finding_name(finding), grade=sentences.grade(finding))
 
 
 def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
@@ -82,29 +88,29 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         lines.append(term("number.more_parameters"))
     if lines:
         yield term("label.size"), "\n".join(lines)
-    acts = f"; {say.acts_on(f)}" if f.channels else ""
-    yield term("label.where"), say.where(f, numbers.clock_of(diagnosis.traces)) + acts
+    acts = f"; {sentences.acts_on(f)}" if f.channels else ""
+    yield term("label.where"), sentences.where(f, numbers.clock_of(diagnosis.traces)) + acts
     if f.region is not None:
-        yield term("label.mostly"), say.region(f.region)
+        yield term("label.mostly"), sentences.region(f.region)
     if f.experiments:
-        yield term("label.in"), say.shares_of_runs(f.experiments, diagnosis.world.runs)
-    yield term("label.driven_by"), say.driven_by(f)
+        yield term("label.in"), sentences.shares_of_runs(f.experiments, diagnosis.environment.runs)
+    yield term("label.driven_by"), sentences.driven_by(f)
     evidence = numbers.evidence(f.p_value, diagnosis.surrogates)
     sure = evidence if f.p_value is None else term("evidence.after_the_search", evidence=evidence)
     yield term("label.how_sure"), sure
     if f.shape is not None:
-        yield term("label.shape"), "; ".join(filter(None, [say.shape(f), plain(f.shape.formula)]))
+        yield term("label.shape"), "; ".join(filter(None, [sentences.shape(f), plain(f.shape.formula)]))
     if f.held_out is None:
         yield term("label.held_out"), f"{term('evidence.not_measured')}: {plain(f.held_out_note)}"
     else:
         zero = f"; {term('evidence.zero')}" if first else ""
-        residual = "; ".join(unseen.residuals(f.held_out, diagnosis.world))
-        more = [unseen.left(f.held_out), plain(f.held_out_note)]
-        told = f"{residual}; {unseen.better(f.held_out)}; {numbers.gain(f.held_out)}{zero}"
-        yield term("label.held_out"), "\n".join(filter(None, [told, *more]))
+        residual = "; ".join(unseen.residuals(f.held_out, diagnosis.environment))
+        more = [unseen.diverged(f.held_out), plain(f.held_out_note)]
+        change = f"{residual}; {unseen.better(f.held_out)}; {numbers.gain(f.held_out)}{zero}"
+        yield term("label.held_out"), "\n".join(filter(None, [change, *more]))
     yield from rows(f.evidence, terminal=True)
-    if say.inseparable(f):
-        yield _striking("label.or"), term("evidence.cannot_tell", rivals=say.rivals(f))
+    if sentences.inseparable(f):
+        yield _striking("label.or"), term("evidence.cannot_distinguish", rivals=sentences.rivals(f))
     if not f.plausible:
         yield _striking("label.doubtful"), typeset(f.plausibility) or term("evidence.no_plausible_size")
 
@@ -121,9 +127,9 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
             term("label.how_sure"),
             term("evidence.searched", evidence=evidence, candidates=tried, level=f"{d.level:g}"),
         )
-    beside = noise.smooth_fit(d)
-    if beside and d.verdict != "unfit":
-        yield term("label.compare"), beside
+    smooth = noise.smooth_fit(d)
+    if smooth and d.verdict != "unfit":
+        yield term("label.compare"), smooth
     if d.verdict != "unfit":
         if world.noise_lines(d):
             yield term("label.sensor"), noise.noise_model(d.noise)
@@ -141,12 +147,12 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
 
 
 def _striking(key: str) -> str:
-    """A name that stands out."""
+    """Return a label that is highlighted."""
     return f"!{term(key)}"
 
 
 def _facts(lines: Iterator[tuple[str, str]]) -> Table:
-    """Names and values; a name that begins with an exclamation mark stands out."""
+    """Return a table of labels and values; a label that begins with an exclamation mark is highlighted."""
     table = Table.grid(padding=(0, 3, 0, 0))
     table.add_column(no_wrap=True, min_width=_LABEL)
     table.add_column(overflow="fold")

@@ -1,4 +1,4 @@
-"""``mkc export``: a calibration or a model made before, in the form that an autopilot or a program takes."""
+"""``mkc export``: write a calibration or a model in the format of an autopilot or a program."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def export(
     output: Annotated[Path, typer.Option(help="File to write.")],
     name: Annotated[
         str | None,
-        typer.Option(help="What the sensor is called; default: as in the calibration; of a model its folder's."),
+        typer.Option(help="Name of the sensor; default: that of the calibration, or of the model's folder."),
     ] = None,
     instance: INSTANCE = None,
     device_id: DEVICE_ID = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a calibration as parameters of PX4 or ArduPilot, a C header, a parameter file of ROS, or plain JSON.
+    """Export a calibration as PX4 or ArduPilot parameters, C header, ROS parameter file, or JSON.
 
-    Of a model, offset, matrix and the field of a current are exported; what else it found is told as left out.
+    From a model, the offset, the matrix and the field of a current are exported; a warning names other findings.
     """
     if name is not None and not name.strip():
         raise typer.BadParameter("--name is empty; name the sensor, such as mast.")
@@ -46,7 +46,7 @@ def export(
         exported = kind.text(correction, Destination(instance, device_id))
         subject = output
         if output.exists() and output.samefile(model):
-            raise ValueError("this is what is exported, which is read and never overwritten; choose another --output.")
+            raise ValueError(f"--output is the input file {model}; choose another.")
         write_atomically(output, exported.text, overwrite=force)
     except FAILURES as error:
         complain(subject, error)

@@ -1,4 +1,4 @@
-"""Options that say in which form a calibration is exported, and to which sensor of a vehicle."""
+"""Options for the format of an export and the sensor of the vehicle that it is for."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ import typer
 
 __all__ = ["DEVICE_ID", "INSTANCE", "KINDS", "checked_exports"]
 
-# as in mkc_torch.calibration.exports, which loads torch: a mistake in a name is told before that
+# the same as in mkc_torch.calibration.exports, which imports torch; a wrong name is reported before that import
 KINDS = ("px4", "ardupilot", "c-header", "ros-yaml", "json")
 _NUMBERED = ("px4", "ardupilot")
 
 INSTANCE = Annotated[
     int | None,
     typer.Option(
-        metavar="N", help="The autopilot's number of the sensor, PX4 from 0, ArduPilot from 1; default: first."
+        metavar="N", help="Number of the sensor on the autopilot: PX4 from 0, ArduPilot from 1; default: the first."
     ),
 ]
 DEVICE_ID = Annotated[
-    int | None, typer.Option(metavar="ID", help="PX4's id of the sensor, for CAL_MAGn_ID; default: yours to set.")
+    int | None,
+    typer.Option(metavar="ID", help="Device id of the sensor for CAL_MAGn_ID of PX4; default: none."),
 ]
 
 
 def checked_exports(option: str, kinds: Sequence[str], instance: int | None, device_id: int | None) -> tuple[str, ...]:
-    """The kinds, each once.
+    """Return the export formats without duplicates.
 
     Args:
-        option: that they were given by.
-        kinds: as given.
-        instance, device_id: place on a vehicle.
+        option: name of the option, for messages.
+        kinds: names of the formats.
+        instance, device_id: the sensor on the vehicle.
 
     Raises:
-        typer.BadParameter: a kind that is not known, or a place for kinds that have none.
+        typer.BadParameter: an unknown format, or a sensor number for formats that have none.
 
     Example:
         >>> checked_exports("--export", ["px4", "json", "px4"], 1, None)
@@ -41,12 +42,12 @@ def checked_exports(option: str, kinds: Sequence[str], instance: int | None, dev
     """
     for kind in kinds:
         if kind not in KINDS:
-            raise typer.BadParameter(f'{option} "{kind}" is not known; known are {", ".join(KINDS)}.')
+            raise typer.BadParameter(f'{option} "{kind}" is unknown; choose from {", ".join(KINDS)}.')
     for name, value, known in (("--instance", instance, _NUMBERED), ("--device-id", device_id, ("px4",))):
         if value is None:
             continue
         if value < 0:
-            raise typer.BadParameter(f"{name} must be a whole number of at least 0 but is {value}.")
+            raise typer.BadParameter(f"{name} must be an integer of at least 0 but is {value}.")
         if not set(kinds) & set(known):
-            raise typer.BadParameter(f"{name} is for {' and '.join(known)}; name one of them with {option}.")
+            raise typer.BadParameter(f"{name} is only for {' and '.join(known)}; choose such a format with {option}.")
     return tuple(dict.fromkeys(kinds))

@@ -1,4 +1,4 @@
-"""Calibrations and models as what is exported, and the exports of a recording's folder."""
+"""Convert calibrations and models to exports, and find stale exports in a folder."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mkc_torch.calibration.exports import EXPORTS, Destination, ExportError, Sen
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.sensor_correction import sensor_correction
 
-__all__ = ["correction_of", "exports_of", "left_from_before"]
+__all__ = ["correction_of", "exports_of", "stale_exports"]
 
 
 def correction_of(known: Calibration | DiagnosedModel, path: Path, name: str | None) -> SensorCorrection:
-    """What is exported of a file; a model has no name, and is called as its folder is.
+    """Return the exportable part of a calibration or model. A model takes the name of its folder.
 
     Raises:
-        ExportError: a model of another simulation than the magnetometer.
+        ExportError: the model is not one of a magnetometer.
     """
     given = None if name is None else name.strip()
     if isinstance(known, DiagnosedModel):
@@ -30,7 +30,7 @@ def correction_of(known: Calibration | DiagnosedModel, path: Path, name: str | N
 def exports_of(
     correction: SensorCorrection, kinds: Sequence[str], to: Destination
 ) -> tuple[dict[str, str], list[str], list[ExportError]]:
-    """File names with their texts, what to notice, and what could not be exported."""
+    """Return file names with their texts, the warnings, and the errors."""
     texts: dict[str, str] = {}
     notes: list[str] = []
     refused = []
@@ -45,8 +45,8 @@ def exports_of(
     return texts, notes, refused
 
 
-def left_from_before(folder: Path, written: Sequence[str]) -> list[str]:
-    """A sentence about exports in a folder that are of an earlier calibration."""
+def stale_exports(folder: Path, written: Sequence[str]) -> list[str]:
+    """Return a sentence on exports in the folder that belong to an earlier calibration, if there are any."""
     old = [export.file for export in EXPORTS.values() if export.file not in written and (folder / export.file).exists()]
     if not old:
         return []

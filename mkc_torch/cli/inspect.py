@@ -1,4 +1,4 @@
-"""``mkc inspect``: what is in files, and what ``mkc calibrate`` would make of it by itself."""
+"""``mkc inspect``: show the content of files, and what ``mkc calibrate`` would read from them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def inspect(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Tables and logs.")],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Tables or logs.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Say what is in files: topics, columns, rates, gaps, units, and what `mkc calibrate` would take by itself.
+    """Show topics, columns, rates, gaps and units of files, and what `mkc calibrate` would read from them.
 
-    Exits with 0 when every file was read and 1 when some were not.
+    The exit code is 0 if every file was read, and 1 otherwise.
     """
     with loading():
         from mkc_torch.cli.inspection_summary import as_data, commands_of, show

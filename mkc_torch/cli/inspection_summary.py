@@ -1,4 +1,4 @@
-"""What is in a file, as tables on a terminal and as data."""
+"""Print the content of a file, or return it as data for JSON."""
 
 from __future__ import annotations
 
@@ -19,52 +19,53 @@ __all__ = ["as_data", "commands_of", "show"]
 
 
 def commands_of(seen: FileSeen) -> tuple[list[str], list[str]]:
-    """The command that calibrates what is recognised, with the options it needs; and what there is to say of it first.
+    """Return the commands that calibrate the recognised sensors, and notes.
 
     Returns:
-        Commands, none where there is a question; and sentences, of which the first is the question.
+        The commands, with the options they need, and the notes. If a question is open there are no commands, and the
+        question is the first note.
     """
     if seen.question or not seen.sensors:
         return [], [seen.question]
-    told: list[str] = []
+    notes: list[str] = []
     options: set[str | None] = set()
     for sensor in seen.sensors:
-        sentences, option = _asked(seen, sensor)
-        told += [sentence for sentence in sentences if sentence not in told]
+        sentences, option = _trial(seen, sensor)
+        notes += [sentence for sentence in sentences if sentence not in notes]
         options |= {option}
     command = f"mkc calibrate {shlex.quote(str(seen.path))}"
-    if len(options) > 1 or None in options:  # each sensor in a call of its own
-        pairs = [(sensor, *_asked(seen, sensor)) for sensor in seen.sensors]
+    if len(options) > 1 or None in options:  # one call for each sensor
+        pairs = [(sensor, *_trial(seen, sensor)) for sensor in seen.sensors]
         return [
             f"{command} --sensor {shlex.quote(sensor.name)}{option} --output results/{shlex.quote(sensor.name)}"
             for sensor, _, option in pairs
             if option is not None
-        ], told
-    return [f"{command}{options.pop()} --output results"], told
+        ], notes
+    return [f"{command}{options.pop()} --output results"], notes
 
 
-def _asked(seen: FileSeen, sensor: SensorSeen) -> tuple[list[str], str | None]:
-    """What reading a sensor tells, and the option that it asks for, empty for none; None where it fails."""
+def _trial(seen: FileSeen, sensor: SensorSeen) -> tuple[list[str], str | None]:
+    """Read a sensor. Returns its warnings and the option it needs, "" for none, None if reading fails."""
     try:
         recording, _ = read_magnetometer(seen.path, {}, {}, sensor.name or None)
     except RecordingError as error:
-        _, found, after = str(error).partition("`--unit mag=")
-        return [str(error)], f" --unit mag={after.partition('`')[0]}" if found else None
+        _, found, after = str(error).partition("`--convert mag=")
+        return [str(error)], f" --convert mag={after.partition('`')[0]}" if found else None
     return list(recording.warnings), ""
 
 
 def as_data(seen: FileSeen) -> dict[str, Any]:
-    """The same as data for JSON."""
-    commands, told = commands_of(seen)
-    data = asdict(seen) | {"path": str(seen.path), "commands": commands, "told": told}
+    """Return the content of a file as data for JSON."""
+    commands, notes = commands_of(seen)
+    data = asdict(seen) | {"path": str(seen.path), "commands": commands, "told": notes}
     for sensor in data["sensors"]:
         sensor["columns"], sensor["units"] = dict(sensor["columns"]), dict(sensor["units"])
     return data
 
 
 def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -> None:
-    """Print what is in a file, what would be read of it, and the command."""
-    commands, told = found
+    """Print the topics and columns of a file, the recognised sensors, the notes and the commands."""
+    commands, notes = found
     console.print()
     console.print(Text(str(seen.path), style="bold"), soft_wrap=True)
     for topic in seen.topics:
@@ -75,14 +76,14 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
         console.print(
             Text(f"magnetometer{where}: {', '.join(_taken(dict(sensor.columns), dict(sensor.units)))}"), soft_wrap=True
         )
-    for sentence in told:
+    for sentence in notes:
         console.print(Text(f"note: {sentence}"), soft_wrap=True)
     for command in commands:
         console.print(Text.assemble(f"{term('label.to_do'):<8}", (command, "cyan")), soft_wrap=True)
 
 
 def _about(topic: TopicSeen) -> str:
-    """A line on a topic: rows, rate, duration, gaps, runs."""
+    """Return a line on a topic: rows, rate, duration, gaps and runs."""
     parts = [f"{topic.rows:,} rows"]
     if topic.rate is not None and topic.seconds is not None:
         parts += [f"{topic.rate:.4g} Hz", f"{topic.seconds:.5g} s"]
@@ -106,9 +107,9 @@ def _columns(topic: TopicSeen) -> Table:
 
 
 def _taken(columns: dict[str, str], units: dict[str, str]) -> list[str]:
-    """What is read as what: mag_x from magX [uT]."""
-    told = []
+    """Return the source of each column, such as ``mag_x from magX [uT]``."""
+    sources = []
     for new, old in columns.items():
         unit = f" in {units[new]}" if new in units and units[new] not in old else ""
-        told.append(f"{new} from {old}{unit}" if new != old else f"{new}{unit}")
-    return told
+        sources.append(f"{new} from {old}{unit}" if new != old else f"{new}{unit}")
+    return sources

@@ -1,4 +1,4 @@
-"""When what computes is loaded: not before a command's options are understood, for torch takes seconds to import."""
+"""Import torch only after a command's options are checked, because the import takes seconds."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from contextlib import contextmanager
 
 __all__ = ["loading", "when_loaded"]
 
-_then: list[Callable[[], None]] = []
+_callbacks: list[Callable[[], None]] = []
 
 
-def when_loaded(then: Callable[[], None]) -> None:
-    """Have ``then`` be called once, when the command of this process has loaded what it needs."""
-    _then.append(then)
+def when_loaded(callback: Callable[[], None]) -> None:
+    """Register a function that is called once, when the command of this process has imported its modules."""
+    _callbacks.append(callback)
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """To be entered once a command, around the imports that bring torch in, before anything is opened or written."""
+    """Wrap the imports of a command. Enter it once, before any file is opened or written."""
     yield
-    while _then:
-        _then.pop()()
+    while _callbacks:
+        _callbacks.pop()()

@@ -1,4 +1,4 @@
-"""``mkc new-simulation`` and ``mkc new-effect``: a file to begin with, and its test."""
+"""``mkc new-simulation`` and ``mkc new-effect``: write a template and its test."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ import typer
 from mkc_torch._support.files import write_atomically
 from mkc_torch.cli.console import FAILURES, complain, out
 
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Of the file and, in capitals, of the class in it: kite.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the file, such as kite; the class is called Kite.")]
 Folder = Annotated[Path, typer.Option(help="Folder to write into.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
 def new_simulation(name: Name, output: Folder = Path(), force: Force = False) -> None:
-    """Write NAME.py, a simulation of your own to begin with, and test_NAME.py, which simulates and diagnoses it."""
+    """Write NAME.py, a template for your own simulation, and test_NAME.py, which simulates and diagnoses it."""
     _write("simulation", name, output, force=force)
 
 
 def new_effect(name: Name, output: Folder = Path(), force: Force = False) -> None:
-    """Write NAME.py, an effect of your own to begin with, and test_NAME.py, which finds it in a simulated recording."""
+    """Write NAME.py, a template for your own effect, and test_NAME.py, which finds it in a simulated recording."""
     _write("effect", name, output, force=force)
 
 
@@ -35,7 +35,7 @@ def _write(kind: str, name: str, folder: Path, *, force: bool) -> None:
     words = {"name": name, "class": _in_capitals(name)}
     targets = {folder / f"{name}.py": kind, folder / f"test_{name}.py": f"test_{kind}"}
     try:
-        for path in targets:  # neither is written where one cannot be
+        for path in targets:  # write both files or none
             if path.exists() and not (force and path.is_file()):
                 raise FileExistsError(f"{path} exists; choose another name, or replace it with `--force`.")
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def _text(template: str, words: dict[str, str]) -> str:
 
 
 def _in_capitals(name: str) -> str:
-    """Of a class.
+    """Return the name of the class.
 
     Example:
         >>> _in_capitals("two_tanks"), _in_capitals("kite")
@@ -63,23 +63,21 @@ def _in_capitals(name: str) -> str:
 
 
 def _refuse_name(name: str) -> None:
-    """Refuses what cannot be imported by its name, or is something else by that name.
+    """Raise if a name cannot be that of a new module.
 
     Raises:
-        typer.BadParameter: no name of a module, or one that is taken.
+        typer.BadParameter: the name is not an identifier, is taken by a module, or equals the name of the class.
     """
     if not name.isidentifier() or keyword.iskeyword(name) or not _in_capitals(name).isidentifier():
         raise typer.BadParameter(
-            f'"{name}" cannot be the name of a module; write a word of letters, digits and _, such as kite. The folder '
-            "is told by --output."
+            f'"{name}" cannot be the name of a module; use letters, digits and _, such as kite. Give the folder by '
+            "--output."
         )
     places = [place for place in sys.path if place and Path(place).resolve() != Path.cwd()]
     taken = name in sys.builtin_module_names or name in sys.stdlib_module_names
     if taken or PathFinder.find_spec(name, places) is not None:
-        raise typer.BadParameter(
-            f"a module {name} is installed, and a file of that name would hide it; choose another."
-        )
+        raise typer.BadParameter(f"a module {name} is installed, and this file would hide it; choose another name.")
     if _in_capitals(name) == name:
         raise typer.BadParameter(
-            f"\"{name}\" would be the file's name and the class's; write it in small letters, {name.lower()}."
+            f'"{name}" would be the name of the file and of the class; write it in lower case, {name.lower()}.'
         )

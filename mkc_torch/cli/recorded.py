@@ -1,4 +1,4 @@
-"""A recording as a command takes it: read, of one sensor, and refused where its unit can only be guessed."""
+"""Read recordings for the commands. A magnetometer whose unit can only be guessed is refused."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Topic
-from mkc_torch.recording.reading import ASKED, LoadedTable, read_file
+from mkc_torch.recording.reading import REQUIRED_COLUMNS, LoadedTable, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
+from mkc_torch.recording.unit_words import conversion
 
 __all__ = [
     "read_accelerometer",
@@ -30,12 +31,12 @@ _AXES = ("mag_x", "mag_y", "mag_z")
 def sensor_names(
     path: Path, columns: Mapping[str, str], sensor: str | None, topics: Sequence[Topic] | None = None
 ) -> list[str | None]:
-    """The magnetometers of a file that are to be taken one by one; None where it has one alone.
+    """Return the names of the magnetometers in a file; a single one has the name None.
 
-    ``topics`` are the file's tables, where they have been read already.
+    ``topics`` are the file's tables, if they are read already.
 
     Raises:
-        RecordingError: nobody can tell which columns are meant.
+        RecordingError: the columns of the magnetometer are ambiguous.
     """
     if sensor is not None:
         return [sensor]
@@ -44,10 +45,10 @@ def sensor_names(
 
 
 def refuse_no_magnetometer(path: Path, columns: Mapping[str, str], sensor: str | None) -> None:
-    """Refuse a file in which no magnetometer is recognised or named.
+    """Raise if no magnetometer is recognised or named.
 
     Raises:
-        RecordingError: none is; the sentence has the option that names its columns.
+        RecordingError: there is none; the message names the option for its columns.
     """
     topics = with_row_sensors(read_topics(path))
     if sensor is None and not set(_AXES) & set(columns) and not recognised(topics, path.stem).sensors:
@@ -61,17 +62,17 @@ def read_magnetometer(
     sensor: str | None,
     topics: Sequence[Topic] | None = None,
 ) -> tuple[Recording, LoadedTable]:
-    """Read a recording of a magnetometer; ``topics`` are the file's tables, where they have been read already.
+    """Read a recording of a magnetometer; ``topics`` are the file's tables, if they are read already.
 
     Raises:
-        RecordingError: no magnetometer in it, or one whose size says that it is in another unit than it should be, and
-            nothing says which it is.
+        RecordingError: the file has no magnetometer, or no unit is given and the size of the field suggests another
+            unit than µT.
     """
-    found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, topics=topics)
+    found = read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, topics=topics)
     if not set(_AXES) & set(found.columns):
         raise RecordingError(which_columns(path, read_topics(path)))
     recording = _recording(path, found)
-    if set(_AXES) <= set(found.columns) and not set(_AXES) & found.said:
+    if set(_AXES) <= set(found.columns) and not set(_AXES) & found.with_stated_unit:
         size = field_size(recording)
         if size is not None:
             refuse_likely_size(path, size)
@@ -81,19 +82,19 @@ def read_magnetometer(
 def read_accelerometer(
     path: Path, columns: Mapping[str, str], units: Mapping[str, str], topics: Sequence[Topic] | None = None
 ) -> Recording:
-    """Read a recording of an accelerometer; ``topics`` are the file's tables, where they have been read already.
+    """Read a recording of an accelerometer; ``topics`` are the file's tables, if they are read already.
 
     Raises:
-        MissingColumnError: no column of one is recognised or named.
+        MissingColumnError: its columns are neither recognised nor named.
     """
-    recording = _recording(path, read_file(path, ASKED, columns=columns, units=units, topics=topics))
+    recording = _recording(path, read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, topics=topics))
     recording.stack("accel_x", "accel_y", "accel_z")
     return recording
 
 
 def read_table(path: Path, columns: Mapping[str, str], units: Mapping[str, str]) -> Recording:
-    """Read a recording for a simulation of the user's own, whose columns have the names that they have."""
-    return _recording(path, read_file(path, ASKED, columns=columns, units=units, recognise=False))
+    """Read a recording for the user's own simulation; columns keep their names."""
+    return _recording(path, read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, recognise=False))
 
 
 def read_again(
@@ -105,44 +106,48 @@ def read_again(
     made_in: str,
     of_field: bool,
 ) -> tuple[Recording, int]:
-    """Read a recording that something made before is applied to, and the number of its topic.
+    """Read a recording to correct. Returns it with the number of its topic.
 
     Args:
-        path, columns, units, sensor: as :func:`read_magnetometer` takes them.
-        made_in: unit of the measurements that it was made from; empty where it is not known.
-        of_field: whether it is of a magnetometer, and not of a simulation of the user's own.
+        path, columns, units, sensor: see :func:`read_magnetometer`.
+        made_in: unit of the calibrated recording; "" if unknown.
+        of_field: whether the recording is of a magnetometer, and not for the user's own simulation.
 
     Raises:
-        RecordingError: the recording's unit is said and another.
+        RecordingError: the recording is given in another unit.
     """
-    found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, recognise=of_field)
+    found = read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=of_field)
     recording = _recording(path, found)
-    said = [name for name in _AXES if name in found.said]
+    said = [name for name in _AXES if name in found.with_stated_unit]
     if of_field and said and made_in not in ("", RECORDED) and recording.units[said[0]] != made_in:
         raise RecordingError(
-            f"{path}: the magnetometer is in {recording.units[said[0]]}, but this was made of measurements in "
-            f"{made_in}; convert the columns, or say their unit with `--unit mag={made_in}`."
+            f"{path}: the magnetometer is in {recording.units[said[0]]}, but the calibrated recording was in "
+            f"{made_in}; convert the columns, or give their unit with `{_unit_option(made_in)}`."
         )
     return recording, found.topic
 
 
+def _unit_option(unit: str) -> str:
+    return f"--unit-label {unit}" if conversion("mag", unit) is None else f"--convert mag={unit}"
+
+
 def refuse_likely_size(path: Path, size: float) -> None:
-    """Refuse a field that is the Earth's in another unit: what is only likely is asked for.
+    """Raise if the field has the size of the Earth's field in another unit.
 
     Args:
-        path: of the recording, for the message.
-        size: of the field, in what is taken for µT.
+        path: the recording, for the message.
+        size: length of the field, taken to be in µT.
 
     Raises:
-        RecordingError: it is; the sentence has the option that says so.
+        RecordingError: the unit is likely another; the message names the option that gives it.
     """
     likely = likely_unit(size)
     if likely is not None:
         name, option = likely
         raise RecordingError(
             f"{path}: the magnetometer measures about {size:.3g} µT, which is not the size of the Earth's field; in "
-            f"{name} it would be. If it is, say so with `--unit mag={option}`; if not, name its unit: `--unit mag=uT`, "
-            "`--unit counts`."
+            f"{name} it would be. If that is its unit, give `--convert mag={option}`; if not, give its unit: "
+            "`--convert mag=uT` or `--unit-label counts`."
         )
 
 

@@ -1,4 +1,4 @@
-"""The option ``--unit``: units of the magnetometer, or of any quantity; nothing here needs torch."""
+"""The options ``--convert`` and ``--unit-label``. Parsing the pairs needs no torch."""
 
 from __future__ import annotations
 
@@ -8,53 +8,89 @@ from pathlib import Path
 
 import typer
 
-__all__ = ["HELP", "METAVAR", "QUANTITIES", "SENSOR_HELP", "parsed_units", "without_units"]
+__all__ = [
+    "CONVERT_HELP",
+    "CONVERT_METAVAR",
+    "LABEL_HELP",
+    "QUANTITIES",
+    "SENSOR_HELP",
+    "parsed_units",
+    "split_trailing_pairs",
+]
 
-METAVAR = "UNIT or QUANTITY=UNIT,..."
-HELP = (
-    "Units that are converted: mag=gauss,time=us. One that is not known, such as counts, is the magnetometer's label."
-)
-SENSOR_HELP = "Which magnetometer, where a file holds several, as `mkc inspect` names them; accel: the accelerometer."
+CONVERT_METAVAR = "NAME=UNIT,..."
+CONVERT_HELP = "Convert a quantity or a column from this unit: mag=gauss,time=us"
+LABEL_HELP = "Label the magnetometer's unit, such as counts; nothing is converted."
+SENSOR_HELP = "The magnetometer to read from a file with several; `mkc inspect` lists their names."
 
-# those of mkc_torch.recording.unit_words, which cannot be imported without torch; a test holds them together
+# the same as in mkc_torch.recording.unit_words, which cannot be imported without torch; a test compares them
 QUANTITIES = ("time", "mag", "field", "gyro", "accel", "position", "temperature", "current", "q")
 
 
-def parsed_units(texts: Sequence[str]) -> dict[str, str]:
-    """Units by quantity or column; one without a quantity is the magnetometer's.
+def parsed_units(conversions: Sequence[str], label: str | None = None) -> dict[str, str]:
+    """Return the unit of each quantity or column that the options name.
+
+    Args:
+        conversions: values of ``--convert``.
+        label: value of ``--unit-label``; the magnetometer's unit, which is not converted.
 
     Raises:
-        typer.BadParameter: a part without a unit, or a quantity given twice.
+        typer.BadParameter: a part without a unit, a name given twice, a magnetic unit that cannot be converted, or a
+            label that is a unit to convert.
 
     Example:
-        >>> parsed_units(["mag=gauss,time=us", "gyro=deg/s"]), parsed_units(["counts"])
+        >>> parsed_units(["mag=gauss,time=us", "gyro=deg/s"]), parsed_units([], "counts")
         ({'mag': 'gauss', 'time': 'us', 'gyro': 'deg/s'}, {'mag': 'counts'})
     """
     units: dict[str, str] = {}
-    for text in texts:
-        parts = re.split(r"[,\s]+(?=\S+=)", text.strip()) if "=" in text else [text]
-        for part in parts:
-            name, equals, unit = (piece.strip() for piece in part.partition("="))
-            if not equals:
-                name, unit = "mag", name
-            if not (name and unit):
-                raise typer.BadParameter("--unit is empty; name the unit, such as counts, or mag=gauss.")
-            if name in units:
-                raise typer.BadParameter(f"--unit says the unit of {name} twice.")
-            units[name] = unit.rstrip(",")
-    return units
+    for part in (part for text in conversions for part in re.split(r"[,\s]+(?=\S+=)", text.strip())):
+        name, equals, unit = (piece.strip() for piece in part.partition("="))
+        if not (equals and name and unit):
+            raise typer.BadParameter(
+                f'--convert "{part}" is not NAME=UNIT; write, for example, mag=gauss. A unit that is not converted, '
+                "such as counts, is given by --unit-label."
+            )
+        if name in units:
+            raise typer.BadParameter(f"--convert gives the unit of {name} twice; keep one of them.")
+        units[name] = unit.rstrip(",")
+    _refuse_unknown(units)
+    return units if label is None else _with_label(units, label.strip())
 
 
-def without_units(recordings: Sequence[Path], texts: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Recordings, and units that were written after the first one without the option's name before them.
+def _refuse_unknown(units: dict[str, str]) -> None:
+    """Refuse magnetic units that cannot be converted."""
+    for quantity in {"mag", "field"} & set(units):
+        from mkc_torch.recording.unit_words import conversion, known_units
+
+        if conversion(quantity, units[quantity]) is None:
+            raise typer.BadParameter(
+                f"--convert {quantity}={units[quantity]} cannot be converted; known units: {known_units(quantity)}. "
+                "Label the magnetometer's own unit with --unit-label."
+            )
+
+
+def _with_label(units: dict[str, str], label: str) -> dict[str, str]:
+    if not label:
+        raise typer.BadParameter("--unit-label is empty; name the unit, such as counts.")
+    if "mag" in units:
+        raise typer.BadParameter("--convert mag=... and --unit-label exclude each other; keep one of them.")
+    from mkc_torch.recording.unit_words import conversion
+
+    if conversion("mag", label) is not None:
+        raise typer.BadParameter(f"--unit-label {label} is a unit that can be converted; give --convert mag={label}.")
+    return {**units, "mag": label}
+
+
+def split_trailing_pairs(recordings: Sequence[Path], conversions: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Move pairs that follow ``--convert NAME=UNIT``, separated by blanks, from the recordings to the conversions.
 
     Example:
-        >>> [list(map(str, part)) for part in without_units([Path("a.csv"), Path("time=us")], ["mag=gauss"])]
+        >>> [list(map(str, part)) for part in split_trailing_pairs([Path("a.csv"), Path("time=us")], ["mag=gauss"])]
         [['a.csv'], ['mag=gauss', 'time=us']]
     """
-    units = [
+    pairs = [
         path for path in recordings if re.fullmatch(rf"({'|'.join(QUANTITIES)})=\S+", str(path)) and not path.exists()
     ]
-    if not texts:
+    if not conversions:
         return list(recordings), []
-    return [path for path in recordings if path not in units], [*texts, *map(str, units)]
+    return [path for path in recordings if path not in pairs], [*conversions, *map(str, pairs)]

@@ -1,4 +1,4 @@
-"""Robust estimators of location and scatter, and the outlier map of a regression, which needs one.
+"""Robust estimators of location and scatter, and the outlier map of a regression, which uses them.
 
 X is (*, N, p), N samples of p columns; ``*`` are batch dimensions.
 """

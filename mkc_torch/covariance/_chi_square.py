@@ -1,4 +1,4 @@
-"""The chi-square distribution, of which torch has the regularised incomplete gamma function."""
+"""Chi-square distribution, from torch's regularised incomplete gamma function."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def chi_square_cdf(x: float, p: int) -> float:
 
 @cache
 def chi_square_quantile(q: float, p: int) -> float:
-    """The value below which a chi-square variable of ``p`` degrees of freedom lies with probability ``0 < q < 1``."""
+    """Quantile of the chi-square distribution of ``p`` degrees of freedom at probability ``0 < q < 1``."""
     low, high = 0.0, float(p)
     while chi_square_cdf(high, p) < q:
         low, high = high, 2.0 * high
-    # halved until no number lies between the ends
+    # bisection to the last bit
     while low < (middle := 0.5 * (low + high)) < high:
         low, high = (middle, high) if chi_square_cdf(middle, p) < q else (low, middle)
     return high

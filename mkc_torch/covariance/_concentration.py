@@ -1,8 +1,8 @@
 """The h points whose covariance has the smallest determinant, by concentration steps from many elemental starts.
 
 Rousseeuw & Van Driessen, "A fast algorithm for the minimum covariance determinant estimator", Technometrics 41 (1999)
-212-223. A step takes mean and covariance of the h points that are closest by the distances of the last ones; by their
-theorem 1 the determinant never rises.
+212-223. A step takes mean and covariance of the h points with the smallest distances by the previous mean and
+covariance; by their theorem 1 the determinant never increases.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ if TYPE_CHECKING:
 
 
 _CHUNK = 1 << 20
-"""Values worked on at once."""
+"""Values processed at once."""
 
 _SCREENING_SAMPLES = 1500
+"""Samples of the first steps, at most."""
 
 FAR = 1e4
-"""A set of standardised points with a deviation above it has outliers among them."""
+"""Standard deviation of standardised points above which the set contains outliers."""
 
 _EXCHANGE_SAMPLES = 200
-"""A sample of no more points has more local minima than concentration steps leave, or than their rank tells apart."""
+"""Samples up to which points are exchanged: concentration steps alone end in too many local minima."""
 
 _EXCHANGED = 20
-"""Of how many supports a point is then exchanged for another."""
+"""Supports in which points are exchanged."""
 
 
 class Ellipsoids(NamedTuple):
-    """Mean, whitening matrix W with distance ``|W (x - mean)|``, and log determinant (-inf if singular), a stack."""
+    """Stack of ellipsoids: mean, whitening matrix W with distance ``|W (x - mean)|``, log determinant (-inf if flat)."""
 
     mean: Float[Tensor, "B S p"]
     whitening: Float[Tensor, "B S p p"]
@@ -50,7 +51,7 @@ class Ellipsoids(NamedTuple):
 
 @dataclass(frozen=True)
 class Support:
-    """Which points count, the number of steps, and whether they had come to rest."""
+    """Mask of the supporting points, the number of steps, and whether they converged."""
 
     counts: Bool[Tensor, "B N"]
     n_iter: int
@@ -58,15 +59,15 @@ class Support:
 
 
 def singular_below(dtype: torch.dtype) -> float:
-    """The variance that a column has left given others, as a share of its own, below which it is lost in rounding."""
+    """Conditional variance of a column given others, as a share of its own, below which rounding dominates."""
     return 512.0 * torch.finfo(dtype).eps
 
 
 def _ellipsoids(points: Float[Tensor, "B S k p"]) -> Ellipsoids:
-    """Ellipsoids of sets of standardised points; a flat one is given a little thickness, and stays flat.
+    """Ellipsoids of sets of standardised points; a flat ellipsoid gets a small thickness for its distances.
 
-    A set with far outliers looks flat too, for they leave the others no digits. With its thickness it is still larger
-    than any set without them.
+    A set with far outliers looks flat too, because rounding dominates the other points. Its determinant, with the
+    thickness, is still larger than that of any set without far outliers.
     """
     mean = points.mean(-2)
     error = points - mean.unsqueeze(-2)
@@ -87,7 +88,7 @@ def _ellipsoids(points: Float[Tensor, "B S k p"]) -> Ellipsoids:
 
 
 def _closest(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Int[Tensor, "B S h"]:
-    """The h points of smallest distance, in no order."""
+    """Indices of the h points with the smallest distances, unordered."""
     error = points.unsqueeze(1) - ellipsoids.mean.unsqueeze(-2)
     distance = torch.matmul(error, ellipsoids.whitening.mT).square().sum(-1)
     return distance.topk(h, dim=-1, largest=False, sorted=False).indices
@@ -99,7 +100,7 @@ def _taken(points: Float[Tensor, "B N p"], index: Int[Tensor, "#B S k"]) -> Floa
 
 
 def _step(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Ellipsoids:
-    """One concentration step of every ellipsoid, few of them at once."""
+    """A concentration step of every ellipsoid, in chunks."""
     size = max(1, _CHUNK // points.numel())
     parts = zip(*(part.split(size, dim=1) for part in ellipsoids), strict=True)
     moved = [_ellipsoids(_taken(points, _closest(points, Ellipsoids(*part), h))) for part in parts]
@@ -107,7 +108,7 @@ def _step(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Ell
 
 
 def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generator) -> Ellipsoids:
-    """Ellipsoids of ``count`` random sets of p + 1 points, and that of all points."""
+    """Ellipsoids of ``count`` random sets of p + 1 points, and the ellipsoid of all points."""
     N, p = points.shape[-2:]
     keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(points.device)
     elemental = _ellipsoids(_taken(points, keys.topk(p + 1, dim=-1).indices.unsqueeze(0)))
@@ -118,16 +119,17 @@ def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generat
 def concentrate(
     points: Float[Tensor, "B N p"], h: int, *, starts: int = 500, max_iter: int = 100, seed: int = 0
 ) -> Support:
-    """Two steps from every start on at most 1500 points, then the best candidates to convergence on all of them.
+    """The support of smallest determinant: two steps from every start on at most 1500 points, then the best candidates
+    to convergence on all points.
 
-    Up to 200 points the best supports are then improved by exchanging one point for another.
+    Up to 200 points, the best supports are then improved by exchanging points.
 
     Args:
-        points: standardised.
-        h: how many count.
+        points: standardised points.
+        h: number of supporting points.
         starts: number of random sets of p + 1 points.
-        max_iter: steps at most.
-        seed: of the random sets; every problem has the same, so that its result does not depend on the others.
+        max_iter: maximum number of steps.
+        seed: seed of the random sets; all problems have the same sets, so that their results are independent.
     """
     per_problem = min(points.shape[-2], _SCREENING_SAMPLES) * points.shape[-1]
     parts = points.split(max(1, _CHUNK // (per_problem * 100)))
@@ -158,7 +160,7 @@ def _concentrate(points: Float[Tensor, "B N p"], h: int, starts: int, max_iter: 
         moving = moving.gather(1, best)
     else:
         index = _exchanged(points, found, h)
-        # an exchange that has ended is at rest
+        # the exchange runs until it converges
         moving = torch.zeros_like(moving[:, :1])
     counts = torch.zeros(points.shape[:2], dtype=torch.bool, device=points.device)
     return Support(counts.scatter_(1, index.squeeze(1), True), n_iter, ~moving.squeeze(1))
@@ -167,9 +169,9 @@ def _concentrate(points: Float[Tensor, "B N p"], h: int, starts: int, max_iter: 
 def _converged(
     points: Float[Tensor, "B N p"], found: Ellipsoids, h: int, max_iter: int
 ) -> tuple[Ellipsoids, int, Bool[Tensor, "B S"]]:
-    """Steps from ellipsoids of any points until no determinant falls, their number, and what was still moving."""
+    """Steps until no determinant decreases. Returns the ellipsoids, the number of steps and the mask not converged."""
     tolerance = 1e2 * torch.finfo(points.dtype).eps
-    # what holds of a part of the points need not hold of all
+    # determinants of a subsample are not comparable with those of all points
     found = found._replace(log_determinant=torch.full_like(found.log_determinant, math.inf))
     moving = torch.ones_like(found.log_determinant, dtype=torch.bool)
     n_iter = 0
@@ -185,7 +187,7 @@ def _converged(
 
 
 def _exchanged(points: Float[Tensor, "B N p"], found: Ellipsoids, h: int) -> Int[Tensor, "B 1 h"]:
-    """The best support after an exchange in the best few that differ."""
+    """The best support after exchanges in the best few distinct supports."""
     value, order = found.log_determinant.sort(dim=1)
     same = torch.nn.functional.pad(value.diff(dim=1) < 1e-9, (1, 0))
     value, few = torch.where(same, math.inf, value).topk(min(_EXCHANGED, value.shape[1]), dim=1, largest=False)

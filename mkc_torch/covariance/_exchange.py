@@ -1,4 +1,4 @@
-"""Exchange of a point that counts for one that does not, while the determinant of their covariance falls.
+"""Exchange of a point of the support for another point, as long as the determinant of the covariance decreases.
 
 Hawkins, "The feasible solution algorithm for the minimum covariance determinant estimator in multivariate data",
 Computational Statistics & Data Analysis 17 (1994) 197-210.
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _CHUNK = 1 << 22
-"""Pairs of points looked at at once."""
+"""Pairs of points processed at once."""
 
 
 def exchange(points: Float[Tensor, "B N p"], counts: Bool[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
-    """The points that count once no single exchange lowers the determinant; those of a flat set stay."""
+    """The support after exchanges until none lowers the determinant; a flat support is returned unchanged."""
     parts = zip(*(part.split(max(1, _CHUNK // points.shape[-2] ** 2)) for part in (points, counts)), strict=True)
     return torch.cat([_exchange(*part) for part in parts])
 
@@ -40,11 +40,11 @@ def _exchange(points: Float[Tensor, "B N p"], counts: Bool[Tensor, "B N"]) -> Bo
         product = torch.matmul(white.mT, white)
         square = product.diagonal(dim1=-2, dim2=-1)
         out, into = square.unsqueeze(-1), square.unsqueeze(-2)
-        # the determinant after over that before, by the rank-two update of the scatter
+        # determinant after over determinant before, by the rank-two update of the scatter
         ratio = 1.0 - (1.0 + 1.0 / h) * out + 2.0 / h * product + (1.0 - 1.0 / h) * into - out * into + product.square()
         allowed = keep.unsqueeze(-1) & ~keep.unsqueeze(-2)
         least, pair = torch.where(allowed, ratio, torch.inf).flatten(-2).min(-1)
-        # NaN, which a flat set gives, falls nowhere
+        # a flat set gives NaN, which compares False
         falls = (least < limit) & (info == 0)
         active, pair = active[falls], pair[falls]
         counts[active, pair // N] = False

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 def moments_of(
     points: Float[Tensor, "B N p"], counts: Bool[Tensor, "B N"], centre: Float[Tensor, "B p"]
 ) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B p p"]]:
-    """Mean and covariance, with the divisor k - 1, of the k points that count; differentiable in the points.
+    """Mean and covariance, with divisor k - 1, of the k points of a mask; differentiable in the points.
 
     Args:
         points: the sample.
-        counts: which points count.
-        centre: taken off before anything is summed, so that a large mean costs no digits.
+        counts: mask of the points (True: used).
+        centre: subtracted before summation, so that a large mean loses no digits.
     """
     number = counts.sum(-1, keepdim=True).to(points.dtype)
     counts = counts.unsqueeze(-1)
-    # what does not count is out before anything is squared
+    # masked points are zeroed before squaring
     error = torch.where(counts, points - centre.unsqueeze(-2), 0.0)
     shift = error.sum(-2) / number
     error = torch.where(counts, error - shift.unsqueeze(-2), 0.0)

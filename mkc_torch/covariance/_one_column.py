@@ -1,4 +1,4 @@
-"""The h values of smallest variance of a single column, exactly."""
+"""The exact h values of smallest variance of a single column."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ if TYPE_CHECKING:
 
 
 def smallest_variance(values: Float[Tensor, "B N"], h: int) -> Bool[Tensor, "B N"]:
-    """Which h > N / 2 values, standardised about their median, have the smallest variance; the first of several.
+    """Mask of the h > N / 2 values of smallest variance, of values standardised about their median; ties: the first.
 
-    They are neighbours once the values are sorted (Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987),
-    p. 171).
+    They are contiguous in the sorted values (Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 171).
     """
     ordered, order = values.sort(-1)
-    # values beyond this lie in no such window, for it holds the median; clipped, they cost the sums no digits
+    # the window contains the median, so values beyond the reach are outside it; clipping them saves digits of the sums
     reach = 2.0 * math.sqrt(2.0 * h) * values.abs().kthvalue(h, dim=-1, keepdim=True).values
     reach = torch.where(reach > 0, reach, 1.0)  # h equal values
     ordered = torch.maximum(torch.minimum(ordered, reach), -reach)

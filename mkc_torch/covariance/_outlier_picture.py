@@ -1,4 +1,4 @@
-"""The picture of an outlier map."""
+"""Drawing of an outlier map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mkc_torch.covariance._picture_labels import Box, free_place, ranges, togeth
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Okabe and Ito's colours, told apart with any colour vision, and by shape; in the order of SampleKind
+# Okabe and Ito's colours, distinguishable with any colour vision, and marker shapes; in the order of SampleKind
 _LOOK = (
     ("regular", "#8A8A8A", "o"),
     ("vertical outlier", "#0072B2", "^"),
@@ -31,7 +31,7 @@ _LETTERS = 8.0
 
 
 class Places(NamedTuple):
-    """Where the samples of one problem lie: distances across, residuals up."""
+    """Coordinates of the samples of a problem: x the distances, y the residuals."""
 
     x: Float[Tensor, N]
     y: Float[Tensor, N]
@@ -41,7 +41,7 @@ class Places(NamedTuple):
 
 
 def draw(places: Places, ax: Any, labels: int) -> Any:
-    """Draw a map of one problem into axes, made where there are none."""
+    """Draw the map of a problem into axes, or a new figure for None, and return the axes."""
     if ax is None:
         _, ax = pyplot.subplots(figsize=(7.0, 4.5), layout="constrained")
     x, y, kinds = places.x, places.y, places.kind
@@ -54,7 +54,7 @@ def draw(places: Places, ax: Any, labels: int) -> Any:
     _label(places, ax, labels)
     ax.set_xlabel("robust distance of the predictors")
     ax.set_ylabel("standardised residual")
-    # below the name of the axis, where a title is not in its way
+    # below the label of the axis, clear of a title
     below = ax.transAxes + ScaledTranslation(0.0, -0.45, ax.figure.dpi_scale_trans)
     wide = ax.get_window_extent().width / ax.figure.dpi > 6.6
     ax.legend(
@@ -67,7 +67,7 @@ def draw(places: Places, ax: Any, labels: int) -> Any:
 
 
 def _limit(places: Places, ax: Any) -> None:
-    """Limits that leave room for labels, whatever the cutoffs are."""
+    """Set limits that leave room for labels, whatever the cutoffs are."""
     x, y = places.x, places.y
     ax.set_xlim(0.0, 1.1 * max(float(x.max()), 1.4 * places.x_cutoff))
     beyond = 1.4 * places.y_cutoff
@@ -76,7 +76,7 @@ def _limit(places: Places, ax: Any) -> None:
 
 
 def _tint(places: Places, ax: Any) -> None:
-    """Each region in a shade of the colour of its points, and the cutoffs between them as lines."""
+    """Fill each region with a shade of the colour of its points, and draw the cutoffs as lines."""
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     c, r = places.x_cutoff, places.y_cutoff
     for kind, across, up in (
@@ -94,7 +94,7 @@ def _tint(places: Places, ax: Any) -> None:
 
 
 def _label(places: Places, ax: Any, labels: int) -> None:
-    """The indices of the outermost samples, as far as there is room; those that lie together get one label."""
+    """Write the indices of the outermost samples where there is room; neighbouring samples share a label."""
     x, y = places.x, places.y
     far, large = x / places.x_cutoff, y.abs() / places.y_cutoff
     outer = (torch.maximum(far, large) > 1.0).nonzero().flatten()
@@ -102,7 +102,7 @@ def _label(places: Places, ax: Any, labels: int) -> None:
         return
     # in points of the page
     page = ax.transData.transform(torch.stack([x, y], -1).numpy()) * 72.0 / ax.figure.dpi
-    # far out in either direction, so that neither scale hides the other's
+    # relative to the largest in each direction, so that neither scale dominates
     rank = torch.maximum(far / far.max(), large / large.max())
     groups = together(page, outer[rank[outer].argsort(descending=True)].tolist())
     taken = [Box.around(place, 3.0) for place in page[outer.numpy()]]

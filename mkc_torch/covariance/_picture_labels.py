@@ -1,4 +1,4 @@
-"""Labels of points on a page: which points share one, what it says, and where there is room for it."""
+"""Labels of points on a page: grouping of neighbours, text, and free position."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 _TOGETHER = 12.0
-"""Points no farther apart than this, in points of the page, share a label."""
+"""Largest distance, in points of the page, at which two points share a label."""
 
 _MOST = 400
-"""Points looked at; the rest lie further in."""
+"""Outermost points considered, at most."""
 
 
 class Box(NamedTuple):
@@ -37,16 +37,16 @@ class Box(NamedTuple):
 
 
 def together(page: np.ndarray, order: Sequence[int]) -> list[list[int]]:
-    """Groups of the points ``order`` that are linked by short ways, in the order of their first.
+    """Groups of points connected by short distances (single linkage), in the order of their first point.
 
     Args:
-        page: where every point is, (N, 2).
-        order: points, the most important first.
+        page: position of every point, (N, 2).
+        order: indices of points, the most important first.
     """
     left, groups = list(order[:_MOST]), []
     while left:
         group = [left.pop(0)]
-        for i in group:  # grows meanwhile
+        for i in group:  # grows during the loop
             near = [j for j in left if float(np.abs(page[i] - page[j]).max()) <= _TOGETHER]
             group += near
             left = [j for j in left if j not in near]
@@ -55,7 +55,7 @@ def together(page: np.ndarray, order: Sequence[int]) -> list[list[int]]:
 
 
 def ranges(indices: Sequence[int], most: int = 5) -> str:
-    """``0–3, 7`` for 0, 1, 2, 3, 7; what is long is cut, and the rest counted."""
+    """Indices as text: ``0–3, 7`` for 0, 1, 2, 3, 7; beyond ``most`` parts, the number of the rest."""
     runs: list[list[int]] = []
     for i in sorted(indices):
         if runs and i == runs[-1][-1] + 1:
@@ -75,7 +75,7 @@ def _size(part: str) -> int:
 
 
 def free_place(group: np.ndarray, text: str, size: float, taken: Sequence[Box]) -> Box | None:
-    """Where a label of points (k, 2) meets nothing: above, below, right or left of them; None if nowhere."""
+    """Free box for a label of points (k, 2): above, below, right or left of them; None if all are taken."""
     half_width, half_height = 0.29 * size * len(text), 0.5 * size
     (left, low), (right, high) = group.min(0), group.max(0)
     middle_x, middle_y, gap = 0.5 * (left + right), 0.5 * (low + high), 4.0

@@ -1,4 +1,4 @@
-"""A sample of points, checked once and standardised column by column for the search."""
+"""A checked sample of points, with columns standardised for the search."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def real_tensor(name: str, value: Data) -> Float[Tensor, "*shape"]:
 
     Raises:
         TypeError: neither a floating-point tensor nor an array of real numbers.
-        ValueError: a value is NaN, infinite, or so large that its square is.
+        ValueError: a value that is NaN or infinite, or whose square overflows.
     """
     tensor = as_tensor(name, value)
     refuse_not_real(name, tensor)
@@ -37,15 +37,15 @@ def real_tensor(name: str, value: Data) -> Float[Tensor, "*shape"]:
 
 
 def working_dtype(tensor: Tensor) -> torch.dtype:
-    """float64, in which covariances of float32 data lose nothing, where the device has it."""
+    """float64, so that covariances of float32 data are exact, if the device supports it."""
     return tensor.dtype if tensor.device.type == "mps" else torch.float64
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Points (B, N, p) in the working dtype, and the same less a centre, over a scale of each column.
+    """Points (B, N, p) in the working dtype, raw and standardised by centre and scale of each column.
 
-    The standardised points carry no gradient; neither does the choice of those that count.
+    The standardised points, and so the choice of the support, have no gradient.
     """
 
     points: Float[Tensor, "B N p"]
@@ -53,7 +53,7 @@ class Sample:
     centre: Float[Tensor, "B p"]
     scale: Float[Tensor, "B p"]
     resolution: Float[Tensor, B]
-    """The rounding of the values given, in the largest share that it has of a column's scale."""
+    """Rounding error of the given values, as a share of the scale; the largest of all columns."""
     batch: torch.Size
     dtype: torch.dtype
 
@@ -63,26 +63,26 @@ class Sample:
         return self.points.shape[-2], self.points.shape[-1]
 
     def restore(self, values: Float[Tensor, B * rest]) -> Float[Tensor, "*batch *rest"]:
-        """Give values of the flattened problems the user's batch dimensions, and numbers the user's dtype."""
+        """Values of the flattened problems in the user's batch dimensions; floating-point values in the user's dtype."""
         values = values.reshape((*self.batch, *values.shape[1:]))
         return values.to(self.dtype) if values.is_floating_point() else values
 
 
 def checked_sample(name: str, value: Data) -> Sample:
-    """Check the points given, and standardise them by median and median absolute deviation.
+    """Check points, and standardise them by median and median absolute deviation.
 
     Raises:
-        TypeError, ValueError: as :func:`real_tensor`, or no shape (*, N, p) with N > p + 1.
+        TypeError, ValueError: as :func:`real_tensor`, or a shape other than (*, N, p) with N > p + 1.
     """
     X = real_tensor(name, value)
     if X.dim() < 2 or X.numel() == 0:
-        mend = f"; one column is {name}.unsqueeze(-1)" if X.dim() == 1 else ""
-        raise ValueError(f"Expected argument `{name}` of shape (*, N, p) but got {tuple(X.shape)}{mend}.")
+        fix = f"; for a single column pass {name}.unsqueeze(-1)" if X.dim() == 1 else ""
+        raise ValueError(f"Expected argument `{name}` of shape (*, N, p) but got {tuple(X.shape)}{fix}.")
     N, p = X.shape[-2:]
     if p + 2 > N:
         raise ValueError(
-            f"Expected at least {p + 2} samples for a scatter of {p} columns but got {N}; add samples, of which five "
-            f"a column are few, or try {name}.mT if a sample is a column."
+            f"Expected at least {p + 2} samples for a scatter of {p} columns but got {N}; add samples (five per "
+            f"column are few), or try {name}.mT if a sample is a column."
         )
     points = X.to(working_dtype(X)).reshape(-1, N, p)
     with torch.no_grad():
@@ -92,7 +92,7 @@ def checked_sample(name: str, value: Data) -> Sample:
         # half of the values may be equal
         scale = torch.where(scale > 0, scale, error.abs().mean(-2))
         scale = torch.where(scale > 0, scale, 1.0)
-        # so far out that no distance tells such points apart, and squares stay finite
+        # far outside the data, and squares stay finite
         bound = float(torch.finfo(points.dtype).max) ** 0.2
         standardised = (error / scale.unsqueeze(-2)).clamp(-bound, bound)
         resolution = torch.finfo(X.dtype).eps * (1.0 + (centre.abs() / scale).amax(-1))

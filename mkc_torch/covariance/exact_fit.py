@@ -1,4 +1,4 @@
-"""Samples of which h lie on a hyperplane: their covariance is singular, and the hyperplane is the answer."""
+"""Samples of which h lie on a hyperplane: their covariance is singular, and the hyperplane is reported."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ if TYPE_CHECKING:
     from mkc_torch.covariance._sample import Sample
 
 _TERMS_SHOWN = 6
+"""Terms of the hyperplane's equation in the message, at most."""
 
 
 class ExactFitError(ValueError):
     """So many samples lie on a hyperplane ``normal · x = offset`` that a robust scatter is singular.
 
     Attributes:
-        normal: of the hyperplane, of length 1, (p,).
-        offset: in the unit of the data.
-        samples: which samples lie on it, (N,).
-        problem: the index of the first such problem among the batch dimensions.
-        columns: the numbers of the columns, as the message has them.
+        normal: unit normal of the hyperplane, (p,).
+        offset: offset of the hyperplane, in the unit of the data.
+        samples: mask of the samples on the hyperplane, (N,).
+        problem: index of the first such problem in the batch dimensions.
+        columns: numbers of the columns in the message.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class ExactFitError(ValueError):
         )  # fmt: skip
 
     def among(self, columns: Sequence[int]) -> ExactFitError:
-        """The same of a table in which the columns have other numbers."""
+        """The same error with the columns renumbered."""
         return ExactFitError(self.normal, self.offset, self.samples, self.problem, columns, self._involved)
 
     def _equation(self) -> str:
@@ -69,15 +70,15 @@ class ExactFitError(ValueError):
 
 
 def refuse_exact_fit(sample: Sample, counts: Bool[Tensor, "B N"]) -> None:
-    """Refuse a support that lies on a hyperplane, as far as the rounding of the values lets that be seen.
+    """Raise ExactFitError if a support lies on a hyperplane, within the rounding of the values.
 
     Args:
-        sample: what the support was chosen from.
-        counts: the support.
+        sample: the sample.
+        counts: mask of the support.
 
     Raises:
         ExactFitError: for the first such problem.
-        ValueError: the support has an outlier so far out that nothing can be said.
+        ValueError: the support contains an outlier so far out that rounding hides the other samples.
     """
     points = sample.standardised
     mean, covariance = moments_of(points, counts, torch.zeros_like(sample.centre))
@@ -90,8 +91,8 @@ def refuse_exact_fit(sample: Sample, counts: Bool[Tensor, "B N"]) -> None:
     b = int(flat.nonzero()[0])
     if float(deviation[b].max()) > FAR:
         raise ValueError(
-            f"Expected argument `X` whose support has no far outlier but with h = {int(counts[b].sum())} one has to be "
-            "in it, beside which the other samples have no digits left; take a smaller `h`."
+            f"Expected argument `X` whose support has no far outlier but h = {int(counts[b].sum())} includes an outlier "
+            "so far out that rounding hides the other samples; take a smaller `h`."
         )
     across = direction[b] / deviation[b]
     height = torch.matmul(points[b] - mean[b], across).abs()

@@ -29,47 +29,52 @@ if TYPE_CHECKING:
 class MinimumCovarianceDeterminant(Fitted):
     """Location and scatter of the h samples whose covariance has the smallest determinant, then reweighted.
 
-    Up to N - h samples may be as far out as they like; a tight cluster that is less far can own the smallest
-    determinant, the more easily the more columns there are. The search is FastMCD: two concentration steps from
-    ``starts`` random sets of p + 1 samples, the best of them to convergence; beyond 1500 samples the first steps see
-    1500 of them. Up to 200 samples, those that count are then exchanged one by one. One column is solved exactly. What
-    comes out turns and stretches with the data (affine equivariance).
+    Up to N - h samples may be arbitrarily far out. A tight cluster at a moderate distance can have the smallest
+    determinant, more easily with more columns. The search is FastMCD: two concentration steps from ``starts`` random
+    sets of p + 1 samples, then the best candidates to convergence; beyond 1500 samples the first steps use 1500 of
+    them. Up to 200 samples, the support is then improved by exchanging single samples. A single column is solved
+    exactly. The estimate is affine equivariant.
 
-    The covariance of the h samples is made consistent for Gaussian data, and its determinant unbiased for few of them.
+    The covariance of the h samples is corrected to be consistent for Gaussian data, and for the bias of small samples.
     The reweighting step takes mean and covariance of all samples within the ``cutoff`` quantile of the distances, and
-    corrects these in turn, by one of two factors. That of the "share" of samples that are left is right for clean
-    samples, few ones too, and is what R's robustbase takes. Outliers inflate it: with 20 % of them variances are 2.4
-    (p = 1), 1.6 (p = 2) and 1.3 (p = 5) times those of the rest, with 40 % 4.9, 2.6 and 1.7 times, which hides outliers
-    that are near; the correlations are right. That of the "cutoff" itself keeps them within 1.0 to 1.2 times, but finds
-    too small a scatter in few clean samples: 0.7 to 0.95 times at N = 20 to 100. Both become one as N grows.
+    corrects them by one of two factors:
+
+    - "share": the factor of the share of samples kept. It is right for clean samples, small samples included, and is
+      used by R's robustbase. Outliers inflate it: with 20 % of them variances are 2.4 (p = 1), 1.6 (p = 2) and 1.3
+      (p = 5) times those of the inliers, with 40 % 4.9, 2.6 and 1.7 times, which hides near outliers; the correlations
+      are right.
+    - "cutoff": the factor of the cutoff itself. Variances are then within 1.0 to 1.2 times, but the scatter of small
+      clean samples is too small: 0.7 to 0.95 times at N = 20 to 100.
+
+    Both factors agree as N grows.
 
     Args:
-        support_fraction: h in other words, in [0.5, 1]: 0.5, the default, is the highest breakdown point,
-            h = (N + p + 1) // 2, 1 is every sample, and h is linear in between, rounded down.
-        h: samples that count, (N + p + 1) // 2 <= h <= N.
-        reweight: whether the step that follows is taken, which costs no breakdown point and gains efficiency.
-        cutoff: quantile of the chi-square distribution of p degrees of freedom, in (0, 1), beyond which a squared
-            distance gives the weight 0.
-        consistency: "share" or "cutoff", what the reweighted covariance is corrected for.
-        starts: number of random starts. One without outliers is enough: at a share ε of outliers all of them have some
-            with probability ``(1 - (1 - ε)^(p + 1))^starts``; take more for more columns.
-        seed: of the starts.
+        support_fraction: alternative to ``h``, in [0.5, 1]: 0.5, the default, is h = (N + p + 1) // 2, the highest
+            breakdown point; 1 is h = N; h is linear in between, rounded down.
+        h: number of samples in the support, (N + p + 1) // 2 <= h <= N.
+        reweight: whether to reweight, which keeps the breakdown point and gains efficiency.
+        cutoff: quantile of the chi-square distribution of p degrees of freedom, in (0, 1); samples whose squared
+            distance exceeds it have weight 0.
+        consistency: "share" or "cutoff", the correction of the reweighted covariance.
+        starts: number of random starts. A single start without outliers is enough. With a share ε of outliers, all
+            starts contain outliers with probability ``(1 - (1 - ε)^(p + 1))^starts``; take more for more columns.
+        seed: seed of the starts.
 
     Attributes, after ``fit`` (``*`` are batch dimensions; lengths in the unit of the data):
-        location_, covariance_: (*, p) and (*, p, p), reweighted. Smooth functions of the samples that count, and
-            differentiable as such; which ones count is a constant.
-        correlation_: of ``covariance_``, (*, p, p).
-        raw_location_, raw_covariance_: the same before the reweighting, with both corrections.
-        support_: which h samples have the smallest determinant, bool (*, N).
-        weights_: 1 for samples that entered ``location_``, else 0, (*, N).
-        distances_: robust Mahalanobis distances by ``location_`` and ``covariance_``, of no unit, (*, N).
+        location_, covariance_: reweighted, (*, p) and (*, p, p). Differentiable in the samples of weight 1; the choice
+            of these samples is constant.
+        correlation_: correlations of ``covariance_``, (*, p, p).
+        raw_location_, raw_covariance_: location and covariance before the reweighting, with both corrections.
+        support_: mask of the h samples with the smallest determinant, bool (*, N).
+        weights_: 1 for samples used by ``location_``, else 0, (*, N).
+        distances_: robust Mahalanobis distances by ``location_`` and ``covariance_``, dimensionless, (*, N).
         distance_cutoff_: square root of the chi-square quantile, a number; distances of outliers exceed it.
         objective_: log determinant of the covariance (divisor h - 1) of the support, uncorrected, (*,).
-        h_: how many samples make the support.
-        n_iter_, converged_: steps made, and whether they had come to rest, (*,); one column needs none.
+        h_: number of samples in the support.
+        n_iter_, converged_: number of steps, and whether they converged, (*,); a single column needs no steps.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of another type, or out of range.
 
     References:
         Rousseeuw & Van Driessen, "A fast algorithm for the minimum covariance determinant estimator", Technometrics 41
@@ -112,7 +117,7 @@ class MinimumCovarianceDeterminant(Fitted):
         seed: int = 0,
     ) -> None:
         if support_fraction is not None and h is not None:
-            raise ValueError("Expected `support_fraction` or `h` but got both; each of them gives the other.")
+            raise ValueError("Expected `support_fraction` or `h` but got both; pass one of them.")
         if support_fraction is not None:
             support_fraction = checked_number("support_fraction", support_fraction, 0.5, 1.0, "[]", "0.75 is usual")
         if not isinstance(reweight, bool):
@@ -139,7 +144,7 @@ class MinimumCovarianceDeterminant(Fitted):
         Raises:
             TypeError: X is neither a real floating tensor nor an array of numbers.
             ValueError: a value is not finite, samples are too few, or ``h`` is out of range.
-            ExactFitError: h samples lie on a hyperplane, or those that the reweighting leaves do.
+            ExactFitError: h samples, or all samples that the reweighting keeps, lie on a hyperplane.
         """
         sample = checked_sample("X", X)
         N, p = sample.shape
@@ -171,10 +176,10 @@ class MinimumCovarianceDeterminant(Fitted):
         return self
 
     def mahalanobis(self, X: Data) -> Float[Tensor, "*batch M"]:
-        """Robust distances of other samples (*, M, p) by ``location_`` and ``covariance_``; those of the fit's dtype.
+        """Robust distances (*, M) of other samples by ``location_`` and ``covariance_``, in the fit's dtype.
 
         Args:
-            X: samples in the unit of those of the fit; batch dimensions broadcast with the fit's.
+            X: samples (*, M, p) in the unit of the fitted samples; batch dimensions broadcast with the fit's.
 
         Raises:
             NotFittedError: before ``fit``.
@@ -184,19 +189,19 @@ class MinimumCovarianceDeterminant(Fitted):
         points = real_tensor("X", X)
         if points.dim() < 2 or points.shape[-1] != p:
             raise ValueError(
-                f"Expected argument `X` of shape (*, M, {p}) but got {tuple(points.shape)}; give it the columns of the "
-                "fit, and one sample as X.unsqueeze(0)."
+                f"Expected argument `X` of shape (*, M, {p}) but got {tuple(points.shape)}; pass the columns of the "
+                "fit, and a single sample as X.unsqueeze(0)."
             )
         common_batch("X", points.shape[:-2], "location_", self.location_.shape[:-1])
         points = points.to(working_dtype(points))
         return mahalanobis_distance(points, self._location, self._scatter).to(self.location_.dtype)
 
     def _coverage(self, N: int, p: int) -> tuple[int, float]:
-        """h, and the fraction that stands for it in the small-sample correction."""
+        """h, and the corresponding support fraction of the small-sample correction."""
         half = (N + p + 1) // 2
         if self.h is None:
             fraction = 0.5 if self.support_fraction is None else self.support_fraction
-            # rounding must not take a sample away
+            # rounding must not remove a sample
             return math.floor(2 * half - N + 2 * (N - half) * fraction + 1e-9), fraction
         if not half <= self.h <= N:
             raise ValueError(
@@ -219,13 +224,13 @@ class MinimumCovarianceDeterminant(Fitted):
 def _reweighted(
     sample: Sample, counts: Bool[Tensor, "B N"], fraction: float, share: float | None
 ) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B p p"]]:
-    """Mean and corrected covariance of the samples that are not far; those of all of them are corrected by nothing.
+    """Mean and corrected covariance of the samples within the cutoff; uncorrected if these are all samples.
 
     Args:
         sample: all samples.
-        counts: which are not far.
-        fraction: of the support.
-        share: of Gaussian samples that are not far; None takes that of the samples.
+        counts: mask of the samples within the cutoff.
+        fraction: support fraction.
+        share: share of Gaussian samples within the cutoff; None takes the share of these samples.
     """
     N, p = sample.shape
     number = counts.sum(-1).tolist()
@@ -233,7 +238,7 @@ def _reweighted(
         raise ValueError(
             f"Expected argument `cutoff` to leave more than {p} samples but only {min(number)} are within it; raise it."
         )
-    # those of the support that lie off a plane can be far by the others
+    # support samples off a plane can be far by the distances of the others
     refuse_exact_fit(sample, counts)
     mean, covariance = moments_of(sample.points, counts, sample.centre)
     small = small_sample_factor(N, p, fraction, reweighted=True)
@@ -242,12 +247,12 @@ def _reweighted(
 
 
 def _restored(sample: Sample, covariance: Float[Tensor, "B p p"]) -> Float[Tensor, "*batch p p"]:
-    """A covariance in the user's dtype, which must be able to hold it."""
+    """A covariance in the user's dtype; ValueError if its variances overflow or underflow."""
     variance = covariance.detach().diagonal(dim1=-2, dim2=-1)
     kind = torch.finfo(sample.dtype)
     if not ((variance >= kind.tiny) & (variance <= kind.max)).all():
         raise ValueError(
-            f"Expected argument `X` with variances that {sample.dtype} holds but got {float(variance.min()):.3g} to "
+            f"Expected argument `X` with variances in the range of {sample.dtype} but got {float(variance.min()):.3g} to "
             f"{float(variance.max()):.3g}; choose another unit."
         )
     return sample.restore(covariance)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class SampleKind(IntEnum):
-    """What a sample is to a regression: by a large residual, by predictors that are far from the others, or by both."""
+    """Kind of a sample in a regression: large residual, predictors far from the others, or both."""
 
     REGULAR = 0
     VERTICAL_OUTLIER = 1
@@ -37,14 +37,14 @@ class SampleKind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class OutlierMap:
-    """Where every sample stands; ``*`` are batch dimensions.
+    """Standardised residual and robust distance of every sample; ``*`` are batch dimensions.
 
     Attributes:
-        residuals: over the scale of the fit, of no unit, (*, N).
-        distances: robust Mahalanobis distances of the predictors, of no unit, (*, N).
-        residual_cutoff: absolute residuals above it are large.
-        distance_cutoff: distances above it are large.
-        columns: the columns of X that are predictors, those that are constant left out.
+        residuals: residuals over the scale of the fit, dimensionless, (*, N).
+        distances: robust Mahalanobis distances of the predictors, dimensionless, (*, N).
+        residual_cutoff: limit of the absolute residuals of regular samples.
+        distance_cutoff: limit of the distances of regular samples.
+        columns: columns of X used as predictors; constant columns are left out.
     """
 
     residuals: Float[Tensor, "*batch N"]
@@ -60,12 +60,12 @@ class OutlierMap:
         return vertical + (self.distances > self.distance_cutoff).long() * SampleKind.GOOD_LEVERAGE
 
     def plot(self, ax: Any = None, *, labels: int = 12) -> Any:
-        """Draw the map with its cutoffs, name its four regions, and label the outermost samples by their index.
+        """Draw the map with its cutoffs and four regions, and label the outermost samples by index.
 
         Args:
             ax: matplotlib axes to draw in; None makes a figure.
-            labels: how many samples are labelled at most, those that exceed a cutoff by the largest factor; labels of
-                samples that lie on one another are drawn as one.
+            labels: maximum number of labels, for the samples that exceed a cutoff by the largest factor; neighbouring
+                samples share a label.
 
         Returns:
             The axes.
@@ -74,13 +74,13 @@ class OutlierMap:
             ImportError: matplotlib is not installed.
             ValueError: the map is of a batch of problems.
         """
-        # pictures are an extra
+        # matplotlib is an optional dependency
         from mkc_torch.covariance._outlier_picture import Places, draw
 
         if self.residuals.dim() != 1:
             raise ValueError(
-                f"Expected the map of one problem but this one has shape {tuple(self.residuals.shape)}; make one of "
-                "the problem's own fit and data."
+                f"Expected the map of a single problem but got a batch of shape {tuple(self.residuals.shape[:-1])}; make "
+                "a map from each problem's fit and data."
             )
         x, y = (values.detach().cpu().double() for values in (self.distances, self.residuals))
         return draw(Places(x, y, self.kind.cpu(), self.distance_cutoff, self.residual_cutoff), ax, labels)
@@ -95,26 +95,27 @@ def outlier_map(
     residual_cutoff: float = 2.5,
     cutoff: float = 0.975,
 ) -> OutlierMap:
-    """Which samples are vertical outliers, and which are good or bad leverage points.
+    """Classify samples as regular, vertical outliers, or good or bad leverage points.
 
-    A bad leverage point is far from the other samples in its predictors and far from the fit; a good one is far in its
-    predictors alone and makes the fit more precise. The fit has to be robust against leverage points (LTS, S, MM), for
-    one that follows them leaves them no residual.
+    A bad leverage point has predictors far from those of the other samples, and a large residual. A good leverage point
+    has a small residual and makes the fit more precise. The fit must be robust against leverage points (LTS, S, MM): a
+    fit that follows them leaves them small residuals.
 
     Args:
-        fit: an estimator of ``mkc_torch.linear`` after its ``fit`` on one channel; it needs ``scale_``.
-        X: predictors (*, N, n) that were given to it. Columns without any spread, such as an intercept, are left out.
-        Y: targets (*, N).
-        estimator: of the location and scatter of the predictors, not fitted; None takes the default MCD.
-        residual_cutoff: in scales of the fit, positive; 2.5 as in the paper, 2.24 is the same quantile as ``cutoff``.
-        cutoff: quantile of the chi-square distribution, with as many degrees of freedom as predictors, beyond which a
-            squared distance is large, in (0, 1).
+        fit: an estimator of ``mkc_torch.linear`` fitted to a single channel; it needs ``scale_``.
+        X: predictors (*, N, n) of the fit. Constant columns, such as an intercept, are left out.
+        Y: targets (*, N) of the fit.
+        estimator: unfitted estimator of the predictors' location and scatter; None takes the default MCD.
+        residual_cutoff: limit of absolute residuals, in scales of the fit, positive; 2.5 as in the paper, 2.24 is the
+            same quantile as ``cutoff``.
+        cutoff: limit of squared distances, as a quantile in (0, 1) of the chi-square distribution with as many degrees
+            of freedom as predictors.
 
     Raises:
         NotFittedError: ``fit`` was not fitted.
-        TypeError: an argument of another kind.
-        ValueError: shapes that do not fit, an estimator without one scale for each problem, an exact fit, of which
-            every residual is infinite in its scale, or no predictor.
+        TypeError: an argument of another type.
+        ValueError: shapes that do not fit, an estimator without a scale for each problem, an exact fit (scale 0), or no
+            predictor.
         ExactFitError: half of the samples have predictors on a hyperplane, such as an indicator that is mostly 0.
 
     References:
@@ -130,7 +131,7 @@ def outlier_map(
         >>> found.kind[:6].tolist(), found.columns
         ([3, 3, 3, 1, 1, 0], (1,))
     """
-    refuse_other_type("fit", fit, LinearEstimator, "a fitted estimator of mkc_torch.linear", "fit one")
+    refuse_other_type("fit", fit, LinearEstimator, "a fitted estimator of mkc_torch.linear", "call its fit first")
     if estimator is None:
         estimator = MinimumCovarianceDeterminant()
     refuse_other_type("estimator", estimator, MinimumCovarianceDeterminant, "an MCD", "None takes the default")
@@ -140,7 +141,7 @@ def outlier_map(
     predictors, residuals = real_tensor("X", x).detach(), _standardised(fit, x, real_tensor("Y", y))
     columns = _with_spread(predictors)
     try:
-        # the one given stays as it is
+        # the given estimator is not modified
         distances = copy(estimator).fit(predictors[..., list(columns)]).distances_
     except ExactFitError as error:
         raise error.among(columns) from None
@@ -170,11 +171,13 @@ def _standardised(fit: LinearEstimator, X: Tensor, Y: Tensor) -> Float[Tensor, "
     scale = getattr(fit, "scale_", None)
     if not isinstance(scale, Tensor) or scale.shape != (*coef.shape[:-1], 1):
         raise ValueError(
-            f"Expected argument `fit` to have one `scale_` for each problem but {type(fit).__name__} has none, or was "
-            "fitted to several channels; take MMRegression, SRegression or LeastTrimmedSquares on one channel."
+            f"Expected argument `fit` to have a `scale_` for each problem but {type(fit).__name__} has none, or was "
+            "fitted to several channels; take MMRegression, SRegression or LeastTrimmedSquares on a single channel."
         )
     if not (scale > 0).all():
-        raise ValueError("Expected a fit with residuals but its scale is 0: what is off an exact fit is an outlier.")
+        raise ValueError(
+            "Expected a fit of positive scale but got scale 0: every sample off an exact fit is an outlier."
+        )
     common_batch("X", X.shape[:-2], "coef_", coef.shape[:-1])
     common_batch("Y", Y.shape[:-1], "coef_", coef.shape[:-1])
     residual = Y.detach() - torch.matmul(X.detach(), coef.unsqueeze(-1)).squeeze(-1)
@@ -182,12 +185,14 @@ def _standardised(fit: LinearEstimator, X: Tensor, Y: Tensor) -> Float[Tensor, "
 
 
 def _with_spread(X: Float[Tensor, "*batch N n"]) -> tuple[int, ...]:
-    """The columns that are no constant, which have to be the same in every problem."""
+    """Indices of the columns that are not constant; they must be the same in every problem."""
     spread = (X.amax(-2) > X.amin(-2)).reshape(-1, X.shape[-1])
     if not (spread == spread[:1]).all():
         column = int((spread != spread[:1]).any(0).nonzero()[0])
-        raise ValueError(f"Expected column {column} of `X` to be constant in every problem or in none; map them apart.")
+        raise ValueError(
+            f"Expected column {column} of `X` to be constant in every problem or in none; make a map of each problem."
+        )
     columns = tuple(int(column) for column in spread[0].nonzero().flatten())
     if not columns:
-        raise ValueError("Expected at least one column of `X` that is not constant; a map of no predictors has none.")
+        raise ValueError("Expected at least one column of `X` that is not constant; a map needs a predictor.")
     return columns

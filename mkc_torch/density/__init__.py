@@ -1,4 +1,4 @@
-"""The MKC density: its energy and normaliser, the distribution, its fit to residuals, their tails, its robustness."""
+"""The MKC density: energy, normaliser, distribution, fit to residuals, test of their tails, robustness."""
 
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.density.fit import DensityFit, fit_density

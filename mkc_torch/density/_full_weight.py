@@ -1,4 +1,4 @@
-"""Weights of residuals, checked and in their shape."""
+"""Checked weights in the shape of the residuals."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ if TYPE_CHECKING:
 
 
 def full_weight(weight: Tensor, error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch N m"]:
-    """A weight for each residual, from one for each or one for each sample.
+    """Weights of all residuals, from a weight per residual or per sample.
 
     Raises:
-        TypeError: no tensor of real numbers.
-        ValueError: negative or non-finite weights, those of a channel all zero, or a shape that does not fit.
+        TypeError: not a tensor of real numbers.
+        ValueError: negative or non-finite weights, a channel of zero weights, or a shape that does not fit.
     """
     refuse_bad_weight(weight)
     try:
-        # weights (N,) of as many channels as samples would be taken for those of channels
+        # if m = N, expanding weights (N,) would take them as weights of channels
         full = weight.to(error).expand_as(error) if weight.dim() > 1 else None
     except RuntimeError:
         full = None
     if full is None:
-        mend = "; one weight a sample is weight[:, None]" if weight.dim() == 1 else ""
+        fix = "; for a weight per sample pass weight[:, None]" if weight.dim() == 1 else ""
         raise ValueError(
             f"Expected argument `weight` of shape {tuple(error.shape)} or {(error.shape[-2], 1)} but got "
-            f"{tuple(weight.shape)}{mend}."
+            f"{tuple(weight.shape)}{fix}."
         )
     total = full.sum(-2)
     if not bool((torch.isfinite(total) & (total > 0)).all()):

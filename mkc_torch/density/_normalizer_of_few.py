@@ -1,4 +1,4 @@
-"""The normaliser of a few channels in NumPy: for so few numbers, calling torch's operations is most of their time."""
+"""The normaliser of a few channels in NumPy: for few numbers, torch's overhead per call dominates."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 __all__ = ["few", "log_partition_and_slopes"]
 
 _FEW = 64
-"""Channels up to which this pays."""
+"""Channels up to which NumPy is faster than torch."""
 
 _SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
-"""Of ``(1 - exp(-x) (1 + x)) / x²``, which below 0.05 keeps all digits."""
+"""Coefficients of ``(1 - exp(-x) (1 + x)) / x²``, accurate to all digits for x below 0.05."""
 
 
 def few(*values: Tensor) -> bool:
-    """Whether these are plain tensors of few numbers on the CPU: no transform's, and no subclass's."""
+    """Whether these are plain tensors of few numbers on the CPU: not of a subclass, not under a function transform."""
     return all(
-        type(one) is Tensor and one.device.type == "cpu" and one.numel() <= _FEW and not is_wrapped(one)
-        for one in values
+        type(value) is Tensor and value.device.type == "cpu" and value.numel() <= _FEW and not is_wrapped(value)
+        for value in values
     )
 
 
@@ -38,12 +38,12 @@ def log_partition_and_slopes(
     weights: Float64[ndarray, " q"],
     tolerance: float,
 ) -> tuple[Float64[ndarray, "*m"], Float64[ndarray, "*m"], Float64[ndarray, "*m"]]:
-    """``log Z`` and its derivatives by kappa and by length, as :func:`mkc_torch.functional.log_partition` has them.
+    """``log Z`` and its derivatives by kappa and by length; see :func:`mkc_torch.functional.log_partition`.
 
     Args:
-        kappa, length: of each channel.
-        nodes, weights: of the head's quadrature.
-        tolerance: by which the density exceeds its flat tail where the head ends.
+        kappa, length: 1/σ² and half-width of the domain over d, of each channel.
+        nodes, weights: quadrature rule of the head.
+        tolerance: excess of the density over its flat tail at the end of the head.
     """
     positive = kappa > 1e-3
     safe = np.where(positive, kappa, 1.0)

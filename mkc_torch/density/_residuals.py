@@ -1,4 +1,4 @@
-"""Residuals and the parameters of their density, checked and in one shape."""
+"""Checked residuals and density parameters in a common shape."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Residuals(NamedTuple):
     scale: Float[Tensor, "*batch m"]
 
     def detached_copy(self) -> Residuals:
-        """The same numbers in memory of their own, without autograd's graph."""
+        """A copy without autograd's graph."""
 
         def copy(values: Tensor | None) -> Tensor | None:
             return None if values is None else values.detach().clone()
@@ -44,7 +44,7 @@ class Residuals(NamedTuple):
 
 
 class Domain(NamedTuple):
-    """Half-width of the domain and floor under d, each (*, m)."""
+    """Half-width of the domain and floor of d, each (*, m)."""
 
     bound: Float[Tensor, "*batch m"]
     d_min: Float[Tensor, "*batch m"]
@@ -54,25 +54,25 @@ def checked_residuals(error: Float[Tensor, "*batch N m"] | Data) -> Float[Tensor
     """Residuals as a tensor.
 
     Raises:
-        TypeError: not real numbers, or of half precision.
-        ValueError: fewer than two, non-finite ones, or ones whose squares overflow.
+        TypeError: residuals that are not real numbers, or of half precision.
+        ValueError: fewer than two residuals, or residuals that are not finite or whose squares overflow.
     """
     error = as_tensor("error", error)
     refuse_not_real("error", error)
     if error.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected argument `error` of dtype float32 or float64 but got {error.dtype}; use .float().")
     if error.dim() < 2 or error.shape[-2] < 2 or error.shape[-1] == 0:
-        mend = "; one channel is error[:, None]" if error.dim() == 1 and len(error) > 1 else ""
+        fix = "; for a single channel pass error[:, None]" if error.dim() == 1 and len(error) > 1 else ""
         raise ValueError(
-            f"Expected argument `error` of shape (*, N >= 2, m) with a channel at least but got {tuple(error.shape)}"
-            f"{mend}."
+            f"Expected argument `error` of shape (*, N >= 2, m) with at least one channel but got {tuple(error.shape)}"
+            f"{fix}."
         )
     refuse_not_finite("error", error, "Leave those residuals out")
     most = torch.finfo(error.dtype).max ** 0.4
     if not bool((error.abs() <= most).all()):
         raise ValueError(
             f"Expected argument `error` within {most:.1g}, beyond which squares overflow, but got "
-            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out what cannot be right."
+            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out impossible values."
         )
     return error
 
@@ -81,7 +81,7 @@ def checked_weight(weight: Float[Tensor, "*batch N m"] | Data | None, error: Flo
     """Checked residuals with their weights and robust scales.
 
     Raises:
-        TypeError, ValueError: weights as :func:`full_weight` refuses them.
+        TypeError, ValueError: as :func:`full_weight`.
     """
     full = share = None
     if weight is not None:
@@ -103,7 +103,7 @@ def channel_values(
     """A positive parameter of each channel, from a number or a tensor that broadcasts; None stays None.
 
     Raises:
-        TypeError: it is no number.
+        TypeError: a value that is not a number.
         ValueError: not positive, below ``least``, infinite unless ``infinite``, or of a shape that does not fit.
     """
     if value is None:
@@ -126,10 +126,10 @@ def checked_domain(
     bound: float | Float[Tensor, " m"] | None,
     d_min: float | Float[Tensor, " m"] | None,
 ) -> Domain:
-    """The domain, by default that of :func:`domain_rule`, and the floor under d, by default a tenth of the scale.
+    """The domain, by default from :func:`domain_rule`, and the floor of d, by default a tenth of the scale.
 
     Raises:
-        TypeError: a parameter that is no number.
+        TypeError: a parameter that is not a number.
         ValueError: a parameter out of range, or ``d_min`` that is not below ``bound``.
     """
     error, weight, _, scale = residuals

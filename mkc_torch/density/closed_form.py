@@ -1,8 +1,8 @@
-"""The energy and its first derivatives of every element, in formulas that NumPy and torch share.
+"""Energy and first derivatives of each element, by formulas for both NumPy and torch.
 
-Autograd on a formula of a dozen operations keeps and reads a dozen arrays of the size of the batch, and calls torch
-twice as often. Here the derivatives are made with the value. They are not differentiable;
-:mod:`mkc_torch.density.energy` has the functions that are.
+Autograd on a formula of a dozen operations stores and reads a dozen arrays of the size of the batch, and calls torch
+twice as often. Here the derivatives are computed with the value. They are not differentiable;
+:mod:`mkc_torch.density.energy` has differentiable functions.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from mkc_torch._support.numpy_or_torch import at_least, at_most
 __all__ = ["ElementEnergy", "element_energy"]
 
 _SERIES_BELOW = 0.3
-"""x = kappa z² / 2 below which the derivative by kappa is a series: a difference of exponentials loses its digits."""
+"""x = kappa z² / 2 below which the derivative by kappa is a series: a difference of exponentials loses digits."""
 
 _SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(9))
 """Coefficients of ``(1 - exp(-x) (1 + x)) / x²``, with an error below 1e-11 at the largest x."""
 
 _LEAST_EXPONENT = -1e4
-"""exp(-1e4) is 0 already, and no product with it overflows."""
+"""Lower limit of exponents: exp(-1e4) is 0, and products with -1e4 do not overflow."""
 
 
 class ElementEnergy(NamedTuple):
-    """Energy, its derivative by z and, if asked for, by kappa, of each element."""
+    """Energy of each element, and its derivatives by z and, if requested, by kappa."""
 
     value: Any
     by_z: Any
@@ -36,13 +36,13 @@ def element_energy(xp: Any, z: Any, kappa: Any, *, wants_kappa: bool, has_gaussi
     """``energy(z, kappa)`` with its first derivatives.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are.
+        xp: ``numpy`` or ``torch``, the library of the other arrays.
         z: standardised errors.
         kappa: ``1 / sigma² >= 0``, broadcast.
         wants_kappa: whether the derivative by kappa is needed; else it is None.
         has_gaussian: whether any kappa may be 0.
     """
-    minus_x = (z * (-0.5 * kappa)) * z  # in this order 0 times a square that overflows is 0
+    minus_x = (z * (-0.5 * kappa)) * z  # this order gives 0 at kappa = 0, even where z² overflows
     value, inlier = -xp.expm1(minus_x), xp.exp(minus_x)
     if has_gaussian:
         value = xp.where(minus_x < 0, value / xp.where(kappa > 0, kappa, 1.0), 0.5 * z * z)

@@ -32,31 +32,31 @@ _MAX_ITERATIONS = 200
 
 
 class _Finite(constraints.Constraint):
-    """Above 0 and below infinity: a flat tail without an end has no density."""
+    """Positive and finite: a flat tail on an infinite domain has no density."""
 
     def check(self, value: Tensor) -> Tensor:
         return (value > 0.0) & (value < torch.inf)
 
 
 class MKCDistribution(Distribution):
-    """Heavy-tailed errors with a Gaussian head on a bounded domain, (17) of Li et al. (2023).
+    """Distribution with a Gaussian head and heavy tails on a bounded domain, (17) of Li et al. (2023).
 
-    The head is that of a Gaussian of standard deviation ``d``, the tail is flat at ``exp(-sigma²)`` of the peak, and
-    the domain is ``[loc - bound, loc + bound]``. ``sigma = inf`` is the Gaussian truncated to the domain.
+    The head is a Gaussian of standard deviation ``d``, the tail is flat at ``exp(-sigma²)`` of the peak, and the domain
+    is ``[loc - bound, loc + bound]``. ``sigma = inf`` is the Gaussian truncated to the domain.
 
     Args:
         sigma: bandwidth in [0.05, inf], dimensionless.
         d: scale > 0, in the unit of the values.
         bound: half-width of the domain, above 0 and finite, in the unit of the values.
         loc: centre.
-        validate_args: False leaves the values of all arguments unseen. By default they are looked at, but in compiled
-            code; torch's own default is switched off for the whole process by the first ``torch.compile``.
+        validate_args: whether to check the values of all arguments. By default they are checked except in compiled
+            code. (The first ``torch.compile`` switches off torch's own default for the whole process.)
 
     The parameters broadcast. ``rsample`` and ``icdf`` are differentiable once in all four by implicit differentiation
     of the distribution function.
 
     Raises:
-        TypeError: a parameter that is no number and no tensor, or a value that is no tensor.
+        TypeError: a parameter that is neither a number nor a tensor, or a value that is not a tensor.
         ValueError: a parameter out of range, a value outside the domain, or shapes that do not broadcast.
 
     References:
@@ -126,7 +126,7 @@ class MKCDistribution(Distribution):
         return torch.log(self.d) + log_partition(self._kappa, self._length)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density; ``-inf`` outside the domain, where validation is off."""
+        """Log-density; ``-inf`` outside the domain if validation is off."""
         value = self._checked_value(value)
         error = value - self.loc
         inside = (value >= self.loc - self.bound) & (value <= self.loc + self.bound)
@@ -151,20 +151,20 @@ class MKCDistribution(Distribution):
         """Quantile of a probability in [0, 1].
 
         Raises:
-            TypeError: no tensor.
-            ValueError: a probability outside [0, 1], where validation is on.
+            TypeError: ``value`` is not a tensor.
+            ValueError: a probability outside [0, 1], if validation is on.
         """
         refuse_no_tensor("value", value, "a tensor of probabilities")
         wrong = ~((value >= 0) & (value <= 1))
         if self._validate_args and bool(wrong.any()):
             raise ValueError(
                 f"Expected argument `value` to be probabilities in [0, 1] but got {first_of(value, wrong)}; "
-                "divide per cents by 100."
+                "divide percentages by 100."
             )
         kappa, length = self._kappa, self._length
         value, kappa, length = torch.broadcast_tensors(value.to(kappa), kappa, length)
         u = _quantile(value, kappa, length)
-        # implicit differentiation: 0 in value, minus the slope of the distribution function in the tangent
+        # implicit differentiation: the term's value is 0, its tangent minus the derivative of the cdf
         density = torch.exp(-energy(u, kappa.detach()) - log_partition(kappa.detach(), length.detach()))
         residual = _cumulative(u, kappa, length) - value
         u = u - (residual - residual.detach()) / density.clamp(min=torch.finfo(density.dtype).tiny)
@@ -176,7 +176,9 @@ class MKCDistribution(Distribution):
         _refuse_no_shape("sample_shape", sample_shape)
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=self.d.dtype, device=self.d.device)
-        return self.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))  # a draw of 0 would be an edge
+        return self.icdf(
+            uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4)
+        )  # a draw of 0 would be an end of the domain
 
     @property
     def mean(self) -> Tensor:
@@ -190,7 +192,7 @@ class MKCDistribution(Distribution):
 
     @property
     def variance(self) -> Tensor:
-        """Variance, the flat tail's share of it in closed form."""
+        """Variance; the contribution of the flat tail in closed form."""
         return self.d.square() * self._expectation(lambda u, _: u * u, lambda length, _: length * length / 3.0)
 
     def entropy(self) -> Tensor:
@@ -222,7 +224,7 @@ def _cumulative(u: Tensor, kappa: Tensor, length: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _quantile(probability: Tensor, kappa: Tensor, length: Tensor) -> Tensor:
-    """Solve for u by Newton's method inside a bracket, a chunk at a time."""
+    """Quantile u, by a bracketed Newton's method in chunks."""
     flat = [t.detach().reshape(-1).split(_CHUNK) for t in (probability, kappa, length)]
     parts = [_quantile_chunk(*chunk) for chunk in zip(*flat, strict=True)]
     return torch.cat(parts).reshape(probability.shape) if parts else probability.detach().clone()
@@ -230,7 +232,7 @@ def _quantile(probability: Tensor, kappa: Tensor, length: Tensor) -> Tensor:
 
 def _quantile_chunk(probability: Tensor, kappa: Tensor, length: Tensor) -> Tensor:
     total = partition(kappa, length)
-    # work on one side, with the mass from the middle, so that neither tail loses digits
+    # work on the positive side with the mass from the middle, so that neither tail loses digits
     mass = (2.0 * (probability - 0.5)).abs() * total
     low, high = torch.zeros_like(mass), length.clone()
     u = torch.minimum(0.5 * mass, length)
@@ -242,7 +244,7 @@ def _quantile_chunk(probability: Tensor, kappa: Tensor, length: Tensor) -> Tenso
         inside = (newton > low) & (newton < high)
         following = torch.where(inside, newton, 0.5 * (low + high))
         moved = (following - u).abs()
-        u = following  # where nothing is in excess, both ends of the bracket
+        u = following  # with zero excess, both ends of the bracket
         if bool((moved <= tolerance * u.abs()).all()):
             break
     u = torch.where(mass >= total, length, u)

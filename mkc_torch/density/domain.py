@@ -1,4 +1,4 @@
-"""The domain of the MKC density: the rule for its half-width, and half-widths that are too narrow or too wide."""
+"""The domain of the MKC density: the default half-width, and the check of a given half-width."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["WIDE", "domain_rule", "refuse_bad_bound"]
 
 WIDE = 10.0
-"""Least half-width of the domain in scales."""
+"""Smallest default half-width of the domain, in scales."""
 
 
 def domain_rule(
@@ -22,18 +22,18 @@ def domain_rule(
     used: Tensor | None = None,
     scales: float = WIDE,
 ) -> Float[Tensor, "*batch m"]:
-    """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
+    """Default half-width of the domain: half the range of the residuals of a robust fit, and at least 10 scales.
 
-    The normaliser depends on the length of the domain alone when both its ends lie on the flat tail, so the domain is
-    an interval of that length that covers the residuals, centred on them or not. Ten scales leave Gaussian data at
-    σ = ∞, where a = max|e| over-fits the tail; half the range instead of a multiple of max|e| keeps the tail of
-    one-sided outliers as dense as it is.
+    If both ends of the domain lie on the flat tail, the normaliser depends on the length of the domain alone. The
+    domain is then an interval of that length that covers the residuals, centred on them or not. With ten scales,
+    Gaussian data give σ = ∞; a = max|e| would over-fit the tail. Half the range, instead of a multiple of max|e|, keeps
+    the density of the tail of one-sided outliers.
 
     Args:
         error: residuals.
         scale: robust scale of each channel.
-        used: boolean mask of the residuals that count.
-        scales: least half-width in scales.
+        used: boolean mask of the residuals (True: used).
+        scales: smallest half-width, in scales.
     """
     high = error if used is None else torch.where(used, error, -torch.inf)
     low = error if used is None else torch.where(used, error, torch.inf)
@@ -41,7 +41,7 @@ def domain_rule(
 
 
 def refuse_bad_bound(bound: Tensor, scale: Tensor) -> None:
-    """Refuse a domain that the head of the density does not fit in, and one whose square overflows."""
+    """Raise ValueError for a domain shorter than the head of the density, or one whose square overflows."""
     most = torch.finfo(scale.dtype).max ** 0.4
     if not bool((bound <= most).all()):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What an alternation of E-steps on (σ, d) with steps of another kind needs, whatever the residual is a residual of."""
+"""Helpers for alternating E-steps on (σ, d) with other steps, for linear and nonlinear models."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["gaussian_state", "normalised", "spread", "written"]
 
 
 def normalised(weight: Float[Tensor, "*batch N m"] | None) -> Float[Tensor, "*batch N m"] | None:
-    """Weights that sum to 1 in each channel, as an E-step takes them."""
+    """Weights that sum to 1 in each channel, as an E-step needs them."""
     return None if weight is None else weight / weight.sum(-2, keepdim=True)
 
 
 def spread(
     residual: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None, least: Float[Tensor, "*batch m"]
 ) -> Float[Tensor, "*batch m"]:
-    """Root mean square of each channel under normalised weights, the d of a Gaussian, and no less than ``least``."""
+    """Root mean square of each channel under normalised weights (the d of a Gaussian), at least ``least``, (*, m)."""
     square = residual.square()
     mean = square.mean(-2) if weight is None else (weight * square).sum(-2)
     return torch.maximum(mean.sqrt(), least)
@@ -33,12 +33,12 @@ def spread(
 def gaussian_state(
     residual: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None, state: DensityState
 ) -> DensityState:
-    """The Gaussian of these residuals on the domain of ``state``, which it is compared with."""
+    """State of the Gaussian fitted to the residuals on the domain of ``state``, for comparison with it."""
     least = torch.exp(state.log_d_min)
     return initial_state(residual, weight, least, torch.exp(state.log_bound), least, kappa=torch.zeros_like(least))
 
 
 def written(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
-    """``whole`` with ``part`` in the place of its problems at ``index``."""
+    """Copy of ``whole`` with the problems at ``index`` replaced by ``part``."""
     names = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
     return replace(whole, **{name: getattr(whole, name).index_copy(0, index, getattr(part, name)) for name in names})

@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 __all__ = ["KAPPA_MAX", "energy", "inverse_square"]
 
 KAPPA_MAX = 400.0
-"""Largest ``1 / sigma^2`` for which the quadrature is specified; it is ``sigma = 0.05``."""
+"""Largest ``1 / sigma^2`` for which the quadrature is accurate: ``sigma = 0.05``."""
 
 SIGMA_LEAST = KAPPA_MAX**-0.5 * (1.0 - 1e-5)
-"""Of the normaliser; what was computed as the least ``sigma`` may round below it."""
+"""Smallest ``sigma`` that the normaliser accepts: 0.05 less a tolerance for rounding."""
 
 _FEW = 4096
-"""Elements up to which the number of calls counts more than the memory of six of each."""
+"""Elements up to which fewer calls are worth six times the memory."""
 
 
 def as_computed(*values: object) -> tuple[Tensor, ...]:
-    """Tensors of one floating dtype (float32 at least) and one device, from tensors and numbers."""
+    """Tensors of a common floating dtype (float32 at least) and device, from tensors and numbers."""
     tensors = [v for v in values if isinstance(v, Tensor)]
     dtype = torch.float32 if tensors else torch.get_default_dtype()
     for t in tensors:
@@ -34,7 +34,7 @@ def as_computed(*values: object) -> tuple[Tensor, ...]:
             raise TypeError(f"Expected real values but got a tensor of dtype {t.dtype}; pass real and imaginary parts.")
         if t.is_floating_point():
             dtype = torch.promote_types(dtype, t.dtype)
-    # a scalar tensor follows the others' device; written so that every supported torch.compile traces it
+    # a scalar tensor moves to the others' device; in a form that every supported torch.compile traces
     leading = [t for t in tensors if t.dim() > 0] or tensors
     device = leading[0].device if leading else None
     return tuple(v.to(dtype) if isinstance(v, Tensor) else _as_tensor(v, dtype, device) for v in values)
@@ -57,7 +57,7 @@ def inverse_square(sigma: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 class _Energy(torch.autograd.Function):
-    """Value by expm1 and gradient by exp: each is accurate where the other one's autograd is not."""
+    """Value by expm1 and gradient by exp: autograd of either formula alone would lose accuracy."""
 
     generate_vmap_rule = True
 
@@ -79,7 +79,7 @@ class _Energy(torch.autograd.Function):
 
 
 class _EnergyWithTangent(_Energy):
-    """The eager form; torch.compile traces only functions without a jvp."""
+    """The eager version; torch.compile traces only functions without a jvp."""
 
     @staticmethod
     def jvp(ctx: Any, tangent_z: Tensor | None, tangent_kappa: Tensor | None) -> Tensor:
@@ -93,9 +93,9 @@ class _EnergyWithTangent(_Energy):
 
 
 def energy_value(z: Tensor, kappa: Tensor) -> Tensor:
-    """:func:`energy` where nothing is differentiated, without an autograd function's own cost."""
+    """:func:`energy` without gradients, and without the overhead of an autograd function."""
     q = 0.5 * z * z
-    x = 0.5 * kappa * z * z  # 0 times a square that overflows is no number
+    x = 0.5 * kappa * z * z  # in this order, because 0 times z² is NaN where z² overflows
     divisor = torch.where(kappa > 0, kappa, 1.0)
     if not torch.compiler.is_compiling():
         return torch.where(x > 0, -torch.expm1(-x) / divisor, q)
@@ -119,16 +119,16 @@ def energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
     small = x < 0.5
     near_x = torch.where(small, x, 0.0)
     near = _near(near_x)
-    # capped, so that 0 times it stays 0 where kappa = 0 and the square overflows
+    # capped, so that 0 times it stays 0 where kappa = 0 and z² overflows
     near_q = torch.where(small, q, 0.0).clamp(max=math.sqrt(torch.finfo(q.dtype).max))
-    direct_x = torch.where(small, 1.0, x).clamp(max=1e4)  # exp(-1e4) is 0 already
+    direct_x = torch.where(small, 1.0, x).clamp(max=1e4)  # exp(-1e4) is 0
     direct = (1.0 - torch.exp(-direct_x) * (1.0 + direct_x)) / torch.where(small, 1.0, kappa).square()
     return -torch.where(small, near_q * near_q * near, direct)
 
 
 def _near(x: Tensor) -> Tensor:
-    """``(1 - exp(-x) (1 + x)) / x^2``, the integral of t exp(-x t) over [0, 1], by Gauss and Legendre's six points."""
-    # written out, since the compiler makes variables of a module's numbers
+    """``(1 - exp(-x) (1 + x)) / x^2``, the integral of t exp(-x t) over [0, 1], by six Gauss-Legendre nodes."""
+    # literals, because the compiler turns a module's numbers into variables
     rule = (
         (0.03376524289842403, 0.0028924065498159403),
         (0.16939530676686776, 0.030555658668093615),
@@ -137,7 +137,7 @@ def _near(x: Tensor) -> Tensor:
         (0.8306046932331322, 0.14982512785597574),
         (0.9662347571015759, 0.0827698396397692),
     )
-    # a list of numbers is copied to a GPU while it waits
+    # copying a list of numbers to a GPU would wait for it
     if x.numel() <= _FEW and x.device.type == "cpu" and not torch.compiler.is_compiling():
         nodes, weights = x.new_tensor(rule).unbind(-1)
         return (weights * torch.exp(-x.unsqueeze(-1) * nodes)).sum(-1)
@@ -158,7 +158,7 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
         The energy, of the broadcast shape; ``z^2 / 2`` exactly where ``kappa`` is 0.
 
     Raises:
-        TypeError: an argument is no tensor.
+        TypeError: an argument is not a tensor.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (9).

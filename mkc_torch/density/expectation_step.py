@@ -1,4 +1,4 @@
-"""The E-step of MKC-EM on weighted residuals: σ and d of greatest likelihood, annealed and damped."""
+"""The E-step of MKC-EM on weighted residuals: maximum-likelihood σ and d, with annealing and damping."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _KAPPA_OFFSET = 0.02
+"""Offset of κ in the logarithm in which it is damped."""
 
 
 class ChannelEstimate(NamedTuple):
-    """κ = 1/σ² and d of each channel, and where the domain is too narrow for the residuals, each (m,)."""
+    """κ = 1/σ² and d of each channel, and whether the domain is too narrow for the residuals, each (m,)."""
 
     kappa: Float[Tensor, " m"]
     d: Float[Tensor, " m"]
@@ -33,18 +34,18 @@ def expectation_step(
     d_min: Float[Tensor, " m"],
     share: float = 1.0,
 ) -> ChannelEstimate:
-    """σ and d that are likeliest for weighted residuals, Algorithm 2 of Li et al. (2023).
+    """Maximum-likelihood σ and d of weighted residuals, Algorithm 2 of Li et al. (2023).
 
-    A domain of less than two robust scales has no room for the density's head, as may happen while a network is
-    untrained or diverges. Such a channel gets the Gaussian of half the bound, least squares, which pulls at every
-    residual; it is reported as ``narrow``.
+    A domain of less than two robust scales is too short for the density's head. This may happen while a network is
+    untrained or diverges. Such a channel gets σ = ∞ (least squares) and d = half the bound, and is reported as
+    ``narrow``.
 
     Args:
         error: residuals.
-        weight: weights ≥ 0, positive somewhere in every channel.
+        weight: weights ≥ 0, with a positive weight in every channel.
         bound: half-widths of the domain, in the unit of ``error``.
-        d_min: floors under d.
-        share: the part of the likeliest 1/σ² that is used, in (0, 1]; d is then fitted for that σ.
+        d_min: floors of d.
+        share: factor on the maximum-likelihood 1/σ², in (0, 1]; d is then fitted for that σ.
 
     Example:
         >>> error = torch.linspace(-2, 2, 101, dtype=torch.float64).unsqueeze(-1)
@@ -53,7 +54,7 @@ def expectation_step(
         >>> step.kappa, step.d
         (tensor([0.], dtype=torch.float64), tensor([1.1662], dtype=torch.float64))
     """
-    if error.shape[0] == 1:  # one that stands for many is two of half the weight
+    if error.shape[0] == 1:  # a residual that represents many becomes two, so that a scale exists
         error, weight = error.expand(2, -1), weight.expand(2, -1)
     narrow = bound < 2.0 * robust_scale(error, weight)
     kappa, d = torch.zeros_like(bound), 0.5 * bound
@@ -68,12 +69,12 @@ def expectation_step(
 
 
 def damped(before: Float[Tensor, " m"], after: Float[Tensor, " m"], keep: Tensor | float) -> Float[Tensor, " m"]:
-    """Part of the way from one d to the next, in log d; ``keep`` in [0, 1) is the part of the old one."""
+    """Damped d: interpolated from ``after`` to ``before`` in log d; ``keep`` in [0, 1) is the share of ``before``."""
     return torch.exp(torch.lerp(torch.log(after), torch.log(before), torch.as_tensor(keep).to(after)))
 
 
 def damped_kappa(before: Float[Tensor, " m"], after: Float[Tensor, " m"], keep: Tensor | float) -> Float[Tensor, " m"]:
-    """Part of the way from one κ = 1/σ² to the next, in log(κ + 0.02), which is finite at σ = ∞ and exact there."""
+    """Damped κ = 1/σ²: interpolated as :func:`damped`, in log(κ + 0.02), which is finite and exact at σ = ∞."""
     s = torch.lerp(
         torch.log1p(after / _KAPPA_OFFSET), torch.log1p(before / _KAPPA_OFFSET), torch.as_tensor(keep).to(after)
     )

@@ -1,6 +1,6 @@
-"""Fit σ and d of the MKC density to residuals by maximum likelihood: the E-step of MKC-EM (Algorithm 2 of the paper).
+"""Maximum-likelihood fit of σ and d to residuals: the E-step of MKC-EM (Algorithm 2 of the paper).
 
-The mean negative log-likelihood of each channel is a function of two numbers, minimised by the safeguarded Newton
+The mean negative log-likelihood of each channel is a function of two parameters, minimised by the safeguarded Newton
 method of :mod:`mkc_torch.density.likelihood`.
 """
 
@@ -35,13 +35,13 @@ __all__ = ["DensityFit", "fit_density"]
 
 @dataclass(frozen=True)
 class DensityFit:
-    """A fitted MKC density, as :func:`fit_density` gives it.
+    """A fitted MKC density: the result of :func:`fit_density`.
 
     Attributes:
         sigma, d, bound: bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain, (*, m).
-        log_likelihood: mean, in nats per residual, (*, m); compare only at equal ``bound``.
-        converged: (*, m).
-        n_iter: Newton steps made.
+        log_likelihood: mean log-likelihood, in nats per residual, (*, m); compare only at equal ``bound``.
+        converged: whether the fit of each channel converged, (*, m).
+        n_iter: number of Newton steps.
 
     Example:
         >>> from mkc_torch import MKCDistribution
@@ -65,10 +65,9 @@ class DensityFit:
 
     @cached_property
     def tails(self) -> Tails:
-        """Whether the tails of the residuals are heavier than a Gaussian's, :func:`assess_tails` on the same domain.
+        """Test of the residuals for tails heavier than a Gaussian's: :func:`assess_tails` on the same domain.
 
-        Computed at the first use, which the residuals are kept for, and by free fits, also where ``sigma`` or ``d`` was
-        fixed.
+        Computed at the first access, from a copy of the residuals. It fits σ and d even if they were fixed in this fit.
 
         Raises:
             ValueError: all residuals of a channel are 0.
@@ -91,23 +90,23 @@ def fit_density(
     """Maximum-likelihood σ and d of residuals, all channels and batches at once.
 
     Args:
-        error: residuals (*, N, m), centred as the fit left them; a tensor, a NumPy array or a DataFrame.
-        sigma: keeps σ at this value in [0.05, inf] (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
-        d: keeps d at this value and fits σ alone, Remark 6.
-        bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
-            :func:`domain_rule`. A residual beyond it counts as one on the flat tail.
+        error: residuals (*, N, m) of a fit; a tensor, a NumPy array or a DataFrame. They are not centred here.
+        sigma: fixed σ in [0.05, inf] (``inf``: Gaussian); only d is fitted, Remark 7 of the paper.
+        d: fixed d; only σ is fitted, Remark 6.
+        bound: half-width of the domain, in the unit of ``error``, at least two robust scales; default from
+            :func:`domain_rule`. Residuals beyond it have the density of the flat tail.
         weight: non-negative weights of the residuals, (*, N, m) or (N, 1).
-        d_min: floor under d; default a tenth of the robust scale, since the likelihood grows without limit as d → 0
-            on residuals that a fit has interpolated.
-        max_iter: Newton steps at most.
-        tol: a channel has converged when a step lowers its mean negative log-likelihood by less.
+        d_min: floor of d; default a tenth of the robust scale, because the likelihood of interpolated residuals grows
+            without limit as d → 0.
+        max_iter: maximum number of Newton steps.
+        tol: a channel has converged when a step lowers its mean negative log-likelihood by less than this, in nats.
 
     Returns:
         The fit, with the domain it was made on: likelihoods compare only on the same domain.
 
     Raises:
-        TypeError: residuals or weights that are no real numbers, or a parameter that is no number.
-        ValueError: fewer than two residuals, non-finite ones, a parameter out of range, or shapes that do not fit.
+        TypeError: residuals or weights that are not real numbers, or a parameter that is not a number.
+        ValueError: fewer than two residuals, non-finite residuals, a parameter out of range, or shapes that do not fit.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (29)-(31), Algorithm 2, Remarks 6 and 7.
@@ -144,7 +143,7 @@ def fit_density(
         log_likelihood=-state.value,
         converged=converged,
         n_iter=n_iter,
-        # a copy, since the caller may write over the residuals before the tails are asked for
+        # a copy, because the caller may overwrite the residuals before the tails are computed
         _residuals=residuals.detached_copy(),
         _domain=domain,
     )

@@ -1,4 +1,4 @@
-"""The head of the MKC density: where it exceeds its flat tail, and the quadrature of it."""
+"""The head of the MKC density, where it exceeds its flat tail: reach and quadrature."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def head_rule_constants() -> tuple[Float[Tensor, " nodes"], Float[Tensor, " node
 
 
 _COPIES: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
-"""The rule on other devices and in other dtypes: a copy to a GPU waits, and is made once."""
+"""Copies of the rule by device and dtype: copying to a GPU waits for it, so each copy is made once."""
 
 
 def _rule_like(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,7 +68,7 @@ def tail_density(kappa: Tensor) -> Tensor:
 
 
 def head_reach(kappa: Tensor) -> Tensor:
-    """The ``z`` beyond which the density exceeds its flat tail by less than 1e-13; a constant for autograd."""
+    """The ``z`` beyond which the density exceeds its flat tail by less than 1e-13; without a gradient."""
     k = kappa.detach().clamp(min=1e-3)
     excess = k * torch.nn.functional.softplus(1.0 / k + math.log(HEAD_TOLERANCE), threshold=30.0)
     return torch.sqrt(-2.0 * torch.log(excess) / k)
@@ -91,19 +91,19 @@ def integrate(
     length: Float[Tensor, "*batch"],
     weights: Float[Tensor, "*batch nodes"],
 ) -> Float[Tensor, "*batch"]:
-    """Integral over the domain of a function that is constant on the tail: the tail exactly, the head by quadrature.
+    """Integral over the domain of a function that is constant on the tail: tail in closed form, head by quadrature.
 
     Args:
         values: the function at the nodes of :func:`head_rule`.
         tail: its value on the flat tail.
         length: half-width of the domain.
-        weights: those of :func:`head_rule`.
+        weights: weights of :func:`head_rule`.
     """
     return 2.0 * length * tail + (weights * (values - tail.unsqueeze(-1))).sum(-1)
 
 
 def head_integral(kappa: Float64[Tensor, "*batch"]) -> Float64[Tensor, "*batch"]:
-    """Integral of the density less its flat tail, over a domain that reaches beyond the head."""
+    """Integral of the density minus its flat tail, over a domain that extends beyond the head."""
     nodes, weights = head_rule(kappa, torch.full_like(kappa, math.inf))
     density = torch.exp(-energy_value(nodes, kappa.unsqueeze(-1)))
     return integrate(density, tail_density(kappa), torch.zeros_like(kappa), weights)

@@ -1,9 +1,9 @@
-"""The integral over the head of the density as a table in kappa, for float32 and domains that reach beyond the head.
+"""The integral over the density's head as a table in kappa, for float32 and domains that extend beyond the head.
 
-There ``Z = 2 length exp(-1 / kappa) + H(kappa)``: H is the integral of the density less its flat tail, which no longer
-depends on the length. It is a polynomial of degree 7 in ``w = (1 + 12 kappa)^(-1/2)`` on each of 16 intervals of
-[0, 1], on which kappa from infinity to 0 lies. A lookup takes a twentieth of the time of the quadrature of 32 nodes.
-The relative error of Z is 2e-7, that of its slope by kappa 4e-7, plus the rounding of exp(-1 / kappa).
+On such domains ``Z = 2 length exp(-1 / kappa) + H(kappa)``: H is the integral of the density minus its flat tail and
+does not depend on the length. The table has a polynomial of degree 7 in ``w = (1 + 12 kappa)^(-1/2)`` on each of 16
+intervals of [0, 1]; kappa from infinity to 0 maps to w in [0, 1]. A lookup takes a twentieth of the time of the 32-node
+quadrature. The relative error of Z is 2e-7, that of its derivative by kappa 4e-7, plus the rounding of exp(-1 / kappa).
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 __all__ = ["DEGREE", "INTERVALS", "RATE", "head_table", "look_up", "reaches_beyond_head"]
 
 RATE = 12.0
-"""Of kappa in ``w``: with it the intervals have about equal shares of the curvature."""
+"""Factor on kappa in ``w``, chosen so that the intervals have about equal shares of the curvature."""
 
 INTERVALS = 16
-"""Intervals of [0, 1]."""
+"""Number of intervals of [0, 1]."""
 
 DEGREE = 7
-"""Degree of the polynomial on each of them."""
+"""Degree of the polynomial on each interval."""
 
 
 @functools.cache
 def head_table(device: torch.device) -> Float[Tensor, "8 16"]:
-    """Coefficients of the powers 0 to 7, in columns for the intervals, in float32.
+    """Coefficients of the powers 0 to 7 (rows) on each interval (columns), in float32.
 
     The variable runs from -1/2 to 1/2 over an interval.
     """
@@ -48,7 +48,7 @@ def head_table(device: torch.device) -> Float[Tensor, "8 16"]:
 
 
 def reaches_beyond_head(kappa: Float[Tensor, " n"], length: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Whether the density exceeds its flat tail by less than 1e-8 at the end of the domain, by a bound that is fast."""
+    """Whether the density exceeds its flat tail by less than 1e-8 at the end of the domain, by a cheap bound."""
     most = torch.where(kappa < 0.03, 54.0, 220.0)
     return length * length >= torch.minimum(37.0 / kappa, most)
 
@@ -56,7 +56,7 @@ def reaches_beyond_head(kappa: Float[Tensor, " n"], length: Float[Tensor, " n"])
 def look_up(
     kappa: Float[Tensor, " n"], length: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """``log Z`` and its derivatives by kappa and by length, in float32, where the domain reaches beyond the head."""
+    """``log Z`` and its derivatives by kappa and by length, in float32, for domains that extend beyond the head."""
     place = torch.rsqrt(1.0 + RATE * kappa)
     position = INTERVALS * place
     index = position.nan_to_num(0.0).clamp(0.0, INTERVALS - 1.0).to(torch.int64)

@@ -1,6 +1,6 @@
-"""The mean negative log-likelihood of the MKC density in κ = 1/σ² and log d: its derivatives, and Newton steps on it.
+"""Mean negative log-likelihood of the MKC density in κ = 1/σ² and log d: derivatives and Newton steps.
 
-σ = ∞ is a finite value of κ. A step in log κ would go too far: where the tail is already more than there are outliers,
+In κ, σ = ∞ is the finite value 0. Steps in log κ would overshoot: once the tail has more mass than there are outliers,
 the likelihood falls exponentially.
 """
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _KAPPA_OFFSET = 0.02
-"""Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
+"""Offset of κ in relative steps, Δκ / (κ + offset): near a Gaussian small absolute changes matter."""
 
 _LONGEST_STEP = 2.0
-"""Length at which a step is cut, in log d and in shares of κ."""
+"""Longest step, in log d and in relative κ."""
 
 _LEAST_KAPPA_SHARE = math.exp(-2.0)
-"""Share of κ that a step leaves at least."""
+"""Smallest factor on κ (plus its offset) in a step."""
 
 
 class Derivatives(NamedTuple):
-    """A function of (κ, log d): value, gradient and Hessian, each of shape (*, m)."""
+    """Value, gradient and Hessian of a function of (κ, log d), each of shape (*, m)."""
 
     value: Tensor
     kappa: Tensor
@@ -51,7 +51,7 @@ def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
     e = -torch.expm1(-x) / divisor
     first = (e - qw) / divisor
     second = (2.0 * first - q * qw) / divisor
-    # below this x the differences lose more digits than two terms of the series leave out
+    # below this x the differences lose more digits than a series of two terms
     small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
     q2 = q * q
     e = torch.where(small, q - 0.5 * q * x, e)
@@ -61,7 +61,7 @@ def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over samples; ``weight`` sums to one over them."""
+    """Mean over samples; ``weight`` sums to 1 over them."""
     return values.mean(-2) if weight is None else (weight * values).sum(-2)
 
 
@@ -110,7 +110,7 @@ def normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> D
 
 @dataclass(frozen=True)
 class DensityState:
-    """Where a fit stands, every field (*, m); ``value`` is the mean negative log-likelihood at the last step."""
+    """Iterate of a fit, every field (*, m); ``value`` is the mean negative log-likelihood at the last step."""
 
     kappa: Tensor
     log_d: Tensor
@@ -148,9 +148,9 @@ def initial_state(
     d: Float[Tensor, "*batch m"] | None = None,
     tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
 ) -> DensityState:
-    """The likeliest of a Gaussian and of densities with κ from ``tails`` and the given scale.
+    """The most likely start among a Gaussian and densities with κ from ``tails`` and the given scale.
 
-    ``kappa`` or ``d`` given stays as it is.
+    A given ``kappa`` or ``d`` is kept fixed.
     """
     rms = torch.sqrt(_mean(error.square(), weight)).clamp(min=d_min)
     log_bound, log_d_min = torch.log(bound), torch.log(d_min)
@@ -178,7 +178,7 @@ def initial_state(
 
 
 def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
-    """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
+    """One damped Newton step in (κ, log d) with κ in [0, 400] and d in [d_min, bound]; the value never increases."""
     total = likelihood_derivatives(energy_derivatives(error, weight, state.kappa, state.log_d), state)
     proposal = newton_proposal(total, state)
     value = negative_log_likelihood(error, weight, proposal)
@@ -193,13 +193,13 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
 
 
 def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivatives:
-    """Those of the mean negative log-likelihood, from those of the mean energy."""
+    """Derivatives of the mean negative log-likelihood, from those of the mean energy."""
     norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
     return Derivatives(*(a + b for a, b in zip(energy, norm, strict=True)))
 
 
 def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
-    """Where a damped Newton step from ``state`` leads, its value not yet known."""
+    """Iterate after a damped Newton step from ``state``; its value is not updated."""
     chain = state.kappa + _KAPPA_OFFSET
     g_s, g_l = total.kappa * chain, total.log_d
     h_ss = total.kappa_kappa * chain.square()
@@ -213,7 +213,7 @@ def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
     g_s, g_l = torch.where(held_s, 0.0, g_s), torch.where(held_l, 0.0, g_l)
     h_sl = torch.where(held_s | held_l, 0.0, h_sl)
     h_ss, h_ll = torch.where(held_s, 1.0, h_ss), torch.where(held_l, 1.0, h_ll)
-    # on scales of their own: near a Gaussian the curvature by κ is a thousandth of that by log d
+    # scaled separately: near a Gaussian the curvature by κ is a thousandth of that by log d
     r_s, r_l = (h.abs().clamp(min=1e-8 * (h_ss.abs() + h_ll.abs())).rsqrt() for h in (h_ss, h_ll))
     a, b, c = h_ss * r_s * r_s, h_sl * r_s * r_l, h_ll * r_l * r_l
     # Levenberg's shift also lifts the smaller eigenvalue above 0
@@ -238,12 +238,12 @@ def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
 
 
 def conclusive(before: DensityState, after: DensityState) -> Tensor:
-    """Whether a step says something about rest: it was taken, or no shorter one is worth trying. Shape (*, m)."""
+    """Whether a step is evidence for convergence: accepted, or the damping is at its limit. Shape (*, m)."""
     return (after.damping <= before.damping) | (after.damping >= 1e3)
 
 
 class Maximum(NamedTuple):
-    """Where Newton steps ended: the state, which channels converged, (*, m), and the number of steps."""
+    """Result of Newton steps: the last iterate, which channels converged, (*, m), and the number of steps."""
 
     state: DensityState
     converged: Bool[Tensor, "*batch m"]
@@ -251,14 +251,14 @@ class Maximum(NamedTuple):
 
 
 def maximise(error: Tensor, weight: Tensor | None, state: DensityState, *, max_iter: int, tol: float) -> Maximum:
-    """Newton steps until none lowers the mean negative log-likelihood of a channel by more than ``tol`` and rounding.
+    """Maximise the likelihood of each channel by Newton steps, until two steps gain less than ``tol`` and rounding.
 
     Args:
         error: residuals, (*, N, m).
-        weight: sums to one over the samples; None for equal weights.
-        state: where to start, :func:`initial_state`.
-        max_iter: Newton steps at most.
-        tol: in nats per residual.
+        weight: weights that sum to 1 over the samples; None for equal weights.
+        state: the start, from :func:`initial_state`.
+        max_iter: maximum number of Newton steps.
+        tol: tolerance of the mean log-likelihood, in nats per residual.
     """
     still = torch.zeros_like(state.value, dtype=torch.int64)
     n_iter = 0

@@ -1,9 +1,9 @@
-"""Several kernels on one channel: a tail that thins out as far errors do, where a single kernel's is flat.
+"""Density with several kernels per channel: its tail decreases with the error, whereas a single kernel's is flat.
 
-The energy is Σ_j θ_j (1 - exp(-e² / (2 h_j²))), one kernel for each of a ladder of bandwidths and one of infinite
-bandwidth, e². A single kernel of depth θ = σ² and bandwidth h = σ d is the MKC density. A continuum of kernels is a
-Student-t's, since log(1 + e²) = ∫ (1 - exp(-t e²)) exp(-t) / t dt. In the depths θ ≥ 0 the density is an exponential
-family, so its likelihood has one maximum: no start, and no bandwidth to choose.
+The energy is Σ_j θ_j (1 - exp(-e² / (2 h_j²))), with a kernel for each bandwidth of a geometric sequence and a kernel
+of infinite bandwidth, e². A single kernel of depth θ = σ² and bandwidth h = σ d is the MKC density. A continuum of
+kernels gives Student's t, because log(1 + e²) = ∫ (1 - exp(-t e²)) exp(-t) / t dt. In the depths θ ≥ 0 the density is
+an exponential family, so its likelihood has a single maximum: neither a start nor a bandwidth has to be chosen.
 """
 
 from __future__ import annotations
@@ -25,35 +25,41 @@ if TYPE_CHECKING:
 
 __all__ = ["KernelsFit", "fit_kernels"]
 
-_NARROWEST, _RATIO = 0.5, 2.0
-"""The least bandwidth in robust scales, and of each to the one before: octaves. Set on draws of Cauchy's
-and Gauss's distribution."""
+_NARROWEST = 0.5
+"""Smallest bandwidth, in robust scales. Tuned on draws of the Cauchy and the Gaussian distribution."""
+
+_RATIO = 2.0
+"""Ratio of successive bandwidths."""
 
 _LEAST_ERROR = 0.02
-"""In robust scales: smaller errors count as this, for errors of exactly 0 would make the density a spike."""
+"""Lower limit of absolute errors, in robust scales: errors of exactly 0 would make the density a spike."""
 
 _NODES = 400
-"""Of the normaliser's quadrature, evenly in asinh(error): for 1e8 scales an error of 1e-9 nats."""
+"""Nodes of the normaliser's quadrature in asinh(error); the error is 1e-9 nats on a domain of 1e8 scales."""
 
 _RULE = np.polynomial.legendre.leggauss(_NODES)
+"""Nodes on [-1, 1] and weights."""
 
 _BARRIERS = tuple(10.0**-k for k in range(1, 10))
-"""Of -μ Σ log θ, which keeps depths positive, one after the other: the last costs 1e-8 nats."""
+"""Successive μ of the barrier -μ Σ log θ, which keeps depths positive; the last costs 1e-8 nats."""
 
-_STEPS, _REST = 50, 1e-10
-"""Of Newton's method for each barrier at most, and the decrease in nats below which it rests."""
+_MAX_STEPS = 50
+"""Newton steps per barrier, at most."""
+
+_TOLERANCE = 1e-10
+"""Decrease, in nats, below which Newton's method has converged."""
 
 
 @dataclass(frozen=True)
 class KernelsFit:
-    """The density of errors that :func:`fit_kernels` found.
+    """A fitted density with several kernels per channel: the result of :func:`fit_kernels`.
 
     Attributes:
-        bandwidth: of the kernels, in the unit of the errors, ``inf`` last, (J,) for each channel.
-        depth: how deep each kernel makes the energy, in nats, (J,) for each channel; at most so much of it is lost far
-            from 0. That of the infinite bandwidth is of ``(e / bound)² / 2``.
+        bandwidth: bandwidths of the kernels, in the unit of the errors, ``inf`` last, (J,) for each channel.
+        depth: depths of the kernels, in nats, (J,) for each channel: each kernel's energy far from 0. For the infinite
+            bandwidth, the coefficient of ``(e / bound)² / 2``.
         bound: half-width of the domain, (m,).
-        log_likelihood: mean, in nats per error, (m,); compare only at equal bounds.
+        log_likelihood: mean log-likelihood, in nats per error, (m,); compare only at equal bounds.
     """
 
     bandwidth: tuple[Float[Tensor, " J"], ...]
@@ -63,29 +69,29 @@ class KernelsFit:
     log_likelihood: Float[Tensor, " m"]
 
     def energy(self, error: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-        """What the negative log-density is above its value at 0; beyond the bound as on it."""
+        """Negative log-density minus its value at 0, in nats; constant beyond the bound."""
         size = torch.minimum(error.abs().to(self.bound), self.bound)
         channels = zip(size.unbind(-1), self.bandwidth, self.depth, self.bound, strict=True)
         return torch.stack([_features(e, h, a) @ depth for e, h, depth, a in channels], -1)
 
     def log_prob(self, error: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-        """The log-density of errors."""
+        """Log-density of errors, in nats."""
         return -self.energy(error) - self.log_normalizer
 
 
 def fit_kernels(error: Float[Tensor, "N m"], *, bound: float | Float[Tensor, " m"] | None = None) -> KernelsFit:
-    """The likeliest depths of a ladder of kernels, for residuals whose tails thin out: delays, returns, claims.
+    """Maximum-likelihood depths of a series of kernels, for residuals with decreasing tails: delays, returns, claims.
 
-    Where wrong values lie evenly anywhere, :func:`mkc_torch.fit_density` has the same density in two numbers.
+    For outliers that are uniform over the domain, :func:`mkc_torch.fit_density` needs two parameters only.
 
     Args:
-        error: residuals (N, m), centred as the fit left them.
-        bound: half-width of the domain; by default the largest of the errors in size.
+        error: residuals (N, m) of a fit. They are not centred here.
+        bound: half-width of the domain; by default the largest absolute error.
 
     Raises:
-        TypeError: residuals that are no real tensor.
-        ValueError: fewer than two residuals, non-finite ones, more than half of a channel's equal to 0, or a bound
-            below four robust scales of them.
+        TypeError: residuals that are not a real tensor.
+        ValueError: fewer than two residuals, non-finite residuals, a channel with more than half of them equal to 0, or
+            a bound below four robust scales.
 
     Example:
         >>> u = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
@@ -98,15 +104,15 @@ def fit_kernels(error: Float[Tensor, "N m"], *, bound: float | Float[Tensor, " m
     refuse_not_real("error", error)
     if error.dim() != 2 or len(error) < 2 or error.shape[1] == 0 or not bool(torch.isfinite(error).all()):
         raise ValueError(
-            f"Expected argument `error` of shape (N >= 2, m), finite throughout, but got {tuple(error.shape)}; one "
-            "channel is error.unsqueeze(-1), and residuals that are not finite must be left out."
+            f"Expected argument `error` of shape (N >= 2, m), finite throughout, but got {tuple(error.shape)}; for a "
+            "single channel pass error.unsqueeze(-1), and leave out residuals that are not finite."
         )
     error = error.detach().double()
     scale = robust_scale(error, None)
     if not bool((scale > 0).all()):
         raise ValueError(
-            f"Expected argument `error` with a robust scale above 0 but got {scale.tolist()}: half of a channel's "
-            "residuals are 0, which is no density."
+            f"Expected argument `error` with a robust scale above 0 but got {scale.tolist()}: more than half of a "
+            "channel's residuals are 0, which has no density."
         )
     largest = error.abs().amax(0)
     half_width = torch.maximum(largest, 4.0 * scale) if bound is None else as_numbers("bound", bound).double()
@@ -128,20 +134,20 @@ def fit_kernels(error: Float[Tensor, "N m"], *, bound: float | Float[Tensor, " m
 
 
 def _fitted(error: Float[Tensor, " N"], scale: Tensor, bound: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Bandwidths, depths, log-normaliser and mean log-likelihood of one channel."""
+    """Bandwidths, depths, log-normaliser and mean log-likelihood of a channel."""
     octaves = math.floor(math.log(float(bound / scale) / _NARROWEST, _RATIO))
     ladder = [_NARROWEST * float(scale) * _RATIO**k for k in range(octaves + 1)]
     bandwidth = error.new_tensor([*ladder, math.inf])
     size = torch.minimum(error.abs().clamp(min=_LEAST_ERROR * float(scale)), bound)
-    # and one error more at the bound: where none was seen, the likeliest tail would be none at all
+    # plus an error at the bound: without errors far out, the most likely tail would have no mass
     mean = _features(torch.cat([size, bound.unsqueeze(0)]), bandwidth, bound).mean(0)
     nodes, weights = _quadrature(scale, bound)
     basis = _features(nodes, bandwidth, bound)
     depth = torch.full_like(mean, 0.5)
     for barrier in _BARRIERS:
-        for _ in range(_STEPS):
+        for _ in range(_MAX_STEPS):
             depth, decrease = _newton_step(depth, mean, basis, weights, barrier)
-            if decrease < _REST:
+            if decrease < _TOLERANCE:
                 break
     log_normalizer = _log_normalizer(depth, basis, weights)
     own = _features(size, bandwidth, bound).mean(0)
@@ -149,13 +155,13 @@ def _fitted(error: Float[Tensor, " N"], scale: Tensor, bound: Tensor) -> tuple[T
 
 
 def _features(size: Float[Tensor, " N"], bandwidth: Float[Tensor, " J"], bound: Tensor) -> Float[Tensor, "N J"]:
-    """``1 - exp(-e² / (2 h²))`` of each kernel; of the infinite one ``(e / bound)² / 2``."""
+    """``1 - exp(-e² / (2 h²))`` of each kernel; ``(e / bound)² / 2`` for the infinite bandwidth."""
     finite = -torch.expm1(-0.5 * (size.unsqueeze(-1) / bandwidth[:-1]).square())
     return torch.cat([finite, 0.5 * (size / bound).square().unsqueeze(-1)], -1)
 
 
 def _quadrature(scale: Tensor, bound: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-    """Nodes in (0, bound), dense near 0 and evenly in the logarithm far away, and weights for both signs."""
+    """Nodes in (0, bound), dense near 0 and uniform in the logarithm far away, and weights for both signs."""
     x, w = (torch.from_numpy(v).to(bound) for v in _RULE)
     near = 0.1 * scale
     reach = torch.asinh(bound / near)
@@ -174,7 +180,7 @@ def _newton_step(
     weights: Float[Tensor, " K"],
     barrier: float,
 ) -> tuple[Float[Tensor, " J"], float]:
-    """The depths after a step on the mean negative log-likelihood with its barrier, and by how much that fell."""
+    """Depths after a Newton step on the mean negative log-likelihood with barrier, and its decrease in nats."""
 
     def value(at: Tensor) -> Tensor:
         return mean @ at + _log_normalizer(at, basis, weights) - barrier * at.log().sum()
@@ -185,7 +191,7 @@ def _newton_step(
     centred = basis - expected
     gradient = mean - expected - barrier / depth
     hessian = (centred * density.unsqueeze(-1)).mT @ centred + torch.diag(barrier / depth.square())
-    # in units of the depths, where the barrier's part is the same for all
+    # scaled by the depths, so that the barrier's curvature is equal for all
     step = -depth * torch.linalg.solve(hessian * torch.outer(depth, depth), depth * gradient)
     shrinks = step < 0
     length = min(1.0, 0.95 * float((depth / -step)[shrinks].min())) if bool(shrinks.any()) else 1.0

@@ -1,4 +1,4 @@
-"""The normaliser of the MKC density: quadrature on the head, the flat tail in closed form."""
+"""The normaliser of the MKC density: the head by quadrature, the flat tail in closed form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["log_partition"]
 
 _RULE = (head_rule_constants()[0].numpy(), head_rule_constants()[1].numpy())
-"""Nodes and weights on the head, for NumPy."""
+"""Nodes and weights of the head's quadrature as NumPy arrays."""
 
 
 def partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -35,7 +35,7 @@ def partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -
 
 
 def log_partition_value(kappa: Tensor, length: Tensor) -> Tensor:
-    """:func:`log_partition` where nothing is differentiated."""
+    """:func:`log_partition` without gradients."""
     return torch.log(_partition(kappa, length, energy_value))
 
 
@@ -47,18 +47,18 @@ def _partition(kappa: Tensor, length: Tensor, energy: Callable[[Tensor, Tensor],
 
 
 def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """``log Z``, ``Z`` being the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``.
+    """``log Z`` with ``Z``, the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``.
 
-    The flat tail ``2 length exp(-1 / kappa)`` is taken analytically and a fixed rule of 32 nodes sits on the head,
-    whose width it knows, so the relative error of ``Z`` stays below 1e-12 in float64 for ``kappa`` in [0, 400] and
-    ``length`` up to 1e7. Many elements of float32 take the head from a table, to 1e-6.
+    The flat tail ``2 length exp(-1 / kappa)`` is analytic. The head is integrated by a rule of 32 nodes scaled to its
+    width. The relative error of ``Z`` is below 1e-12 in float64 for ``kappa`` in [0, 400] and ``length`` up to 1e7. For
+    many elements of float32 the head comes from a table, to 1e-6.
 
     Args:
         kappa: ``1 / sigma^2`` in [0, 400].
         length: half-width of the domain in units of ``d``; broadcast against ``kappa``.
 
     Raises:
-        TypeError: an argument is no tensor.
+        TypeError: an argument is not a tensor.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -78,11 +78,11 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
 
 
 def log_partition_with_slopes(xp: Any, kappa: Any, length: Any) -> tuple[Any, Any, Any]:
-    """``log Z`` and its derivatives by kappa and by length, none of them differentiable.
+    """``log Z`` and its derivatives by kappa and by length; not differentiable.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are; NumPy's are float64.
-        kappa, length: as in :func:`log_partition`, of one shape.
+        xp: ``numpy`` or ``torch``, the library of the other arrays; NumPy arrays are float64.
+        kappa, length: as in :func:`log_partition`, of the same shape.
     """
     if xp is np:
         return log_partition_and_slopes(kappa, length, *_RULE, HEAD_TOLERANCE)
@@ -105,38 +105,38 @@ def _log_partition_and_slopes(
 
 
 def _is_looked_up(*values: Tensor) -> bool:
-    """Whether the table has the digits, and may be chosen for each element: looking at a GPU's values would wait."""
+    """Whether the table is accurate enough (float32), and values can be read without waiting for a GPU."""
     return all(
-        type(one) is Tensor and one.dtype == torch.float32 and one.device.type == "cpu" and not is_wrapped(one)
-        for one in values
+        type(value) is Tensor and value.dtype == torch.float32 and value.device.type == "cpu" and not is_wrapped(value)
+        for value in values
     )
 
 
 def _looked_up(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """By the table, and by quadrature where the domain ends on the head."""
+    """``log Z`` and its derivatives by the table, and by quadrature where the domain ends on the head."""
     kappa, length = kappa.contiguous(), length.contiguous()
     flat = kappa.view(-1), length.view(-1)
     found = look_up(*flat)
     near = torch.nonzero(~reaches_beyond_head(*flat)).squeeze(-1)
     if len(near):
         exact = _log_partition_and_slopes(flat[0][near], flat[1][near], energy_value)
-        for one, own in zip(found, exact, strict=True):
-            one[near] = own
-    value, by_kappa, by_length = (one.view(kappa.shape) for one in found)
+        for entry, own in zip(found, exact, strict=True):
+            entry[near] = own
+    value, by_kappa, by_length = (entry.view(kappa.shape) for entry in found)
     return value, by_kappa, by_length
 
 
 class _LogPartition(torch.autograd.Function):
-    """Value and both slopes at once: autograd through the quadrature takes several times as long on a few channels."""
+    """Value and both derivatives at once: autograd through the quadrature is several times slower on few channels."""
 
     generate_vmap_rule = True
 
     @staticmethod
     def forward(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if few(kappa, length):
-            k, reach = (one.detach().double().numpy() for one in (kappa, length))
+            k, reach = (entry.detach().double().numpy() for entry in (kappa, length))
             found = log_partition_and_slopes(k, reach, *_RULE, HEAD_TOLERANCE)
-            value, by_kappa, by_length = (torch.as_tensor(one, dtype=kappa.dtype) for one in found)
+            value, by_kappa, by_length = (torch.as_tensor(entry, dtype=kappa.dtype) for entry in found)
             return value, by_kappa, by_length
         if _is_looked_up(kappa, length):
             return _looked_up(kappa, length)
@@ -172,13 +172,13 @@ class _LogPartition(torch.autograd.Function):
 
 
 def refuse_bad_ratio(length: Float[Tensor, "*batch"]) -> None:
-    """Refuse a domain of so many or so few scales that squares of their number overflow or vanish.
+    """Raise ValueError for a ratio ``bound / d`` whose square overflows or underflows.
 
     Args:
         length: ``bound / d``.
 
     Raises:
-        ValueError: one is, where it can be seen.
+        ValueError: a ratio out of range, where values are checked; see :mod:`mkc_torch.functional`.
     """
     most = torch.finfo(length.dtype).max ** 0.4
-    refuse_out_of_range("bound / d", length.detach(), 1.0 / most, most, "[]", "are they in one unit?")
+    refuse_out_of_range("bound / d", length.detach(), 1.0 / most, most, "[]", "do they have the same unit?")

@@ -1,13 +1,13 @@
-"""How far outliers can move a fit under the MKC loss, and what that costs on good data.
+"""Robustness of the MKC loss: bound on the error that outliers cause, efficiency and breakdown point.
 
-Theorem 3, Propositions 1 and 2 and Corollary 2 of Li et al., "Multi-kernel Correntropy Regression" (2023), are about
-one coefficient, ``y_k = x_k θ° + v_k`` with N samples of which M have noise ``|v_k| <= ε d`` and regressors
-``|x_k| >= ζ``, the others being arbitrary. Efficiency and breakdown are those of an M-estimator with the fixed kernel
-width ``h = σ d``. All arguments broadcast.
+Theorem 3, Propositions 1 and 2 and Corollary 2 of Li et al., "Multi-kernel Correntropy Regression" (2023), treat a
+single coefficient, ``y_k = x_k θ° + v_k``. Of N samples, M have noise ``|v_k| <= ε d`` and regressors ``|x_k| >= ζ``;
+the others are arbitrary. Efficiency and breakdown point are those of an M-estimator with the fixed kernel width
+``h = σ d``. All arguments broadcast.
 
-Read with these corrections of the printed text: ``I(ε)`` is defined by ``v_k <= ε`` and needs ``|v_k| <= ε``, which
-(24) and Remark 4 use; φ is defined on q < p < 1, so that its limits are ``φ(q₊) = ∞`` and ``φ(1₋) = 0``, not
-``φ(0₊)``; and the index of the last sum of (26) is k. The formulas (22), (27) and (28) are right as printed.
+Corrections of the printed text: ``I(ε)`` is defined by ``v_k <= ε``, but (24) and Remark 4 need ``|v_k| <= ε``; φ is
+defined on q < p < 1, so its limits are ``φ(q₊) = ∞`` and ``φ(1₋) = 0``, not ``φ(0₊)``; and the index of the last sum of
+(26) is k. The formulas (22), (27) and (28) are right as printed.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ def _refuse(name: str, wanted: str, value: object, right: Tensor, advice: str) -
 def _positive(name: str, value: Tensor, *, zero: bool = False, infinite: bool = False) -> None:
     right = ((value > 0) | ((value == 0) & zero)) & (torch.isfinite(value) | infinite)
     wanted = ("not negative" if zero else "positive") + ("" if infinite else " and finite")
-    # a NaN is refused too, since it compares False
+    # a NaN is refused too, because it compares False
     _refuse(name, wanted, value.tolist(), right, "check its sign and its unit")
 
 
 def _numbers(**given: Tensor | float) -> tuple[Tensor, ...]:
-    """Tensors of one dtype from numbers and tensors; what is neither is refused by its name."""
+    """Tensors of a common dtype from numbers and tensors; TypeError names an argument that is neither."""
     for name, value in given.items():
         as_numbers(name, value, torch.float64)
     return as_computed(*given.values())
@@ -72,7 +72,7 @@ def _shares(num_samples: Tensor | int, num_inliers: Tensor | int, *, outliers: b
 
 
 def _log_gap(a: Tensor, q: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-    """log(p - q) for ``p = exp(-a)`` and ``r = 1 - q``, and where p exceeds q; 0 elsewhere."""
+    """log(p - q) for ``p = exp(-a)`` and ``r = 1 - q``, 0 where p <= q; and whether p exceeds q."""
     lost = -torch.expm1(-a)
     gap = r - lost
     valid = gap > 0
@@ -81,18 +81,18 @@ def _log_gap(a: Tensor, q: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def phi(p: Float[Tensor, "*batch"] | float, q: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch"]:
-    """``φ(p) = p log p / ((p - q) log(p - q))`` of (28), whose value 1 marks the optimal bandwidth.
+    """``φ(p) = p log p / ((p - q) log(p - q))`` of (28); φ = 1 at the optimal bandwidth.
 
-    It falls from infinity at p = q to 0 at p = 1. The paper calls that obvious; the proof is that the logarithmic
-    derivative of ``x log x`` is ``(1 + u) / x`` with ``u = 1 / log x`` and falls with x in (0, 1), its own derivative
-    being ``-(1 + u + u²) / x²``.
+    φ decreases from infinity at p = q to 0 at p = 1. The paper calls this obvious. Proof: the logarithmic derivative of
+    ``x log x`` is ``(1 + u) / x`` with ``u = 1 / log x``, and decreases for x in (0, 1) because its derivative is
+    ``-(1 + u + u²) / x²``.
 
     Args:
         p: ``exp(-ε² / (2 σ²))``, in (q, 1].
         q: ``(N - M) / M``, in [0, 1).
 
     Returns:
-        φ, of the broadcast shape; 1 for every p where q is 0.
+        φ, of the broadcast shape; 1 for every p if q is 0.
 
     Raises:
         ValueError: q outside [0, 1), or p outside (q, 1].
@@ -102,7 +102,7 @@ def phi(p: Float[Tensor, "*batch"] | float, q: Float[Tensor, "*batch"] | float) 
         tensor([2.4114, 1.0000, 0.3386])
     """
     p, q = _numbers(p=p, q=q)
-    _refuse("q", "in [0, 1)", q.tolist(), (q >= 0) & (q < 1), "it is outliers over inliers, (N - M) / M")
+    _refuse("q", "in [0, 1)", q.tolist(), (q >= 0) & (q < 1), "it is the ratio of outliers to inliers, (N - M) / M")
     _refuse("p", "in (q, 1]", p.tolist(), (p > q) & (p <= 1), "raise the bandwidth above `least_bandwidth`")
     gap = p - q
     divisor = torch.where(q > 0, gap * torch.log(gap), 1.0)
@@ -114,14 +114,14 @@ def least_bandwidth(
     num_samples: Int[Tensor, "*batch"] | int,
     num_inliers: Int[Tensor, "*batch"] | int,
 ) -> Float[Tensor, "*batch"]:
-    """The σ that Theorem 3 asks to be exceeded, ``ε / sqrt(2 log(M / (N - M)))``.
+    """The bandwidth that σ must exceed in Theorem 3, ``ε / sqrt(2 log(M / (N - M)))``.
 
     Args:
         epsilon: largest ``|v| / d`` of the inliers, >= 0.
         num_samples, num_inliers: N and M, with N/2 < M <= N.
 
     Returns:
-        The bandwidth, of the broadcast shape; 0 where ε is 0 or nothing is an outlier.
+        The bandwidth, of the broadcast shape; 0 where ε is 0 or there are no outliers.
 
     Raises:
         ValueError: ε negative or not finite, or M not more than half of N.
@@ -161,17 +161,17 @@ def error_bound(
     num_samples: Int[Tensor, "*batch"] | int,
     num_inliers: Int[Tensor, "*batch"] | int,
 ) -> Float[Tensor, "*batch"]:
-    """ξ of Theorem 3, (22): no outliers whatever move the minimiser of (21) farther than this from θ°.
+    """ξ of Theorem 3, (22): largest distance of the minimiser of (21) from θ° that outliers can cause.
 
-    It holds for the global minimiser, wherever the outliers are and whatever their regressors are, and for one
+    It holds for the global minimiser and for arbitrary outliers and regressors of outliers. It holds for a single
     coefficient; the paper has no bound for several.
 
     Args:
         sigma: bandwidth > 0; ``inf`` is least squares.
         d: scale > 0, in the unit of y.
         epsilon: largest ``|v_k| / d`` of the inliers, >= 0.
-        zeta: least ``|x_k|`` of the inliers, > 0 (Assumption 2, which inputs that pass through 0, like those of the
-            paper's example 1, do not meet).
+        zeta: smallest ``|x_k|`` of the inliers, > 0 (Assumption 2; inputs that pass through 0, as in example 1 of
+            the paper, violate it).
         num_samples, num_inliers: N and M, with N/2 < M <= N (Assumption 1; M = N is its limit, with ξ = 2 ε d / ζ).
 
     Returns:
@@ -202,13 +202,13 @@ def error_bound_slope(
     num_samples: Int[Tensor, "*batch"] | int,
     num_inliers: Int[Tensor, "*batch"] | int,
 ) -> Float[Tensor, "*batch"]:
-    """dξ/dσ, (27) and (28): negative, then positive (Proposition 1), and constant in the end (Proposition 2).
+    """dξ/dσ, (27) and (28): negative, then positive (Proposition 1), and constant in the limit (Proposition 2).
 
     Args:
         sigma, d, epsilon, zeta, num_samples, num_inliers: as in :func:`error_bound`.
 
     Returns:
-        The slope, of the broadcast shape. At ``sigma = inf`` its limit ``d sqrt(-2 log(1 - q)) / ζ``, for which the
+        The derivative, of the broadcast shape. At ``sigma = inf`` its limit ``d sqrt(-2 log(1 - q)) / ζ``, although the
         bound of least squares is infinite; ``-inf`` at or below :func:`least_bandwidth`; 0 where M = N.
 
     Raises:
@@ -229,9 +229,9 @@ def error_bound_slope(
 
 @torch.no_grad()
 def _optimal_gap(r: Tensor) -> Tensor:
-    """p - q at the root of φ(p) = 1, for r = 1 - q: by halving, since the sign of φ - 1 changes once."""
+    """p - q at the root of φ(p) = 1, for r = 1 - q, by bisection: φ - 1 has a single change of sign."""
     low, high = torch.zeros_like(r), r
-    for _ in range(1100):  # an interval from 0 is halved as often as float64 has exponents
+    for _ in range(1100):  # bisection down to 0 takes as many steps as float64 has exponents
         middle = 0.5 * (low + high)
         if bool(((middle == low) | (middle == high)).all()):
             break
@@ -246,10 +246,11 @@ def optimal_bandwidth(
     num_samples: Int[Tensor, "*batch"] | int,
     num_inliers: Int[Tensor, "*batch"] | int,
 ) -> Float[Tensor, "*batch"]:
-    """The σ of the least :func:`error_bound`, Corollary 2: where ``φ(exp(-ε² / (2 σ²))) = 1``.
+    """The σ of the smallest :func:`error_bound`, Corollary 2: where ``φ(exp(-ε² / (2 σ²))) = 1``.
 
     φ depends on M / N alone, so the bandwidth is proportional to ε: from ``ε / sqrt(2)`` for a single outlier among
-    many samples to infinity for one half. It protects from the worst outliers; a wider one is more efficient.
+    many samples to infinity for 50 % outliers. It protects from the worst outliers; a wider bandwidth is more
+    efficient.
 
     Args:
         epsilon: largest ``|v_k| / d`` of the inliers, > 0.
@@ -279,13 +280,13 @@ def least_error_bound(
     num_samples: Int[Tensor, "*batch"] | int,
     num_inliers: Int[Tensor, "*batch"] | int,
 ) -> Float[Tensor, "*batch"]:
-    """ξ at :func:`optimal_bandwidth`, in closed form ``(ε d / ζ) (1 + sqrt(p / (p - q)))`` since φ(p) = 1 there.
+    """ξ at :func:`optimal_bandwidth`; in closed form ``(ε d / ζ) (1 + sqrt(p / (p - q)))``, because φ(p) = 1 there.
 
     Args:
         d, epsilon, zeta, num_samples, num_inliers: as in :func:`error_bound`, with ε > 0 and M < N.
 
     Returns:
-        The least bound that any bandwidth gives, of the broadcast shape, without derivatives.
+        The smallest bound over all bandwidths, of the broadcast shape, without derivatives.
 
     Raises:
         ValueError: an argument out of its range.
@@ -319,8 +320,8 @@ def gaussian_efficiency(
 ) -> Float[Tensor, "*batch"]:
     """Asymptotic efficiency at Gaussian noise: the variance of least squares over that of the fit at this σ and d.
 
-    ``(E ψ')² / E ψ²`` for ``ψ(z) = z exp(-z² / (2 h²))`` is ``(1 - 1 / (1 + h²)²)^(3/2)`` with ``h = σ d / noise``. The
-    bandwidth is meant as given; where it is learned, as by MKC-EM, Gaussian data send it to infinity.
+    ``(E ψ')² / E ψ²`` for ``ψ(z) = z exp(-z² / (2 h²))`` is ``(1 - 1 / (1 + h²)²)^(3/2)`` with ``h = σ d / noise``. It
+    holds for a fixed bandwidth; a learned bandwidth, as by MKC-EM, goes to infinity on Gaussian data.
 
     Args:
         sigma: bandwidth > 0; ``inf`` is least squares.
@@ -341,13 +342,13 @@ def gaussian_efficiency(
         tensor([0.2160, 0.6495, 0.9406, 1.0000])
     """
     h = _relative_width(sigma, d, noise)
-    # 1 - 1 / (1 + h²)² in factors, exact for small h
+    # 1 - 1 / (1 + h²)² factored, accurate for small h
     share = 1.0 / (1.0 + h.pow(-2))
     return (share * (2.0 - share)).pow(1.5)
 
 
 def bandwidth_for_efficiency(efficiency: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch"]:
-    """The ``h = σ d`` of this :func:`gaussian_efficiency`, in standard deviations of the noise.
+    """The ``h = σ d`` at which :func:`gaussian_efficiency` has a value, in standard deviations of the noise.
 
     Args:
         efficiency: in (0, 1]; 1 gives ``inf``.
@@ -376,11 +377,11 @@ def gaussian_breakdown(
     d: Float[Tensor, "*batch"] | float = 1.0,
     noise: Float[Tensor, "*batch"] | float = 1.0,
 ) -> Float[Tensor, "*batch"]:
-    """Share of outliers at which the fit breaks down when the other samples have Gaussian noise, in the limit N → ∞.
+    """Breakdown point with Gaussian noise of the inliers, in the limit N → ∞: a share of outliers.
 
-    ``w / (1 + w)`` with the inliers' mean weight ``w = E exp(-e² / (2 σ² d²)) = h / sqrt(1 + h²)``, see
-    :func:`breakdown_point`. It says when the error is no longer bounded, not how large it is before: that grows with
-    the bandwidth (:func:`error_bound`), so that a wide one breaks down late and is far off by then.
+    ``w / (1 + w)`` with the inliers' mean weight ``w = E exp(-e² / (2 σ² d²)) = h / sqrt(1 + h²)``; see
+    :func:`breakdown_point`. Below it the error is bounded, but the bound grows with the bandwidth
+    (:func:`error_bound`): a wide bandwidth has a high breakdown point and a large error before it.
 
     Args:
         sigma, d, noise: as in :func:`gaussian_efficiency`.
@@ -406,27 +407,28 @@ def breakdown_point(
     d: Float[Tensor, "*batch"] | float,
     num_coefficients: int = 1,
 ) -> Float[Tensor, "*batch"]:
-    """Share of added outliers that this fit of one channel withstands, wherever they and their regressors are.
+    """Finite-sample breakdown point of a fit of a channel: the share of added outliers that it withstands.
 
-    Fewer than ``Σ w_k - (n - 1)`` added samples cannot carry the global minimiser of (13) away without limit: there is
-    more kernel weight at the fit than they and the n - 1 samples can have that a hyperplane at infinite coefficients
-    still passes. More than the greatest ``Σ w_k`` of any coefficients, in one far place, can.
+    Fewer than ``Σ w_k - (n - 1)`` added samples, wherever they are, keep the global minimiser of (13) bounded: a
+    hyperplane with infinite coefficients passes at most n - 1 of the samples, so that these and the added samples have
+    less kernel weight than the fit. More samples at a single far place than the largest ``Σ w_k`` of any coefficients
+    move it without limit.
 
     Args:
         error: residuals (*, N) of samples in general position, at the fit.
-        sigma: bandwidth > 0, of the batch's shape; ``inf`` is least squares, which one outlier breaks down.
+        sigma: bandwidth > 0, of the batch's shape; ``inf`` is least squares, which a single outlier breaks down.
         d: scale > 0, in the unit of ``error``, of the batch's shape.
-        num_coefficients: n.
+        num_coefficients: number n of coefficients.
 
     Returns:
-        ``m / (N + m)``, (*,), with m the fewest samples that are not ruled out to break the fit down.
+        ``m / (N + m)``, (*,), with m the smallest number of added samples that may break the fit down.
 
     Raises:
         ValueError: an error that is not finite, no samples, or a parameter out of range.
 
     References:
         Huber, "Finite sample breakdown of M- and P-estimators", Annals of Statistics 12 (1984) 119-126, for a location;
-        the n - 1 samples are the step from there to regression.
+        the n - 1 samples extend it to regression.
 
     Example:
         >>> breakdown_point(torch.linspace(-2, 2, 21), torch.tensor([0.5, 2.0, math.inf]), 1.0, num_coefficients=2)
@@ -440,7 +442,7 @@ def breakdown_point(
     _positive("sigma", sigma, infinite=True)
     _positive("d", d)
     num_coefficients = checked_whole("num_coefficients", num_coefficients, 1, "count the columns of X")
-    num_coefficients = min(num_coefficients, error.shape[-1] + 1)  # more determine no fewer than none
+    num_coefficients = min(num_coefficients, error.shape[-1] + 1)  # more coefficients leave no sample
     total = kernel_weight(error / d.unsqueeze(-1), inverse_square(sigma.unsqueeze(-1))).sum(-1)
     fewest = torch.ceil(total - (num_coefficients - 1)).clamp(min=0.0)
     return torch.where(torch.isfinite(sigma), fewest / (error.shape[-1] + fewest), 0.0)

@@ -1,7 +1,7 @@
-"""Whether residuals have heavier tails than a Gaussian, and the share of them beyond three scales.
+"""Test of residuals for tails heavier than a Gaussian's, and the share of errors beyond three scales.
 
-A finite σ does not show it: where the noise is Gaussian, the maximum-likelihood κ = 1/σ² is positive in about half of
-all samples. Twice the log-likelihood ratio against the Gaussian on the same domain does.
+A finite σ is not evidence of heavy tails: with Gaussian noise the maximum-likelihood κ = 1/σ² is positive in about half
+of all samples. The test statistic is twice the log-likelihood ratio against the Gaussian on the same domain.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ if TYPE_CHECKING:
 __all__ = ["GAUSSIAN_BELOW", "ChannelTails", "Tails", "assess_tails", "percent_with_error", "time_series_tails"]
 
 GAUSSIAN_BELOW = 2.71
-"""5 % point of the equal mixture of χ²₀ and χ²₁, as κ = 0 is on the boundary: Chernoff 1954, Self & Liang 1987."""
+"""5 % point of the equal mixture of χ²₀ and χ²₁, because κ = 0 is on the boundary: Chernoff 1954, Self & Liang 1987."""
 
 REACH_SCALES = 3.0
-"""Scales d beyond which an error counts as one in the tail."""
+"""Beginning of the tail, in scales d."""
 
 GAUSSIAN_SHARE = math.erfc(REACH_SCALES / math.sqrt(2.0))
-"""Share of the errors of a Gaussian beyond three standard deviations, 0.27 %."""
+"""Share of Gaussian errors beyond three standard deviations, 0.27 %."""
 
 _MAX_STEPS = 200
-"""Newton steps at most of each of the two fits."""
+"""Newton steps of each of the two fits, at most."""
 
 _TOLERANCE = 1e-13
-"""Nats per residual below which a Newton step ends a fit; a million residuals then leave the ratio exact to 1e-6."""
+"""Gain, in nats per residual, at which a fit has converged; the ratio of a million residuals is exact to 1e-6."""
 
 _MOST_CORRELATED = 1.0 - 1e-9
-"""Squared correlation of the estimates of κ and log d at most, so that their covariance stays finite."""
+"""Upper limit of the squared correlation of the estimates of κ and log d, to keep their covariance finite."""
 
 
 class ChannelTails(NamedTuple):
-    """The tails of one channel as plain numbers.
+    """Test of a channel's tails as plain numbers.
 
     Attributes:
         likelihood_ratio: twice the log-likelihood ratio of the MKC density and the Gaussian.
@@ -62,7 +62,7 @@ class ChannelTails(NamedTuple):
 
     @property
     def is_gaussian(self) -> bool:
-        """Whether the ratio is below 2.71, so that a Gaussian is not rejected at 5 %."""
+        """Whether the ratio is below 2.71: a Gaussian is not rejected at the 5 % level."""
         return self.likelihood_ratio < GAUSSIAN_BELOW
 
     def __str__(self) -> str:
@@ -75,7 +75,7 @@ class ChannelTails(NamedTuple):
 
 
 def percent_with_error(share: float, error: float) -> str:
-    """A share and its standard error in per cent, to the first digit of the error.
+    """A share and its standard error in per cent, rounded to the first digit of the error.
 
     Example:
         >>> percent_with_error(0.0412, 0.0058), percent_with_error(0.31, 0.021), percent_with_error(0.0031, 0.0002)
@@ -87,21 +87,21 @@ def percent_with_error(share: float, error: float) -> str:
 
 @dataclass(frozen=True)
 class Tails:
-    """The test of residuals for tails heavier than a Gaussian's, as :func:`assess_tails` gives it.
+    """Test of residuals for tails heavier than a Gaussian's: the result of :func:`assess_tails`.
 
-    ``str(tails)`` is a text of one line for each channel.
+    ``str(tails)`` has a line for each channel.
 
     Attributes:
         likelihood_ratio: twice the log-likelihood of the MKC fit minus that of the Gaussian fit on the same domain,
             >= 0, (*, m).
-        is_gaussian: whether it is below 2.71, (*, m): the Gaussian is not rejected at 5 %.
+        is_gaussian: whether the ratio is below 2.71, (*, m): the Gaussian is not rejected at the 5 % level.
         share_beyond: probability of an error beyond 3 d, in [0, 1], (*, m): of the MKC fit, or of the Gaussian fit
             where ``is_gaussian``, 0.0027 on a wide domain.
-        share_error: its standard error, (*, m). Where ``is_gaussian``, what the test may have missed: ``share_beyond +
-            2 share_error`` is at least two standard errors above the share of the MKC fit.
+        share_error: standard error of ``share_beyond``, (*, m). Where ``is_gaussian``, it covers what the test may have
+            missed: ``share_beyond + 2 share_error`` is at least two standard errors above the share of the MKC fit.
         share_observed: weighted share of the given residuals beyond 3 d, (*, m). If it differs from ``share_beyond`` by
             several ``share_error``, the tail is not flat and the MKC density does not describe it.
-        sigma, d: of the MKC fit, (*, m).
+        sigma, d: bandwidth and scale of the MKC fit, (*, m).
         bound: half-width of the domain of both fits, (*, m).
         count: number of independent residuals that the test assumes, (*, m).
 
@@ -122,7 +122,7 @@ class Tails:
 
     @property
     def channels(self) -> tuple[ChannelTails, ...]:
-        """The test of each channel in plain numbers, batches one after the other."""
+        """Test of each channel as plain numbers, batches flattened."""
         numbers = (self.likelihood_ratio, self.share_beyond, self.share_error)
         return tuple(map(ChannelTails, *(t.flatten().tolist() for t in numbers)))
 
@@ -144,33 +144,33 @@ def assess_tails(
 ) -> Tails:
     """Test residuals for tails heavier than a Gaussian's, and estimate the share of errors beyond 3 d.
 
-    Fits the MKC density and the Gaussian (σ = ∞) by maximum likelihood on the same domain. A Gaussian is rejected where
-    twice the log-likelihood ratio reaches 2.71, the 5 % point of the equal mixture of χ²₀ and χ²₁: κ = 1/σ² = 0 is on
-    the boundary of the parameters. Of Gaussian samples 5 % are rejected asymptotically and fewer of small samples
-    (3 % of 500 residuals, 1.5 % of 100).
+    The MKC density and the Gaussian (σ = ∞) are fitted by maximum likelihood on the same domain. The Gaussian is
+    rejected if twice the log-likelihood ratio reaches 2.71, the 5 % point of the equal mixture of χ²₀ and χ²₁ (κ =
+    1/σ² = 0 is on the boundary of the parameter space). The rate of false rejections is 5 % asymptotically and lower in
+    small samples: 3 % at 500 residuals, 1.5 % at 100.
 
-    Tails lighter than a Gaussian's, such as those of uniform errors, pass as Gaussian. The test assumes independent
-    residuals of mean zero. Autocorrelated residuals hold less information than their number: give the effective number
-    of independent residuals as ``count``, or expect more than 5 % false rejections.
+    Tails lighter than a Gaussian's, such as those of uniform errors, are not rejected. The test assumes independent
+    residuals of mean zero. Autocorrelated residuals contain less information: pass the effective number of independent
+    residuals as ``count``, or expect more than 5 % false rejections.
 
-    The standard error of the share is that of the delta method with the Fisher information of the MKC density. It does
-    not include the bias of a density that is not the right one, which ``share_observed`` shows: of Gaussian noise with
-    1 % (5 %) of uniform outliers up to 10 d the share is 2.0 % (5.2 %), where 1.4 % (4.5 %) are observed.
+    The standard error of the share comes from the delta method with the Fisher information of the MKC density. It does
+    not include the bias of a misspecified density, which ``share_observed`` reveals: for Gaussian noise with 1 % (5 %)
+    of uniform outliers up to 10 d the share is 2.0 % (5.2 %), whereas 1.4 % (4.5 %) are observed.
 
     Computed in float64; the result has the dtype of ``error``.
 
     Args:
         error: residuals, in any unit; a tensor, a NumPy array or a DataFrame.
         weight: non-negative weights of the residuals, (*, N, m) or (N, 1).
-        bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
-            :func:`mkc_torch.density.domain.domain_rule`. The ratio depends on it a little: compare at equal bounds.
-        d_min: floor under d of both fits, in the unit of ``error``; default a tenth of the robust scale.
+        bound: half-width of the domain, in the unit of ``error``, at least two robust scales; default from
+            :func:`mkc_torch.density.domain.domain_rule`. The ratio depends on it slightly: compare at equal bounds.
+        d_min: floor of d in both fits, in the unit of ``error``; default a tenth of the robust scale.
         count: number of independent residuals, at most N or the sum of the weights; default N, and with weights
             ``(Σw)² / Σw²`` (Kish).
 
     Raises:
-        TypeError: residuals or weights that are no real numbers, or a parameter that is no number.
-        ValueError: fewer than two residuals, non-finite ones, a channel of zeros alone, a parameter out of range, or
+        TypeError: residuals or weights that are not real numbers, or a parameter that is not a number.
+        ValueError: fewer than two residuals, non-finite residuals, a channel of zeros, a parameter out of range, or
             shapes that do not fit.
 
     References:
@@ -199,13 +199,13 @@ def assess_tails(
         return maximise(error, share, start, max_iter=_MAX_STEPS, tol=_TOLERANCE).state
 
     mkc, gaussian = fitted(None), fitted(torch.zeros_like(scale))
-    # the Gaussian is one of the MKC densities, so a less likely fit ended at a local maximum
+    # the Gaussian is a special case of the MKC density, so a less likely fit is a local maximum
     mkc = _where(mkc.value < gaussian.value, mkc, gaussian)
     ratio = (2.0 * number * (gaussian.value - mkc.value)).clamp(min=0.0)
     is_gaussian = ratio < GAUSSIAN_BELOW
     free_share, free_error = _share_beyond(mkc, number)
     gaussian_share, gaussian_error = _share_beyond(gaussian, number)
-    # two errors above the Gaussian's share reach at least as far as two errors above that of the free fit
+    # share + 2 errors of the Gaussian is at least share + 2 errors of the free fit
     undetected = torch.maximum(gaussian_error, 0.5 * (free_share - gaussian_share) + free_error)
     probability = torch.where(is_gaussian, gaussian_share, free_share)
     standard_error = torch.where(is_gaussian, undetected, free_error)
@@ -221,15 +221,15 @@ def assess_tails(
 
 
 def time_series_tails(error: Float[Tensor, "N m"]) -> tuple[ChannelTails, ...]:
-    """The tails of each channel of a time series, counting as many independent residuals as its autocorrelation leaves.
+    """Test of each channel's tails in a time series, with the effective sample size of its autocorrelation.
 
-    The autocorrelation is that of ``|e| / (|e| + scale)``, which outliers do not dominate.
+    The autocorrelation is that of ``|e| / (|e| + scale)``, which is robust to outliers.
 
     Args:
         error: residuals in the order of time.
 
     Returns:
-        A test a channel; empty where the residuals of a channel are all 0, an exact fit.
+        A test per channel; empty if a channel's residuals are all 0 (an exact fit).
 
     Example:
         >>> error = torch.randn(500, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -245,12 +245,12 @@ def time_series_tails(error: Float[Tensor, "N m"]) -> tuple[ChannelTails, ...]:
 
 
 def _count(residuals: Residuals, count: float | Tensor | None) -> Float[Tensor, "*batch m"]:
-    """Number of independent residuals: the given one, or Kish's effective sample size."""
+    """Number of independent residuals: ``count``, or Kish's effective sample size."""
     error, weight, share, scale = residuals
     number = channel_values("count", count, error)
     if number is None:
         return torch.full_like(scale, error.shape[-2]) if share is None else share.square().sum(-2).reciprocal()
-    # weights may be numbers of repetitions
+    # weights may be counts of repetitions
     most = error.shape[-2] if weight is None else max(error.shape[-2], float(weight.sum(-2).max()))
     if bool((number > most).any()):
         raise ValueError(
@@ -261,7 +261,7 @@ def _count(residuals: Residuals, count: float | Tensor | None) -> Float[Tensor, 
 
 
 def _refuse_zeros(error: Float[Tensor, "*batch N m"]) -> None:
-    """Refuse a channel whose residuals are all 0: it has no scale that tails could be measured in."""
+    """Raise ValueError for a channel whose residuals are all 0: its tails have no scale."""
     exact = (error == 0).all(-2)
     if bool(exact.any()):
         index = tuple(exact.nonzero()[0].tolist())
@@ -273,7 +273,7 @@ def _refuse_zeros(error: Float[Tensor, "*batch N m"]) -> None:
 
 
 def _where(condition: Bool[Tensor, "*batch m"], yes: DensityState, no: DensityState) -> DensityState:
-    """Channel by channel one of two states of the same residuals."""
+    """``yes`` where the condition holds, else ``no``, per channel."""
     return replace(
         no,
         kappa=torch.where(condition, yes.kappa, no.kappa),
@@ -283,7 +283,7 @@ def _where(condition: Bool[Tensor, "*batch m"], yes: DensityState, no: DensitySt
 
 
 class _Moments(NamedTuple):
-    """Integral of the density and means of the derivatives of minus the energy by κ and by log d, each (*, m)."""
+    """Integral of the density, and moments of the derivatives of the negative energy by κ and log d, each (*, m)."""
 
     partition: Tensor
     kappa: Tensor
@@ -300,7 +300,7 @@ def _moments(kappa: Float[Tensor, "*batch m"], length: Float[Tensor, "*batch m"]
     each = kappa.unsqueeze(-1)
     density = torch.exp(-energy_value(nodes, each))
     by_kappa, by_log_d = -energy_dkappa(nodes, each), nodes * energy_dz(nodes, each)
-    # on the flat tail the energy is 1 / κ, whatever d is
+    # on the flat tail the energy is 1 / κ for every d
     tail_by_kappa = torch.where(tail > 0, kappa, 1.0).pow(-2)
     zero = torch.zeros_like(tail)
     partition = integrate(density, tail, length, weights)
@@ -321,7 +321,7 @@ def _moments(kappa: Float[Tensor, "*batch m"], length: Float[Tensor, "*batch m"]
 def _share_beyond(
     state: DensityState, count: Float[Tensor, "*batch m"]
 ) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
-    """Probability beyond 3 d and its standard error by the delta method; a parameter at its limit counts as known."""
+    """Probability beyond 3 d and its standard error by the delta method; a parameter at its limit is taken as known."""
     kappa = state.kappa
     length = torch.exp(state.log_bound - state.log_d)
     inner_length = length.clamp(max=REACH_SCALES)
@@ -337,7 +337,7 @@ def _share_beyond(
     tiny = torch.finfo(kappa.dtype).tiny
     fisher_kappa = (whole.kappa_kappa - whole.kappa.square()).clamp(min=tiny)
     fisher_log_d = (whole.log_d_log_d - whole.log_d.square()).clamp(min=tiny)
-    # normalised, since the information on κ may be orders of magnitude smaller than that on log d
+    # normalised, because the information on κ may be orders of magnitude smaller than that on log d
     correlation = (whole.kappa_log_d - whole.kappa * whole.log_d) * fisher_kappa.rsqrt() * fisher_log_d.rsqrt()
     correlation = torch.where(free_d & (kappa < KAPPA_MAX), correlation, 0.0)
     a, b = slope_kappa * fisher_kappa.rsqrt(), slope_log_d * fisher_log_d.rsqrt()

@@ -1,4 +1,4 @@
-"""Diagnosis: where simulation and recording differ, what physics was left out, and how much better it fits with it."""
+"""Diagnosis: which physics a simulation leaves out of a recording, and how much the fit improves with it."""
 
 from mkc_torch.diagnosis.diagnose import diagnose
 from mkc_torch.diagnosis.io.model import DiagnosedModel

@@ -1,4 +1,4 @@
-"""A :class:`Diagnosis` from what the searches found and what was told of it."""
+"""Build a :class:`Diagnosis` from the searches and the results of the tests of evidence."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from mkc_torch.diagnosis.verdict import (
     FitAssessment,
     assess,
     assess_baseline,
-    lost_from_the_start,
+    impossible_rotations,
     noise_environment,
     verdict_of,
 )
@@ -46,28 +46,28 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 __all__ = ["DiagnosisInputs", "build_diagnosis", "with_search_notes"]
 
 _MOMENT_S = 1.0
-"""Seconds that a part of a stopped diagnosis may take that is of use beside what was found."""
+"""Time limit in seconds for each optional part of a stopped diagnosis."""
 
 _HINTED = 0.15
-"""p-value up to which the strongest candidate is told, though it does not count."""
+"""p-value up to which the strongest candidate is mentioned although it is not a finding."""
 
 
-_DROPPED = ("not confirmed", "nearest in the catalogue")
-"""Grades of findings that are left out where their size is 0 within its standard error."""
+_DROPPED = ("unconfirmed", "nearest")
+"""Grades of findings that are dropped if their size is 0 within its standard error."""
 
 
 @dataclass(frozen=True)
 class DiagnosisInputs:
-    """All that a diagnosis is assembled from beside the answers of the tests.
+    """Everything that a diagnosis is built from, except the results of the tests.
 
     Attributes:
-        simulation: as it was given.
-        drivers: the recorded columns, and what is to be said of them.
+        simulation: as given by the user.
+        drivers: the recorded columns that can drive an effect, and warnings about the others.
         terms: the candidates.
-        base: the simulation alone, in the noise of the world.
-        final: with all findings, under the pushes that are left.
-        asked: for.
-        cut: whether there was more to be found than was asked for.
+        base: the fitted simulation without findings, with its noise.
+        final: the fit with all findings, under the remaining process noise.
+        options: options of the search.
+        cut: whether there was a further finding beyond the limit.
         stop: why the search was stopped before its end, and what was not done.
     """
 
@@ -76,39 +76,39 @@ class DiagnosisInputs:
     terms: tuple[Term, ...]
     base: ProcessNoiseFit
     final: FittedModel
-    asked: SearchOptions
+    options: SearchOptions
     cut: bool
     stop: Stop | None = None
 
     @property
     def in_short(self) -> bool:
-        """Whether parts that take long are left out."""
-        return self.asked.quick or self.stop is not None
+        """Whether slow parts are left out."""
+        return self.options.quick or self.stop is not None
 
 
 def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosis:
-    """The diagnosis, with advice.
+    """Build the diagnosis, with its verdict and advice.
 
     Args:
-        whole: what it is of.
-        answers: what the tests of evidence say, of what case.
+        whole: the inputs.
+        answers: results of the tests of evidence, and their context.
     """
-    case, prepared, asked = answers.case, answers.case.prepared, whole.asked
-    first, final, settings = case.first, case.final, asked.settings
-    known = _around(whole)
+    case, prepared, options = answers.case, answers.case.prepared, whole.options
+    first, final, settings = case.first, case.final, options.settings
+    known = _assessment(whole)
     unfit = known.unfit(settings.evidence)
     tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
-    without_size = [one for one in tried if one.grade in _DROPPED and is_zero_within_error(one)]
-    findings = tuple(one for one in tried if one not in without_size)
+    without_size = [finding for finding in tried if finding.grade in _DROPPED and is_zero_within_error(finding)]
+    findings = tuple(finding for finding in tried if finding not in without_size)
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
-        level=asked.level,
+        level=options.level,
         noise=noise_summary(final, settings.noise),
         candidates_tried=0 if first is None and whole.stop is not None else len(whole.terms),
-        surrogates=0 if asked.quick else asked.surrogates,
-        seed=asked.seed,
+        surrogates=0 if options.quick else options.surrogates,
+        seed=options.seed,
         p_value=_p_value(first, whole),
         verdict="adequate",
         findings=findings,
@@ -116,32 +116,32 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
         corrected=case.spread(case.held_out[-1]),
         advice=(),
         warnings=(
-            *notices(whole.stop, quick=asked.quick),
+            *notices(whole.stop, quick=options.quick),
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
             *prepared.warnings,
             *whole.drivers.warnings,
             *_time_warnings(prepared),
             *answers.warnings,
-            *(_no_size(one) for one in without_size),
-            *(doubt for one in findings for doubt in one.doubts),
+            *(_no_size(finding) for finding in without_size),
+            *(doubt for finding in findings for doubt in finding.doubts),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),
         model=model_of(final, whole.simulation),
         evidence=answers.of_all,
-        world=_world(whole, known, unfit=unfit),
-        quick=asked.quick,
+        environment=_environment(whole, known, unfit=unfit),
+        quick=options.quick,
         stop=whole.stop,
     )
-    there = first is not None and first.p_value <= asked.level and not findings
+    there = first is not None and first.p_value <= options.level and not findings
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
-    # of a trajectory it has been asked for what pushes it
+    # for differential equations the fitted process noise has accounted for correlation already
     white = known.noise is not None or _white(diagnosis)
     verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
     if whole.stop is not None and verdict != "unfit":
-        verdict = "unexplained"  # nobody knows what the rest of the search would have found
+        verdict = "unexplained"  # the rest of the search might have found more
     diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
@@ -149,75 +149,75 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
 def _finding(
     found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs, answers: EvidenceReport
 ) -> Finding:
-    """A finding, with what the tests say of it, its shape and its grade."""
-    quick = whole.asked.quick
+    """Return a finding with its evidence, shape check and grade."""
+    quick = whole.options.quick
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
     if whole.in_short:
         return replace(finding, grade=grade_in_short(finding))
     shape = None
     if isinstance(whole.final.model.prepared, PreparedDynamics):
-        shape = shape_of(whole.final, number, whole.terms, whole.asked.settings.evidence)
+        shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
     grade = grade_of(finding)
     if shape is not None and shape.curve is not None:
-        grade = "nearest in the catalogue"
+        grade = "nearest"
     return replace(finding, grade=grade, shape=shape)
 
 
-def _around(whole: DiagnosisInputs) -> FitAssessment:
-    """What stands around the fits; of a stopped search no more than is known in a moment."""
-    settings, declared = whole.asked.settings.noise, whole.asked.declared
+def _assessment(whole: DiagnosisInputs) -> FitAssessment:
+    """Assess the fits; after a stop only as far as the time limit of a part allows."""
+    settings, declared = whole.options.settings.noise, whole.options.declared
     if whole.stop is None:
         return assess(whole.base, whole.final, declared, settings)
     known = within(_MOMENT_S, partial(assess, whole.base, whole.final, declared, settings))
     if known is not None:
         return known
-    # how the simulation follows with what was found is not known, so it is not called unfit either
+    # the goodness of fit with the findings is unknown, so the verdict cannot be unfit
     follows = () if whole.final.model.terms else assess_baseline(whole.base, declared)
-    return FitAssessment(follows, (), None, lost_from_the_start(whole.base))
+    return FitAssessment(follows, (), None, impossible_rotations(whole.base))
 
 
-def _world(whole: DiagnosisInputs, known: FitAssessment, *, unfit: bool) -> NoiseEnvironment:
+def _environment(whole: DiagnosisInputs, known: FitAssessment, *, unfit: bool) -> NoiseEnvironment:
     if whole.stop is None:
         return noise_environment(whole.base, whole.final, known, unfit=unfit)
-    world = within(_MOMENT_S, partial(noise_environment, whole.base, whole.final, known, unfit=unfit))
-    return NoiseEnvironment(known.follows, starts=whole.base.starts) if world is None else world
+    noise = within(_MOMENT_S, partial(noise_environment, whole.base, whole.final, known, unfit=unfit))
+    return NoiseEnvironment(known.follows, starts=whole.base.starts) if noise is None else noise
 
 
 def _p_value(first: SearchResult | None, whole: DiagnosisInputs) -> float | None:
-    """Of the strongest candidate; None where no noise was drawn."""
-    if whole.asked.quick or (first is None and whole.stop is not None):
+    """The p-value of the strongest candidate; None without surrogates."""
+    if whole.options.quick or (first is None and whole.stop is not None):
         return None
     return 1.0 if first is None else first.p_value
 
 
-def _sure(p_value: float | None) -> str:
-    return "it pays its price in likelihood" if p_value is None else f"p = {p_value:.2g} after the whole search"
+def _significance(p_value: float | None) -> str:
+    return "its likelihood gain exceeds its penalty" if p_value is None else f"p = {p_value:.2g} after the whole search"
 
 
 def _no_size(finding: Finding) -> str:
     return (
-        f"{finding.effect}: {_sure(finding.p_value)}, but in the free run its size is 0 within its standard error, so "
-        "it does not count as a finding."
+        f"{finding.effect}: {_significance(finding.p_value)}, but in the open-loop fit its size is 0 within its "
+        "standard error, so it does not count as a finding."
     )
 
 
 def _white(diagnosis: Diagnosis) -> bool:
-    """Whether what is left over is white."""
-    told = next((said.value for said in diagnosis.evidence if said.test == "whiteness"), None)
-    return not told or all(one.lag == 0 for one in told.values())
+    """Whether the residual is white."""
+    channels = next((result.value for result in diagnosis.evidence if result.test == "whiteness"), None)
+    return not channels or all(channel.lag == 0 for channel in channels.values())
 
 
 def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis:
-    """With what the last search found that does not count, and why there was no other."""
+    """Add warnings about rejected candidates, and about why the search ended."""
     more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
     if search.given_up:
-        more.append(f"The search beside what was found was given up. {search.given_up}")
+        more.append(f"The search for further findings failed. {search.given_up}")
     if search.cut:
         more.append(
-            f"There is more structure beside the {len(search.found)} findings, which are as many as were asked for; "
-            "ask for more with `max_findings`."
+            f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "
+            "it."
         )
     return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 
@@ -247,21 +247,21 @@ def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
     shape = described(located.term.effect, located.term.shape)
     what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
-        f"{what}: {_sure(None if quick else located.p_value)}, but it does not predict blocks better that the fit has "
-        "not seen, so it does not count as a finding."
+        f"{what}: {_significance(None if quick else located.p_value)}, but it does not predict held-out blocks better, "
+        "so it does not count as a finding."
     )
 
 
 def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
-    """What would explain what is left best, and how much more of the recording would show it."""
+    """Describe the best candidate above the level, and how long a recording would decide about it."""
     if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
         return []
     shape = described(first.term.effect, first.term.shape)
     what = f"{called(first.term)} ({shape})" if shape else called(first.term)
     return [
-        f"{what} would explain what is left best, but noise and pushes make as much of it by chance: p = "
-        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would show it, if it is "
-        "that."
+        f"{what} explains the residual best, but measurement and process noise gain as much by chance: p = "
+        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide whether it "
+        "is real."
     ]
 
 
@@ -269,7 +269,7 @@ def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:
     if prepared.recording.time is not None:
         return ()
     return (
-        "The recording has no column `time`: sample numbers stand in for seconds, and samples count as evenly spaced.",
+        "The recording has no column `time`: sample numbers replace seconds, and samples are taken as evenly spaced.",
     )
 
 

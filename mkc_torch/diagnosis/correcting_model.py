@@ -1,4 +1,4 @@
-"""What a diagnosis leaves for other recordings, as its result knows it."""
+"""The interface of the corrected simulation that a diagnosis returns."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ __all__ = ["CorrectingModel"]
 
 
 class CorrectingModel(nn.Module):
-    """A simulation's sensor or system with the findings in it; :class:`mkc_torch.diagnosis.DiagnosedModel` is one."""
+    """A simulation's sensor or system with the findings in it; see :class:`mkc_torch.diagnosis.DiagnosedModel`."""
 
     @abstractmethod
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
-        """The corrected columns of a recording, and sentences about what does not carry over."""
+        """Return the corrected columns of a recording, and sentences about findings that do not transfer to it."""
 
     @abstractmethod
     def to_json(self) -> str:
-        """The text of model.json."""
+        """Return the text of model.json."""
 
     @abstractmethod
     def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
-        """The simulation with the findings as Python."""
+        """Return the simulation with the findings as Python source."""

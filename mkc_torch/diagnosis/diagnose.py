@@ -1,4 +1,4 @@
-"""Diagnose a recording against a simulation: locate the mismatch, name it, model it, show the fit improve."""
+"""Diagnose a recording against a simulation: locate the mismatch, name it, model it, measure the improvement."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.parallel import common_parts
 from mkc_torch.diagnosis.model.process_noise import choose_input_hold, estimate_noise, fit_baseline, open_loop
-from mkc_torch.diagnosis.partial_diagnosis import cut_short, nothing_known
+from mkc_torch.diagnosis.partial_diagnosis import cut_short, error_without_fit
 from mkc_torch.diagnosis.partial_result import PartialResult
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.search.own_noise import noise_of_fit
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
-from mkc_torch.diagnosis.verdict import assess_baseline, lost_from_the_start
+from mkc_torch.diagnosis.verdict import assess_baseline, impossible_rotations
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
@@ -44,13 +44,13 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 __all__ = ["diagnose"]
 
 LEVEL = 0.05
-"""Rate of false alarms, if none is asked for."""
+"""Default rate of false alarms."""
 
 SURROGATES = 99
-"""Draws of noise for each p-value, if no number is asked for."""
+"""Default number of surrogates for each p-value."""
 
 MAX_FINDINGS = 3
-"""Findings at most, if no number is asked for."""
+"""Default limit on the number of findings."""
 
 
 def diagnose(
@@ -69,42 +69,41 @@ def diagnose(
     time_limit: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Diagnosis:
-    """What a simulation lacks, by one recording of what it simulates, or by several together.
+    """Find the physics that a simulation leaves out of a recording, or of several recordings together.
 
-    The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest
-    one is judged by the same search on draws of the fitted noise, and by whether it predicts blocks that the fit has
-    not seen; what passes is kept, refitted jointly, and the search goes on beside it. Where nothing passes, whatever
-    the catalogue, a wander that moves a sensor's axes along one direction is told as "unknown": a cause that no column
-    recorded.
+    The simulation's own parameters are refitted with every candidate: effect × driver × shape. The strongest candidate
+    has to pass two tests: the same search on surrogates of the fitted noise, and the prediction of held-out blocks. A
+    candidate that passes is a finding; it is refitted jointly, and the search continues with it in the model. If no
+    candidate of any catalogue passes, a drift that moves a sensor's axes along one direction is reported as "unknown":
+    its cause is in no recorded column.
 
-    Several recordings of one system are diagnosed together: one set of parameters and of findings for all of them, and
-    states at the start for each, and offsets of the outputs, as far as they are determined. Physics repeats from run to
-    run, slow noise and disturbances do not. Of a simulation without states the recordings follow one another on one
-    clock; a magnetometer has one offset in all of them.
+    Several recordings of one system share their parameters and findings. Each has its own initial states, and its own
+    offsets of the outputs, as far as these can be determined. Physics repeats from run to run; slow noise and
+    disturbances do not. For a simulation without states the recordings follow one another on one clock; a
+    magnetometer has one offset for all of them.
 
     Args:
-        simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
-        recording: with named columns, see :class:`mkc_torch.Recording`; or a sequence of recordings with the same
-            columns in the same units.
-        effects: the catalogue to search; :data:`mkc_torch.effects.CATALOGUE` and whatever a user adds.
+        simulation: the model of the recorded system, such as :class:`mkc_torch.simulation.Magnetometer`.
+        recording: named columns, see :class:`mkc_torch.Recording`; or a sequence of recordings with the same columns
+            in the same units.
+        effects: the catalogue to search; :data:`mkc_torch.effects.CATALOGUE` and a user's own effects.
         level: rate of false alarms, in (0, 1).
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
-        max_findings: findings at most.
-        seed: of the draws.
-        settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. What was measured of
-            false alarms and power was measured with the default.
-        noise: standard deviation of the sensor's white noise, by the output's name and in its unit, where it is known;
-            estimated otherwise.
-        between: what an input does between two samples, "held" or "linear", where it is known; otherwise whichever is
-            likelier. Of differential equations only.
-        quick: a first look that draws no noise: candidates count by their likelihood's price alone, leading ones are
-            refitted from fewer starts, and tests of evidence that take long are left out. There are no p-values then,
-            and nobody knows the rate of false alarms.
-        time_limit: seconds after which the search is stopped; what is known then is returned, and ``stop`` says what
-            was not done. None for no limit.
-        progress: called with what is being done, as each stage begins. Where it has a method
-            ``count(thing, done, total)`` too, that is called with how many of the things that a stage is made of are
-            done: candidates that are fitted, say.
+        max_findings: limit on the number of findings.
+        seed: of the random draws.
+        settings: thresholds by stage, see :class:`mkc_torch.diagnosis.Settings`. The published rates of false alarms
+            and the power were measured with the default.
+        noise: known standard deviations of the sensors' white noise, by output, in the output's unit; the others are
+            estimated.
+        between: known input holds between two samples, "held" or "linear", by input; for the others the more likely
+            hold is used. For differential equations only.
+        quick: True for a quick look without surrogates: candidates are accepted by likelihood less a penalty, leading
+            candidates are refitted from fewer starts, and slow tests of evidence are left out. There are no p-values,
+            and the rate of false alarms is unknown.
+        time_limit: seconds after which the search stops and returns what is known; ``stop`` lists what was not done.
+            None for no limit.
+        progress: called with the name of each stage as it begins. If it has a method ``count(thing, done, total)``,
+            that method is called with the progress within a stage, such as the number of fitted candidates.
 
     Returns:
         The diagnosis.
@@ -112,7 +111,7 @@ def diagnose(
     Raises:
         TypeError: an argument of another kind: the name of a simulation, of a file or of an effect, or a class.
         ValueError: an argument out of range, too few samples, recordings whose columns or units differ, or a recording
-            that the simulation refuses.
+            that the simulation rejects.
         MissingColumnError: the recording lacks a column that the simulation needs.
         TimeoutError: the time limit was over before the simulation's first fit had ended.
 
@@ -147,16 +146,16 @@ def diagnose(
     prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
-    asked = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
-    known = PartialResult(simulation, effects, names, asked, run_counts(several) if names else ())
+    options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
+    known = PartialResult(simulation, effects, names, options, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit
     with limited(limit, begin=begin) as deadline, counting(progress):
         try:
             return _diagnosed(known, prepared, where, progress)
         except Stopped as stopped:
             reason, seconds = stopped.reason, deadline.elapsed
-    if known.world is None:
-        raise nothing_known(reason, limit, where)
+    if known.baseline is None:
+        raise error_without_fit(reason, limit, where)
     progress("writing down what is known")
     return cut_short(known, reason, seconds)
 
@@ -164,53 +163,53 @@ def diagnose(
 def _diagnosed(
     known: PartialResult, prepared: PreparedSimulation, where: str, progress: Callable[[str], object]
 ) -> Diagnosis:
-    """The diagnosis, unless it is stopped; ``known`` has what is known then."""
-    asked = known.asked
-    declared, fixed, settings = asked.declared, asked.fixed, asked.settings
-    generator = torch.Generator().manual_seed(asked.seed)
+    """Run the diagnosis; ``known`` holds the partial result if the run is stopped."""
+    options = known.options
+    declared, fixed, settings = options.declared, options.fixed, options.settings
+    generator = torch.Generator().manual_seed(options.seed)
     if isinstance(prepared, PreparedDynamics):
-        prepared = prepared.holding(fixed)
-        if asked.quick:
-            known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1), judged=False)
+        prepared = prepared.with_input_hold(fixed)
+        if options.quick:
+            known.options = options = replace(options, max_findings=min(options.max_findings, 1), judged=False)
     progress("fitting the simulation alone")
-    world = fit_baseline(prepared, declared, settings.noise, known.keep_world)
-    known.world = world = choose_input_hold(world, declared, fixed, settings.noise)
+    baseline = fit_baseline(prepared, declared, settings.noise, known.keep_baseline)
+    known.baseline = baseline = choose_input_hold(baseline, declared, fixed, settings.noise)
     known.fitted = True
-    base = world.fit
+    base = baseline.fit
     _refuse_no_noise(base, where)
     finer = with_smaller_step(base, settings.noise)
     if finer is not None:
-        return _diagnosed(known.anew(), finer, where, progress)
+        return _diagnosed(known.restart(), finer, where, progress)
     terms = known.candidates[1]
-    if poor_fits(assess_baseline(world, declared), settings.evidence.followed):
-        # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
-        known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1))
-    hopeless = lost_from_the_start(world)
+    if poor_fits(assess_baseline(baseline, declared), settings.evidence.followed):
+        # a poor fit may lack a single effect; further findings wait until the simulation fits with it
+        known.options = options = replace(options, max_findings=min(options.max_findings, 1))
+    hopeless = impossible_rotations(baseline)
     progress(f"trying {len(terms)} effects")
     terms = () if hopeless else terms
-    search = first_step(base, terms, asked, generator, world.free, known.keep_search)
-    likelier = None if search.first is None else search.first.alone
+    search = first_step(base, terms, options, generator, baseline.free, known.keep_search)
+    refitted_noise_fit = None if search.first is None else search.first.without_candidate
     noise = (
         None
-        if likelier is None
-        else estimate_noise(likelier, declared, settings.noise, noise_of_fit(likelier, declared))
+        if refitted_noise_fit is None
+        else estimate_noise(refitted_noise_fit, declared, settings.noise, noise_of_fit(refitted_noise_fit, declared))
     )
-    if likelier is not None and noise is not None and noise.observer is not None:
-        progress(f"trying {len(terms)} effects under a likelier noise")
-        known.world = world = replace(world, fit=likelier, noise=noise)
-        base = likelier
-        search = first_step(base, terms, asked, generator, world.free, known.keep_search)
+    if refitted_noise_fit is not None and noise is not None and noise.observer is not None:
+        progress(f"trying {len(terms)} effects under a more likely noise model")
+        known.baseline = baseline = replace(baseline, fit=refitted_noise_fit, noise=noise)
+        base = refitted_noise_fit
+        search = first_step(base, terms, options, generator, baseline.free, known.keep_search)
     finer = with_smaller_step(search.found[-1].fit, settings.noise) if search.found else None
     if finer is not None:
-        return _diagnosed(known.anew(), finer, where, progress)
+        return _diagnosed(known.restart(), finer, where, progress)
     known.search, tests = search, known.tests
     common = [known.simulation, base, base.model, *common_parts(open_loop(base.model.prepared), terms)]
     while search.left:
         case = known.case(search)
-        # most often there is nothing more
+        # usually there is no further finding, so compute the evidence ahead
         with speculative(precompute(case, tests), [*common, *search.parts]) as done:
-            progress(f"trying {len(search.left)} effects beside {len(search.found)} found")
-            after = next_step(search, asked, generator, known.keep_search)
+            progress(f"trying {len(search.left)} effects in addition to {len(search.found)} found")
+            after = next_step(search, options, generator, known.keep_search)
             if after.found == search.found:
                 known.search = after
                 return known.diagnosis(after, case, done(), tests)
@@ -222,13 +221,13 @@ def _diagnosed(
 
 
 def _refuse_no_noise(base: FittedModel, where: str) -> None:
-    """Refuse a channel that the simulation answers exactly: there is no noise that structure could be told from."""
+    """Raise ValueError for a channel whose residual is constant: no noise is left to test an effect against."""
     same = (base.residual == base.residual[:1]).all(0)
     nothing = base.d.square() < torch.finfo(base.d.dtype).tiny
     exact = (same | nothing).tolist()
-    names = [name for name, one in zip(base.model.prepared.channels, exact, strict=True) if one]
+    names = [name for name, is_exact in zip(base.model.prepared.channels, exact, strict=True) if is_exact]
     if names:
         raise ValueError(
-            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so it has no noise "
-            "to tell structure from. Leave it out of what is compared, or record it with its noise."
+            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so no noise is left "
+            "to test effects against. Leave it out of the compared channels, or record it with its noise."
         )

@@ -1,4 +1,4 @@
-"""What a diagnosis says of how a simulation follows its recording, and of the noise of the world around it."""
+"""The goodness of fit and the noise environment that a diagnosis reports."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ __all__ = [
 
 Verdict = Literal["unfit", "adequate", "explained", "unexplained"]
 
-Grade = Literal["left out", "real but small", "not confirmed", "nearest in the catalogue"]
+Grade = Literal["left_out", "small", "unconfirmed", "nearest"]
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The trace of an effect against what drives it, one row a point, one column a channel.
+    """An effect against its driver, one row per point, one column per channel.
 
     ``band`` is the half-width of a 95 % interval.
     """
@@ -47,18 +47,18 @@ class Curve:
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """How well the simulation alone, running freely, follows one output; all sizes in that output's unit.
+    """How well the open-loop simulation explains one output; all sizes in that output's unit.
 
     Attributes:
-        output, unit: which.
-        residual: robust size of recording less simulation.
-        variation: robust size of the output about its mean; of a length, what readings scattered as widely, and alike
-            in all directions, would leave.
-        explained: share of the variation's square that the simulation explains; below 0 where it is worse than none.
-        noise_floor: size of the sensor's white noise; ``floor_source`` says whether it was "declared", or estimated
-            from what is new from one of the "samples" to the next, or from the steps of the recording's numbers,
-            "quantisation"; NaN where the sampling is slower than the noise.
-        mean_predicts, last_value_predicts: residual of two trivial predictions: the mean, and the sample before.
+        output, unit: name and unit of the output.
+        residual: robust RMS of the residual.
+        variation: robust standard deviation of the output. For the length of a vector, the standard deviation of
+            readings that scatter as widely and equally in all directions.
+        explained: share of the variation's square that the simulation explains; negative if it is worse than the mean.
+        noise_floor: standard deviation of the sensor's white noise; NaN if the sampling is slower than the noise.
+        floor_source: "declared" by the user, estimated from third differences of the "samples", or from the resolution
+            of the recorded numbers, "quantisation".
+        rmse_of_mean, rmse_of_last_value: residuals of two trivial predictions: the mean, and the previous sample.
     """
 
     output: str
@@ -68,39 +68,40 @@ class GoodnessOfFit:
     explained: float
     noise_floor: float
     floor_source: Literal["declared", "samples", "quantisation"]
-    mean_predicts: float
-    last_value_predicts: float
+    rmse_of_mean: float
+    rmse_of_last_value: float
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Something random and unrecorded that acts on a state's rate, or is added to an output beside its white noise.
+    """An unrecorded random disturbance of a state's rate, or slow noise of an output in addition to its white noise.
 
     Attributes:
-        place: the state or the output; ``at_rate`` says which.
-        lasting: s for which it keeps its value, roughly; 0 for one that is new at each sample.
-        size, standard_error, unit: its standard deviation.
-        nats: by which a model of the noise without it is less likely.
+        place: name of the state or output.
+        at_rate: True for a state's rate, False for an output.
+        correlation_time: in s; 0 for white noise.
+        size, standard_error, unit: its standard deviation, with error and unit.
+        log_likelihood_gain: in nats, over a noise model without it.
     """
 
     place: str
     at_rate: bool
-    lasting: float
+    correlation_time: float
     size: float
     standard_error: float
     unit: str
-    nats: float
+    log_likelihood_gain: float
 
 
 @dataclass(frozen=True)
 class DisturbanceEstimate:
-    """The course of a push by all samples, with its 95 % band, and what it depends on.
+    """The estimated course of a disturbance from all samples, with its 95 % band and its dependences.
 
     Attributes:
-        place, at_rate, unit: of the push.
-        time, value, band: (N,), in s and in the push's unit; the band is a half-width.
-        curves: its mean along each state and input, with its band.
-        sentences: whether it is white, and whether it depends on an input or a state, in a control engineer's words.
+        place, at_rate, unit: of the disturbance.
+        time, value, band: (N,), in s and in the disturbance's unit; the band is a half-width.
+        curves: the mean of the disturbance against each state and input, with its band.
+        sentences: whether it is white, and whether it depends on an input or a state.
     """
 
     place: str
@@ -115,13 +116,13 @@ class DisturbanceEstimate:
 
 @dataclass(frozen=True)
 class ShapeCheck:
-    """Whether the shape that a name claims is the one that the recording shows.
+    """Whether the recording supports the named shape of an effect.
 
     Attributes:
-        free_curve_gain: nats by which a free curve of the same variables at the same place is likelier.
-        p_value: of as large a gain where the name is right.
-        curve: that free curve, where it is clearly better; else None.
-        formula: the formula nearest to it, such as "0.0071 |x|^1.52 sign(x)"; empty where there is none.
+        free_curve_gain: log-likelihood gain of a free curve of the same variables at the same place, in nats.
+        p_value: of that gain if the name is right.
+        curve: the free curve if it is clearly better; otherwise None.
+        formula: the formula nearest to the curve, such as "0.0071 |x|^1.52 sign(x)"; empty if there is no formula.
     """
 
     free_curve_gain: float
@@ -135,10 +136,10 @@ class Offset:
     """The offset of an output in one of several recordings.
 
     Attributes:
-        output, unit: of which output.
+        output, unit: name and unit of the output.
         recording, name: number of the recording, from 1, and its name.
-        value, standard_error: in the unit; NaN for the error of an offset that is left at 0, which the others are
-            counted from, or which the first states or another parameter stand for.
+        value, standard_error: in the unit. The error is NaN for an offset that is fixed at 0: the reference of the
+            others, or an offset that initial states or another parameter represent.
     """
 
     output: str
@@ -151,11 +152,11 @@ class Offset:
 
 @dataclass(frozen=True)
 class Run:
-    """One of several runs.
+    """A run of a recording.
 
     Attributes:
-        recording, name: number, from 1, and name of the recording that it is of; 0 and empty for a single recording.
-        number: of the run within its recording, from 1; 0 where that recording holds no other.
+        recording, name: number, from 1, and name of its recording; 0 and empty for a single recording.
+        number: of the run within its recording, from 1; 0 if that recording has a single run.
     """
 
     recording: int
@@ -165,24 +166,24 @@ class Run:
 
 @dataclass(frozen=True)
 class NoiseEnvironment:
-    """What stands beside the findings: whether the simulation follows, and the noise of the world.
+    """The goodness of fit of a simulation, and the noise around it.
 
     Attributes:
-        follows: of each output.
-        reasons: why the simulation does not follow, in sentences, the most likely first; empty where it does.
-        pushes: strongest first; none where the sensors' white noise is enough.
-        input_hold: what each input does between two samples, "held", "linear" or "smooth", whichever is likelier.
-        forcing: of each push at a rate.
-        starts: from which the first fit was tried.
-        offsets: of the outputs in each of several recordings, where they are fitted.
-        runs: in the order in which findings give their shares; empty for a single one.
+        goodness_of_fit: of each output.
+        reasons: why the fit is poor, in sentences, the most likely reason first; empty for a good fit.
+        process_noise: process noise or drift, strongest first; empty if the sensors' white noise is enough.
+        input_hold: most likely hold of each input between two samples: "held", "linear" or "smooth".
+        disturbance: estimated disturbance of each state's rate.
+        starts: number of starting points that the first fit was tried from.
+        offsets: fitted offsets of the outputs in each of several recordings.
+        runs: in the order in which findings list their shares; empty for a single run.
     """
 
-    follows: tuple[GoodnessOfFit, ...] = ()
+    goodness_of_fit: tuple[GoodnessOfFit, ...] = ()
     reasons: tuple[str, ...] = ()
-    pushes: tuple[ProcessNoise, ...] = ()
+    process_noise: tuple[ProcessNoise, ...] = ()
     input_hold: Mapping[str, str] = field(default_factory=dict)
-    forcing: tuple[DisturbanceEstimate, ...] = ()
+    disturbance: tuple[DisturbanceEstimate, ...] = ()
     starts: int = 1
     offsets: tuple[Offset, ...] = ()
     runs: tuple[Run, ...] = ()

@@ -1,4 +1,4 @@
-"""What is diagnosed: a recording, or several as one table."""
+"""Join the recordings of a diagnosis to one table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["joined", "run_counts", "with_own_offsets"]
 
 
 def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -> tuple[Recording, tuple[str, ...]]:
-    """One recording of what was given, and the names of those in it; no names of a single one.
+    """Return one recording of all that were given, and their names; no names for a single recording.
 
     Raises:
         TypeError: neither a recording nor a list or tuple of recordings.
@@ -30,21 +30,21 @@ def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -
         refuse_no_recording("recording", recording)
         assert isinstance(recording, Recording)
         return recording, ()
-    for number, one in enumerate(recording):
-        refuse_no_recording(f"recording[{number}]", one)
+    for number, item in enumerate(recording):
+        refuse_no_recording(f"recording[{number}]", item)
     whole = join_recordings(recording, _clock(simulation))
     return whole, recording_names(recording) if len(recording) > 1 else ()
 
 
 def run_counts(recordings: Sequence[Recording]) -> tuple[int, ...]:
-    """How many runs each of the recordings holds."""
-    return tuple(len(one.experiments()) for one in recordings)
+    """Return the number of runs in each recording."""
+    return tuple(len(recording.experiments()) for recording in recordings)
 
 
 def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recording]) -> PreparedSimulation:
-    """A simulation of several recordings with offsets of its outputs that each recording has of its own.
+    """Return the simulation with separate offsets of its outputs for each recording.
 
-    Of a simulation that knows of none, such as the magnetometer's, it is as it was.
+    A simulation without such offsets, such as the magnetometer's, is returned unchanged.
     """
     whole = prepared.recording
     if len(recordings) < 2 or EXPERIMENT not in whole:
@@ -58,7 +58,7 @@ def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recordin
 
 
 def _clock(simulation: Simulation) -> Clock:
-    """What runs' times do beside one another, so that the simulation keeps the runs apart."""
+    """How the times of joined runs relate, so that the simulation keeps the runs apart."""
     if isinstance(simulation, Paired):  # each sample is compared with what the simulator wrote at its time
         return "own"
     return "restart" if getattr(simulation, "joins_experiments", False) else "follow"

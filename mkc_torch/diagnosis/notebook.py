@@ -1,4 +1,4 @@
-"""A diagnosis as a table in a notebook: the verdict, a row a finding, and what to do."""
+"""A diagnosis as a table in a notebook: the verdict, a row per finding, and advice."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def as_html(
     *,
     stop: Stop | None = None,
 ) -> str:
-    """The table, with sentences below it: advice and warnings; first of all why the search was stopped, if it was."""
+    """Return the table with sentences below it: why the search was stopped, if it was; then advice and warnings."""
     names = term("label.against", recording=plain(recording) or term("label.recording"), simulation=plain(simulation))
     heads = ("", "grade", "p", "on unseen data")
     rows = [_row(finding) for finding in findings]
     first = term(_VERDICTS[verdict]) if stop is None else term("verdict.unfinished")
-    below = [first, *(typeset(one) for one in sentences)]
+    below = [first, *(typeset(sentence) for sentence in sentences)]
     for finding in findings:
-        below = [one.replace(finding.effect, words_of(finding.effect, finding.kind)) for one in below]
+        below = [text.replace(finding.effect, words_of(finding.effect, finding.kind)) for text in below]
     return html_table(names, heads, rows, below)
 
 
@@ -46,4 +46,9 @@ def _row(f: Finding) -> tuple[str, ...]:
     drivers = f" ({', '.join(plain(name) for name in f.drivers)})" if f.drivers else ""
     held = f.held_out
     change = "" if held is None else f"{held.rmse_before:.3g} → {held.rmse_after:.3g} {plain(held.unit)}".rstrip()
-    return words_of(f.effect, f.kind) + drivers, f.grade, "" if f.p_value is None else f"{f.p_value:.2g}", change
+    return (
+        words_of(f.effect, f.kind) + drivers,
+        f.grade.replace("_", " "),
+        "" if f.p_value is None else f"{f.p_value:.2g}",
+        change,
+    )

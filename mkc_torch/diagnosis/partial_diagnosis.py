@@ -1,4 +1,4 @@
-"""What is known of a diagnosis that was stopped before its end, as a result that says what was not done."""
+"""The result of a diagnosis that was stopped before its end, with a list of what was not done."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from mkc_torch.diagnosis.stepwise import StepwiseSearch
 from mkc_torch.diagnosis.stop import Stop
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["cut_short", "nothing_known"]
+__all__ = ["cut_short", "error_without_fit"]
 
 _MOMENT_S = 1.0
-"""Seconds that free runs of what was found may take."""
+"""Time limit in seconds for the open-loop fits of the findings."""
 
 
-def nothing_known(reason: Reason, limit: float, where: str) -> BaseException:
-    """What is raised where the simulation's first fit had not ended."""
+def error_without_fit(reason: Reason, limit: float, where: str) -> BaseException:
+    """Return the exception to raise if the simulation's first fit had not ended."""
     if reason == "interrupt":
         return KeyboardInterrupt()
     return TimeoutError(
@@ -37,48 +37,48 @@ def nothing_known(reason: Reason, limit: float, where: str) -> BaseException:
 
 
 def cut_short(known: PartialResult, reason: Reason, seconds: float) -> Diagnosis:
-    """The result of what is known.
+    """Return the result of what is known.
 
     Args:
-        known: so far; the simulation has a first fit.
-        reason, seconds: why it was stopped, and after how long.
+        known: the partial result; it contains a first fit of the simulation.
+        reason, seconds: why and after how many seconds the run was stopped.
     """
     search = known.search if known.search is not None else _not_begun(known)
     leading = _leading(known, search)
     found = (*search.found, *leading)
     judged = len(search.evidence) == len(found) + 1
     if not judged:
-        fits = known.base, *(one.fit for one in found)
+        fits = known.base, *(located.fit for located in found)
         search = replace(search, evidence=tuple(on_all(fit) for fit in fits), pairs=())
     search = replace(search, found=found)
-    unjudged = partial(running_unjudged, known.base, known.alone.free, found)
-    free = within(_MOMENT_S, partial(known.running_freely, search) if judged else unjudged)
+    unjudged = partial(running_unjudged, known.base, known.fitted_baseline.free, found)
+    free = within(_MOMENT_S, partial(known.open_loop_findings, search) if judged else unjudged)
     if free is None:
         free = OpenLoop(known.base, found, search.evidence)
     case = known.case(search, free)
-    final = estimate(case.fit, known.asked.settings.noise).at_least(case.held_out[-1].jackknife)
+    final = estimate(case.fit, known.options.settings.noise).at_least(case.held_out[-1].jackknife)
     stop = Stop(reason, seconds, tuple(_not_done(known, search, judged=judged, leading=bool(leading))))
     return known.diagnosis(search, case, [final], in_short(held_out=judged), stop)
 
 
 def _not_begun(known: PartialResult) -> StepwiseSearch:
-    fit, settings = known.base, known.asked.settings.confirmation
+    fit, settings = known.base, known.options.settings.confirmation
     blocks = blocks_of(len(fit.residual), 1, settings, first_samples(fit.model.prepared))
     return StepwiseSearch(None, (), None, blocks, (), known.candidates[1])
 
 
 def _leading(known: PartialResult, search: StepwiseSearch) -> tuple[SearchResult, ...]:
-    """The candidate that the first search leads with, if it passed there and nobody has asked unseen blocks yet."""
-    first, asked = search.first, known.asked
-    if first is None or search.found or search.unconfirmed or not search.left or asked.max_findings == 0:
+    """The leading candidate of the first search if it passed there and was not yet tested on held-out blocks."""
+    first, options = search.first, known.options
+    if first is None or search.found or search.unconfirmed or not search.left or options.max_findings == 0:
         return ()
-    if first.p_value > asked.level or within_a_sample(first.term, first.fit.model.prepared):
+    if first.p_value > options.level or within_a_sample(first.term, first.fit.model.prepared):
         return ()
     return (first,)
 
 
 def _not_done(known: PartialResult, search: StepwiseSearch, *, judged: bool, leading: bool) -> Iterator[str]:
-    """What was left undone, in the order in which it is done."""
+    """Yield what was left undone, in the order of the diagnosis."""
     if not known.fitted:
         yield "the noise around the simulation's fit"
     if search.first is None:

@@ -1,4 +1,4 @@
-"""A diagnosis under way: what is known of it so far, and how it becomes a result."""
+"""A running diagnosis: what is known so far, and its conversion to a result."""
 
 from __future__ import annotations
 
@@ -30,76 +30,77 @@ __all__ = ["PartialResult"]
 
 @dataclass
 class PartialResult:
-    """What is known so far; what is asked for stays as it is, the rest is filled in step by step.
+    """What is known so far; the arguments are fixed, the rest is filled in step by step.
 
     Attributes:
-        simulation, effects, recordings, asked: what was asked, the names of recordings that are diagnosed together.
-        run_counts: runs that each of these recordings holds.
-        world: the fit of the simulation alone; at first before its noise is known.
+        simulation, effects, options: arguments of the diagnosis.
+        recordings: names of the recordings that are diagnosed together.
+        run_counts: number of runs in each of these recordings.
+        baseline: the fit of the simulation without findings; at first before its noise is known.
         fitted: whether the noise is known too.
-        search: what was found.
+        search: the search so far.
     """
 
     simulation: Simulation
     effects: tuple[Effect, ...]
     recordings: tuple[str, ...]
-    asked: SearchOptions
+    options: SearchOptions
     run_counts: tuple[int, ...] = ()
-    world: ProcessNoiseFit | None = None
+    baseline: ProcessNoiseFit | None = None
     fitted: bool = False
     search: StepwiseSearch | None = None
     _candidates: tuple[Drivers, tuple[Term, ...]] | None = field(default=None, repr=False)
 
-    def keep_world(self, world: ProcessNoiseFit) -> None:
-        """Remember the simulation's fit."""
-        self.world = world
+    def keep_baseline(self, baseline: ProcessNoiseFit) -> None:
+        """Store the simulation's fit."""
+        self.baseline = baseline
 
     def keep_search(self, search: StepwiseSearch) -> None:
-        """Remember what was found."""
+        """Store the search so far."""
         self.search = search
 
-    def anew(self) -> PartialResult:
-        """The same from the beginning; what is known stays until it is known anew."""
+    def restart(self) -> PartialResult:
+        """Restart with new candidates; earlier results stay until they are replaced."""
         self._candidates = None
         return self
 
     @property
     def tests(self) -> tuple[EvidenceTest, ...]:
-        """The tests of evidence."""
-        return in_short(held_out=self.asked.judged) if self.asked.quick else TESTS
+        """The tests of evidence to run."""
+        return in_short(held_out=self.options.judged) if self.options.quick else TESTS
 
     @property
-    def alone(self) -> ProcessNoiseFit:
-        """The simulation alone, which has been fitted."""
-        assert self.world is not None
-        return self.world
+    def fitted_baseline(self) -> ProcessNoiseFit:
+        """The fitted simulation without findings, with its noise."""
+        assert self.baseline is not None
+        return self.baseline
 
     @property
     def base(self) -> FittedModel:
-        """Its fit."""
-        return self.alone.fit
+        """The fit of :attr:`fitted_baseline`."""
+        return self.fitted_baseline.fit
 
     @property
     def candidates(self) -> tuple[Drivers, tuple[Term, ...]]:
-        """The recorded columns that can drive an effect, and what is tried."""
+        """The recorded columns that can drive an effect, and the candidates."""
         if self._candidates is None:
-            prepared, settings = open_loop(self.base.model.prepared), self.asked.settings
+            prepared, settings = open_loop(self.base.model.prepared), self.options.settings
             roles = frozenset(role for effect in self.effects for role in effect.roles)
             measured: frozenset[str] = getattr(self.simulation, "measured", frozenset())
             found = find_drivers(prepared.recording, self.simulation.columns, settings.drivers, roles, measured)
             self._candidates = found, candidate_terms(prepared, found.drivers, self.effects)
         return self._candidates
 
-    def running_freely(self, search: StepwiseSearch) -> OpenLoop:
-        """What was found, as a free run where that follows the recording."""
-        if not self.asked.judged:
-            return running_unjudged(self.base, self.alone.free, search.found)
-        return open_loop_evidence(self.base, self.alone.free, search.found, search.evidence, search.blocks)
+    def open_loop_findings(self, search: StepwiseSearch) -> OpenLoop:
+        """The findings in their open-loop fit if it explains the recording."""
+        if not self.options.judged:
+            return running_unjudged(self.base, self.fitted_baseline.free, search.found)
+        return open_loop_evidence(self.base, self.fitted_baseline.free, search.found, search.evidence, search.blocks)
 
     def case(self, search: StepwiseSearch, free: OpenLoop | None = None) -> EvidenceContext:
-        """What tests of evidence look at; ``free`` is what was found, where that is known."""
-        free = self.running_freely(search) if free is None else free
-        asked, drivers = self.asked, self.candidates[0].drivers
+        """The context of the tests of evidence; ``free`` holds the open-loop findings if they are known."""
+        free = self.open_loop_findings(search) if free is None else free
+        options, drivers = self.options, self.candidates[0].drivers
         held_out: tuple[Evidence, ...] = free.held_out
         return EvidenceContext(
             free.base,
@@ -108,8 +109,8 @@ class PartialResult:
             held_out,
             search.blocks,
             drivers,
-            asked.seed,
-            asked.settings,
+            options.seed,
+            options.settings,
             pairs=search.pairs,
         )
 
@@ -121,12 +122,16 @@ class PartialResult:
         tests: Sequence[EvidenceTest],
         stop: Stop | None = None,
     ) -> Diagnosis:
-        """The result, once the parts of the tests that go ahead are done."""
+        """The result, once the precomputed parts of the tests are done."""
         final = search.found[-1].fit if search.found else self.base
         drivers, terms = self.candidates
-        whole = DiagnosisInputs(self.simulation, drivers, terms, self.alone, final, self.asked, search.cut, stop)
+        whole = DiagnosisInputs(
+            self.simulation, drivers, terms, self.fitted_baseline, final, self.options, search.cut, stop
+        )
         answers = run_tests(case, done, tests)
-        told = with_search_notes(build_diagnosis(whole, answers), search)
+        result = with_search_notes(build_diagnosis(whole, answers), search)
         offsets = offsets_of(answers.case.final, self.recordings) if self.recordings else ()
         runs = runs_of(self.base.model.prepared, self.recordings, self.run_counts)
-        return replace(told, recordings=self.recordings, world=replace(told.world, offsets=offsets, runs=runs))
+        return replace(
+            result, recordings=self.recordings, environment=replace(result.environment, offsets=offsets, runs=runs)
+        )

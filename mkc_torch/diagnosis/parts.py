@@ -1,4 +1,4 @@
-"""What a diagnosis is made of: findings with their evidence, and the figures a report draws."""
+"""The parts of a diagnosis: findings with their evidence, and the figures of a report."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ __all__ = [
     "Alternative",
     "CandidateScore",
     "DensityCheck",
+    "DivergedBlock",
     "DriverShift",
     "EffectParameter",
     "EvidenceResult",
@@ -44,7 +45,7 @@ Number = float | tuple["Number", ...]
 
 @dataclass(frozen=True)
 class Row:
-    """A line of facts, on the terminal too or not; one labelled "driven by" goes on where the driver is named."""
+    """A line of facts; ``in_terminal`` shows it on the terminal. The label "driven by" adds it to the driver's line."""
 
     label: str
     text: str
@@ -53,7 +54,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the report, its first column a heading of each row; ``note`` says how to read it."""
+    """A table of the report; its first column is the heading of each row, ``note`` explains how to read it."""
 
     title: str
     columns: tuple[str, ...]
@@ -63,16 +64,16 @@ class Table:
 
 @dataclass(frozen=True)
 class EvidenceResult:
-    """What a test of evidence says of a finding or of the whole diagnosis: report, terminal and JSON loop over it.
+    """The result of a test of evidence, for a finding or the whole diagnosis; report, terminal and JSON loop over it.
 
-    Its texts have effects by their ids, and numbers as Python prints them.
+    Texts name effects by their ids, and numbers as Python prints them.
 
     Attributes:
         test: its id.
-        value: the result, for what goes on with it in Python.
-        content: what ``diagnosis.json`` has of it, as ``evidence.<test>``: JSON, or results of this file.
-        keys: the same for a test that is older than ``evidence``, whose keys have places of their own in the finding
-            or the diagnosis; a mapping is added to the object that is there.
+        value: the result, for further use in Python.
+        content: what ``diagnosis.json`` contains as ``evidence.<test>``: JSON, or results of this file.
+        keys: the same for tests with keys of their own in the finding or the diagnosis; a mapping is merged into an
+            existing object.
         warnings: sentences.
         rows: facts.
         table: of the report.
@@ -88,15 +89,16 @@ class EvidenceResult:
 
 
 def value_of(evidence: Sequence[EvidenceResult], test: str, default: Any = None) -> Any:
-    """The result of a test; the default where it was not asked."""
-    return next((said.value for said in evidence if said.test == test), default)
+    """Return the result of a test, or the default if the test was not run."""
+    return next((result.value for result in evidence if result.test == test), default)
 
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A parameter of an effect; ``standard_error`` has the shape of ``value`` and None where it is not known.
+    """A parameter of an effect.
 
-    ``components`` says what each number of a list is, in their order; empty for a single number.
+    ``standard_error`` has the shape of ``value``, with None for an unknown error. ``components`` labels the numbers of
+    a list in their order; empty for a single number.
     """
 
     name: str
@@ -108,7 +110,7 @@ class EffectParameter:
 
 @dataclass(frozen=True)
 class Reference:
-    """The value of a driver's column, its mean over the recording, that an equation counts from: T̄, Ī, x̄."""
+    """The reference value of a driver in an equation, its mean over the recording: T̄, Ī, x̄."""
 
     column: str
     value: float
@@ -117,7 +119,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class ResidualSizes:
-    """Residuals of one output before and after, in its own unit."""
+    """RMS residuals of one output without and with the findings, in its own unit."""
 
     before: float
     after: float
@@ -125,12 +127,27 @@ class ResidualSizes:
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Evidence on blocks that the fit has not seen; the gain in nats per sample, with its 95 % interval.
+class DivergedBlock:
+    """A held-out block in which the open-loop simulation leaves the recording's range.
 
-    ``outputs`` has each output's residuals; ``left`` says of which blocks the free run leaves the recording's range,
-    which enter no mean, and is empty where none does. Where noise and physics were chosen together the blocks can speak
-    against a finding but do not decide: one step ahead any process noise predicts as well.
+    ``before`` and ``after``: whether it does so without and with the finding. ``number`` counts the blocks in time,
+    from 1.
+    """
+
+    number: int
+    before: bool
+    after: bool
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Evidence on held-out blocks; the gain in nats per sample, with its 95 % interval.
+
+    ``outputs`` has each output's residuals. ``diverged_blocks`` lists those of the ``blocks`` held-out blocks in which
+    an open-loop simulation leaves the recording's range; no mean includes them. ``decides`` is False if noise and
+    physics
+    were selected together: the blocks can then reject a finding but not confirm it, because process noise predicts one
+    step ahead as well.
     """
 
     log_likelihood_gain: float
@@ -139,13 +156,14 @@ class HeldOut:
     rmse_after: float
     unit: str
     outputs: Mapping[str, ResidualSizes] = field(default_factory=dict)
-    left: str = ""
+    diverged_blocks: tuple[DivergedBlock, ...] = ()
+    blocks: int = 0
     decides: bool = True
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """A fit to the low values of a driver, judged on the high ones: gain in nats per sample, its 95 % interval."""
+    """A fit to the low values of a driver, tested on the high values: gain in nats per sample, its 95 % interval."""
 
     log_likelihood_gain: float
     confidence_interval: tuple[float, float]
@@ -153,7 +171,7 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class DriverShift:
-    """Copies of a driver shifted in time, earlier and later by up to ``reach`` s, and how many gain as much."""
+    """Number of copies of a driver, shifted in time by up to ``reach`` s either way, and number that gain as much."""
 
     copies: int
     as_good: int
@@ -162,24 +180,25 @@ class DriverShift:
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart.
+    """Another candidate for a finding: by how many nats it is less likely, and whether the recording separates the two.
 
-    ``at`` is where it acts, of several places that a simulation has for it; ``recurrence`` what becomes of it in another
-    recording; ``distinguishing_state`` what to record to tell it from the finding, where the data do not.
+    ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` says whether it recurs in
+    another recording. ``distinguishing_state`` is what to record to distinguish it from the finding, if the recording
+    does not.
     """
 
     effect: str
     drivers: tuple[str, ...]
     log_likelihood_gap: float
     separable: bool
-    at: str = ""
+    port: str = ""
     recurrence: str = ""
     distinguishing_state: str = ""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A part of a state's range in which most of a finding's gain arises, in less of the time.
+    """A part of a state's range that holds most of a finding's gain, in a smaller share of the time.
 
     ``kind`` is "below", "above", "near zero" or "far from zero", each by ``bound``, in ``unit``.
     """
@@ -194,7 +213,7 @@ class Region:
 
 @dataclass(frozen=True)
 class StateMap:
-    """A finding's gain in nats over two states: sums over cells, NaN where the recording never was."""
+    """A finding's gain in nats over two states, summed over cells; NaN in cells without samples."""
 
     states: tuple[str, str]
     units: tuple[str, ...]
@@ -206,18 +225,19 @@ class StateMap:
 class Finding:
     """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``.
 
-    ``map`` is for the report; None where it cannot be drawn. ``region``
-    is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
-    share of the gain, and is empty for a single run.
-    ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
-    ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``recurrence`` what becomes
-    of it in another recording; one that is ``location_specific`` belongs to the place or the attitude of this recording.
-    ``kind`` is what kind of quantity it acts on, such as "temperature"; empty where that is not known.
-    ``cannot_be`` says that its size cannot be right, see ``plausibility``; ``doubts`` are sentences on numbers of its
+    ``map`` is for the report; None if it cannot be drawn.
+    ``region`` is None if the gain spreads over all states, or if the simulation has no states.
+    ``experiments`` has each run's share of the gain; empty for a single run.
+    ``event_times`` are the times in s at which an effect with several onsets sets in; the first is its onset.
+    ``references`` are the reference values of the drivers in the equation.
+    ``advice`` is what to do about the finding; ``recurrence`` says whether it recurs in another recording.
+    ``location_specific`` effects belong to the place or the attitude of this recording.
+    ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
+    ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its
     shape at the ends of their ranges.
-    ``p_value`` is that after the whole search; None in a quick look, which draws no noise.
-    ``grade`` is what it is worth, ``shape`` whether its name's shape is the recording's; None where that is not asked.
-    ``evidence`` is what the tests say that are asked of each finding.
+    ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
+    ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
+    ``evidence`` has the results of the tests of evidence.
     """
 
     effect: str
@@ -236,7 +256,7 @@ class Finding:
     region: Region | None = None
     experiments: tuple[float, ...] = ()
     map: StateMap | None = None
-    moments: tuple[float, ...] = ()
+    event_times: tuple[float, ...] = ()
     references: tuple[Reference, ...] = ()
     advice: str = ""
     recurrence: str = ""
@@ -244,47 +264,47 @@ class Finding:
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
-    grade: Grade = "left out"
+    grade: Grade = "left_out"
     shape: ShapeCheck | None = None
     evidence: tuple[EvidenceResult, ...] = ()
 
     @property
     def held_out(self) -> HeldOut | None:
-        """The gain on blocks that the fit has not seen; None where it cannot be measured."""
+        """The gain on held-out blocks; None if it cannot be measured."""
         return value_of(self.evidence, "held_out", (None, ""))[0]
 
     @property
     def held_out_note(self) -> str:
-        """Why ``held_out`` is None, or what to know about it."""
+        """Why ``held_out`` is None, or what limits it."""
         return value_of(self.evidence, "held_out", (None, ""))[1]
 
     @property
     def extrapolation(self) -> Extrapolation | None:
-        """How well it holds where its driver is high; None where that cannot be told."""
+        """The gain at high values of its driver; None if that cannot be tested."""
         return value_of(self.evidence, "extrapolation")
 
     @property
     def driver_shift(self) -> DriverShift | None:
-        """How many shifted copies of its driver gain as much; None where no driver was recorded."""
+        """How many shifted copies of its driver gain as much; None without a recorded driver."""
         return value_of(self.evidence, "driver_shift")
 
     @property
     def onset_interval(self) -> tuple[float, float] | None:
-        """What holds the onset with 95 % confidence; None where there is none."""
+        """The 95 % confidence interval of the onset; None without an onset."""
         return value_of(self.evidence, "onset")
 
     @property
     def comes_and_goes(self) -> bool:
-        """Whether a step is as if something was switched on and off."""
+        """Whether a step is intermittent, as if something was switched on and off."""
         return bool(value_of(self.evidence, "switched"))
 
 
 @dataclass(frozen=True)
 class DensityCheck:
-    """How far the density of a channel's residuals is from their distribution, and how far a Student-t is.
+    """Distances of a channel's residuals from the density and from a Student-t distribution.
 
-    The distances are Kolmogorov's, between distribution functions; ``allowed`` is what one set in a thousand exceeds of
-    as many independent samples as the channel tells of. ``closer`` says that a Student-t is clearly the better one.
+    The distances are Kolmogorov's, between distribution functions. ``allowed`` is the distance that one in a thousand
+    sets of as many independent samples exceeds. ``closer`` is True if a Student-t is clearly closer.
     """
 
     channel: str
@@ -297,12 +317,12 @@ class DensityCheck:
 
 @dataclass(frozen=True)
 class NoiseSummary:
-    """The noise that structure was tested against.
+    """The noise model that effects were tested against.
 
-    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` those that have
-    a unit; ``bound`` is the half-width of the density's domain, one for all models compared. ``unit`` is that of d and
-    the bound. ``tails`` has the test for heavy tails of each channel, on as many residuals as are independent; empty
-    where the fit of a channel is exact.
+    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` has the units of
+    those that have one. ``bound`` is the half-width of the density's domain, equal for all compared models. ``unit`` is
+    that of d and the bound. ``tails`` has the test for heavy tails of each channel, on its effective number of
+    independent residuals; empty if the fit of a channel is exact.
     """
 
     model: Literal["white", "ar", "random_walk"]
@@ -328,9 +348,9 @@ class HeldOutScore:
 
 @dataclass(frozen=True)
 class SmoothCorrection:
-    """What a smooth correction reaches on held-out blocks, and the columns along which it shows that something remains.
+    """The score of a smooth correction on held-out blocks, and the columns along which structure remains.
 
-    The correction is by all columns and by time, instead of the findings; a step, say, goes beyond it.
+    The correction depends on all columns and on time, and replaces the findings; it cannot follow a step, for example.
     """
 
     reached: HeldOutScore
@@ -339,11 +359,11 @@ class SmoothCorrection:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """One candidate of the search at its best shape, for the first finding.
+    """A candidate of the search at its best shape, for the first finding.
 
-    ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` the root of twice that, roughly the number
-    of standard errors. ``at`` is where it acts, of several places that a simulation has for it; ``behind`` how many
-    nats it is behind the first one, once its numbers and its handicap are paid for.
+    ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` is the root of twice the gain, about the
+    number of standard errors. ``port`` is where it acts, if the simulation has several places for it. ``behind`` is the
+    distance to the best candidate in nats, after penalties.
     """
 
     effect: str
@@ -351,19 +371,19 @@ class CandidateScore:
     shape: str
     log_likelihood_gain: float
     z: float
-    at: str = ""
+    port: str = ""
     behind: float = 0.0
 
 
 @dataclass(frozen=True)
 class Separability:
-    """How well candidates could be told apart on this recording, whatever was found.
+    """How well the recording separates candidates, whatever was found.
 
     ``labels`` are ``effect`` or ``effect (driver)``.
 
-    ``share[i, j]`` is the share of candidate i's trace that candidate j cannot take over, once the simulation's own
-    parameters have been refitted: 0 means inseparable, 1 means at right angles. ``left[i]`` is the share that survives
-    the refit alone.
+    ``share[i, j]`` is the share of candidate i's trace that candidate j cannot explain, once the simulation's own
+    parameters have been refitted: 0 means inseparable, 1 orthogonal. ``left[i]`` is the share that remains after the
+    refit alone.
     """
 
     labels: tuple[str, ...]
@@ -373,7 +393,7 @@ class Separability:
 
 @dataclass(frozen=True)
 class Traces:
-    """What the report draws: one row a sample that was used."""
+    """The series that the report draws, one row per sample in use."""
 
     time: Float[Tensor, " N"]
     has_time: bool

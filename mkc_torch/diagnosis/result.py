@@ -1,4 +1,4 @@
-"""What a diagnosis says: verdict, findings, and the figures a report draws."""
+"""The result of a diagnosis: verdict, findings, and the figures of a report."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.parts import (
     Alternative,
     CandidateScore,
     DensityCheck,
+    DivergedBlock,
     DriverShift,
     EffectParameter,
     EvidenceResult,
@@ -39,6 +40,7 @@ __all__ = [
     "CandidateScore",
     "DensityCheck",
     "Diagnosis",
+    "DivergedBlock",
     "DriverShift",
     "EffectParameter",
     "EvidenceResult",
@@ -63,28 +65,30 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of a recording, or of several together: what ``diagnosis.json`` and its report have.
+    """The diagnosis of a recording, or of several together: the content of ``diagnosis.json`` and its report.
 
     Attributes:
-        recording, simulation, samples, level: what was asked: names, number of samples used, false-alarm level.
-        noise: the noise model that structure was tested against.
+        recording, simulation: names.
+        samples: number of samples in use.
+        level: rate of false alarms.
+        noise: the noise model that effects were tested against.
         candidates_tried, surrogates, seed: the size of the search.
-        p_value: of the strongest candidate after the whole search; None in a quick look, and where the search was
-            stopped before it was known.
+        p_value: of the strongest candidate after the whole search; None in a quick look, and if the search was stopped
+            before it was known.
         verdict: "unfit", "adequate", "explained" or "unexplained".
         findings: strongest first.
-        baseline, corrected: the simulation without and with the findings, on held-out blocks.
-        advice: what to do or to record next, in sentences, effects by their ids.
-        warnings: what was noticed, likewise.
+        baseline, corrected: scores of the simulation without and with the findings, on held-out blocks.
+        advice: what to do or to record next, in sentences that name effects by their ids.
+        warnings: sentences of the same form.
         candidates: the candidates of the search, best first.
         separability: of the leading candidates.
         traces: the residuals.
-        model: the simulation's sensor or system with the findings in it; None where there is none to apply.
-        evidence: what the tests say that are asked of the whole diagnosis.
-        world: how the simulation follows the recording, and the noise of the world around it.
-        recordings: names of the recordings that were diagnosed together; empty for a single one.
-        quick: whether it is a quick look, which draws no noise: no p-values, and no known rate of false alarms.
-        stop: why the search was stopped before its end, and what was not done; None where it was not.
+        model: the simulation's sensor or system with the findings in it; None if there is nothing to apply.
+        evidence: results of the tests of evidence of the whole diagnosis.
+        environment: goodness of fit of the simulation, and the noise environment.
+        recordings: names of the recordings that were diagnosed together; empty for a single recording.
+        quick: True for a quick look, which draws no surrogates: no p-values, and an unknown rate of false alarms.
+        stop: why the search was stopped before its end, and what was not done; None if it was not stopped.
 
     Example:
         >>> import torch
@@ -120,7 +124,7 @@ class Diagnosis:
     traces: Traces
     model: CorrectingModel | None = field(default=None, repr=False, compare=False)
     evidence: tuple[EvidenceResult, ...] = ()
-    world: NoiseEnvironment = field(default_factory=NoiseEnvironment)
+    environment: NoiseEnvironment = field(default_factory=NoiseEnvironment)
     recordings: tuple[str, ...] = ()
     quick: bool = False
     stop: Stop | None = None
@@ -135,18 +139,18 @@ class Diagnosis:
 
     @property
     def plot(self) -> DiagnosisPlot:
-        """The pictures of the report as axes of matplotlib, such as ``diagnosis.plot.residual()``."""
-        return DiagnosisPlot(self.traces, self.findings, self.candidates, self.separability, self.world)
+        """The figures of the report as axes of matplotlib, such as ``diagnosis.plot.residual()``."""
+        return DiagnosisPlot(self.traces, self.findings, self.candidates, self.separability, self.environment)
 
     @property
     def ceiling(self) -> HeldOutScore | None:
-        """What a smooth correction reaches instead of the findings, for comparison; None where it was not asked for."""
+        """The score of a smooth correction instead of the findings, for comparison; None if it was not computed."""
         smooth: SmoothCorrection | None = value_of(self.evidence, "remaining")
         return None if smooth is None else smooth.reached
 
     @property
     def remaining(self) -> tuple[str, ...]:
-        """Columns along which something smooth remains beside the findings."""
+        """Columns along which smooth structure remains after the findings."""
         smooth: SmoothCorrection | None = value_of(self.evidence, "remaining")
         return () if smooth is None else smooth.columns
 

@@ -1,8 +1,8 @@
-"""The numbers that decide a diagnosis, by stages, each with what it means and where it is from.
+"""Thresholds of a diagnosis by stage, each with its meaning and source.
 
-Those that set how finely something is computed (grids, orders, iterations, tolerances) stand beside their code. Gains
-and differences of log-likelihood are in nats, times in seconds, shares between 0 and 1. A number without a source was
-set by judgement, on the project's own generated recordings.
+Numerical accuracy (grids, orders, iterations, tolerances) is set next to the code. Gains and differences of
+log-likelihood are in nats, times in seconds, shares between 0 and 1. A number without a source was set by judgement, on
+the project's own generated recordings.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = [
 
 
 class _Stage:
-    """Refuses what no number of its kind can be: whole numbers from 1, others finite and not below 0."""
+    """Check the numbers of a stage: integers from 1, other numbers finite and not negative."""
 
     def __post_init__(self) -> None:
         for known in fields(self):  # type: ignore[arg-type]
@@ -31,14 +31,15 @@ class _Stage:
 
 @dataclass(frozen=True)
 class DriverSettings(_Stage):
-    """Which columns can drive an effect, and when values of one count as missing. All by judgement.
+    """Which columns can drive an effect, and when a value counts as missing. All by judgement.
 
     Attributes:
         fewest_finite: share of finite values below which a column is left out, with a warning.
-        repeats: correlation, of either sign, above which a column repeats a measured one and is left out.
-        wild: times the range of all other values that one is off to count as missing.
-        wild_share: share of the samples that may be wild; of more, none is.
-        wild_in_a_row: samples in a row that may be wild, unless all wild values are the same, as a code for none is.
+        repeats: absolute correlation above which a column repeats a measured column and is left out.
+        wild: distance of a value from the others, in ranges of all other values, above which it counts as missing.
+        wild_share: largest share of wild samples; with more, none counts as missing.
+        wild_in_a_row: largest number of consecutive wild samples, unless all wild values are equal, as a code for
+            "no value" is.
     """
 
     fewest_finite: float = 0.5
@@ -50,36 +51,40 @@ class DriverSettings(_Stage):
 
 @dataclass(frozen=True)
 class NoiseSettings(_Stage):
-    """Which samples count, and what noise an effect is judged against. By judgement, unless a reason is named.
+    """Which samples count, and the noise models for the tests of effects. By judgement, unless a reason is given.
 
     Attributes:
-        domain: half-width of the density's domain, over that of a rough fit of the simulation alone; all models share
-            it, so it has to hold whatever an effect does to residuals.
-        rejected_below: MKC weight below which a residual is rejected: it says nothing of noise or effect.
-        far: robust standard deviations from the wander beyond which a residual is rejected. Where outliers five of them
-            away are many, the likeliest density is so wide that most would count, and bursts of one sign pass for a
-            wander: seen on generated recordings.
-        neighbours: samples to either side that make up a neighbourhood.
-        crowded: share of outliers in its neighbourhood above which a sample counts as one too.
-        one_sided: robust standard deviations of neighbourhoods' means beyond which a neighbourhood lies to one side
-            together, as the mild samples of a burst do, and is rejected.
-        in_common: share of a channel's outliers that are outliers in others too, above which it is rejected in all.
-        bursts: largest share of the residuals that can be bursts; what is more is physics that is not in the model yet.
-        slow_courses: cosines of time that a wander is made of, in each channel; on 90 s they reach 0.67 Hz.
-        plateaus: families of wander beside a random walk. Of each the number of the course beyond which it falls off,
-            as a wander about a mean does, and that up to which a walk beside it is larger, 0 for none.
-        walk_first: nats that another family has to gain over a random walk: beside a spectrum of any form it can pass
-            for a walk, and then knows too little of its slowest courses.
-        doubted_family: nats that a family may be less likely and still have a say in standard errors.
-        wander_drawn: nats that a wander has to gain to be in the draws of noise: half of all white noise fits a small
-            one, and p-values of white noise were too careful with it.
-        plausible: nats that a colour may be less likely than the likeliest and still be drawn from: as many as one of
-            more numbers gains by chance.
-        told_wander: nats that a wander has to gain to be told of.
-        told_colour: sum of squared autoregression coefficients above which noise is called coloured.
-        pushed: nats that a push of a state, or slow noise of an output, has to gain to be in the noise of the world.
-        pushes: of these at most.
-        last_step: standard errors beyond which the final step of least squares is not taken, for the noise misfits.
+        domain: half-width of the density's domain, relative to that of a rough fit of the simulation without effects;
+            all models share it, so it has to hold with any effect.
+        rejected_below: MKC weight below which a residual is rejected.
+        far: robust standard deviations from the drift beyond which a residual is rejected. With many outliers at five
+            of them, the most likely density is so wide that most outliers would count, and bursts of one sign look
+            like a drift: seen on generated recordings.
+        neighbours: samples to either side that form a neighbourhood.
+        crowded: share of outliers in its neighbourhood above which a sample is rejected too.
+        one_sided: robust standard deviations of neighbourhoods' means beyond which a whole neighbourhood is rejected,
+            as in a burst of mild outliers of one sign.
+        in_common: share of a channel's outliers that are outliers in other channels too, above which outliers are
+            rejected in all channels.
+        bursts: largest share of the residuals that bursts can make up; a larger share is missing physics.
+        slow_courses: number of cosines of time that a drift consists of, in each channel; on 90 s they reach 0.67 Hz.
+        plateaus: drift families in addition to the random walk. Each is a pair: the number of the cosine beyond which
+            the family falls off, as a drift about a mean does; and the number up to which an added random walk is
+            larger, 0 without a walk.
+        walk_first: nats by which another family has to be more likely than a random walk: a free spectrum can imitate a
+            walk, and then underestimates its slowest components.
+        doubted_family: nats by which a family may be less likely and still widen standard errors.
+        drawn_drift: nats that a drift has to gain to be part of the surrogates: half of all white noise fits a small
+            drift, and p-values of white noise were too large with it.
+        plausible: nats by which a spectrum may be less likely than the best and still be drawn from: as many as a
+            spectrum with more numbers gains by chance.
+        reported_drift: nats that a drift has to gain to be reported.
+        reported_autocorrelation: sum of squared autoregression coefficients above which noise is reported as coloured.
+        disturbance_gain: nats that a disturbance of a state, or slow noise of an output, has to gain to enter the noise
+            model.
+        max_disturbances: largest number of such disturbances.
+        last_step: standard errors beyond which the final step of least squares is not taken, because the noise model
+            does not fit.
     """
 
     domain: float = 3.0
@@ -94,12 +99,12 @@ class NoiseSettings(_Stage):
     plateaus: tuple[tuple[float, float], ...] = ((25.0, 0.0), (25.0, 5.0))
     walk_first: float = 5.0
     doubted_family: float = 12.0
-    wander_drawn: float = 2.0
+    drawn_drift: float = 2.0
     plausible: float = 6.0
-    told_wander: float = 3.0
-    told_colour: float = 0.05
-    pushed: float = 6.0
-    pushes: int = 2
+    reported_drift: float = 3.0
+    reported_autocorrelation: float = 0.05
+    disturbance_gain: float = 6.0
+    max_disturbances: int = 2
     last_step: float = 5.0
 
     def __post_init__(self) -> None:
@@ -111,31 +116,33 @@ class NoiseSettings(_Stage):
 
 @dataclass(frozen=True)
 class SearchSettings(_Stage):
-    """How far the search goes, and when what it finds is doubted. All by judgement, on generated recordings.
+    """How far the search goes, and when its results are checked again. All by judgement, on generated recordings.
 
     Attributes:
-        fewest_samples: with fewer a diagnosis is refused: nothing can be said about structure.
-        refitted: physics that are fitted jointly, those that promise most around the fit without an effect.
-        refitted_elsewhere: the same around each other start, where residuals are clipped instead of rejected, say.
-        parts: pieces of the recording that are fitted alone, for where one model over all of it runs away.
-        part_better: scale of the residuals in a piece, over the smallest of the fits to all of it, below which
-            candidates are sought around the fit to that piece.
-        ran_away: times that a parameter has grown or shrunk, for candidates also to be sought from where it began.
-        leading: joint fits whose shapes are tried, and one more if it scores
-        third_share: above this share of the first one, and
-        third_nats: above so many nats.
-        shapes: tried of each of these.
-        hidden: share of the residuals that a fit without an effect may reject and one with it may not, and
-        smaller: scale with the effect over that without, which has to be above this, for the fit without it to hide
-            nothing: then the effect is judged by tangents there.
-        doubted: nats beyond all draws of noise up to which draws of other plausible noise are asked too.
-        own_noise: leading candidates that are fitted and compared under the pushes that each of them leaves,
-        behind: but for those whose first fit is so many nats behind the best one
-        behind_share: and this share of what that one gains. Set on a simulated cart and a servo, where they were 90 to
-            430 nats behind in the end.
-        stretches: a stretch of the recording is as long as one of so many.
-        in_one_stretch: share of an effect's evidence above which it lies in one stretch. If there are bursts of
-            outliers elsewhere, the stretch may be another, and the effect is judged without it.
+        fewest_samples: smallest number of samples for a diagnosis.
+        refitted: number of effects that are fitted jointly, the most promising at the fit without an effect.
+        refitted_elsewhere: number at each other starting point, such as a fit with clipped residuals.
+        parts: pieces of the recording that are fitted separately, in case a fit to all of it diverges.
+        part_better: scale of the residuals of a piece, relative to the smallest scale of the fits to the whole
+            recording, below which candidates are searched at the fit to that piece.
+        ran_away: factor by which a parameter has grown or shrunk, from which candidates are also searched at its
+            initial value.
+        leading: number of joint fits whose shapes are refined; a further fit is added above the two limits below.
+        third_share: limit for that fit, as a share of the best score.
+        third_nats: limit for that fit, in nats.
+        shapes: number of shapes tried for each of these fits.
+        hidden: share of the residuals that the fit without an effect rejects and a fit with the effect does not, above
+            which the rejection may hide the effect. The effect is then tested by tangents at the fit with it,
+        smaller: unless the scale with the effect, relative to that without, is above this limit.
+        doubted: nats beyond all surrogates up to which surrogates of other plausible noise are drawn too.
+        own_noise: number of leading candidates that are refitted and compared, each under its own remaining process
+            noise.
+        behind: nats behind the best first fit from which a candidate is not refitted, added to
+        behind_share: this share of the best gain. Set on a simulated cart and a servo, where such candidates ended 90
+            to 430 nats behind.
+        stretches: number of equal stretches in a recording.
+        in_one_stretch: share of an effect's evidence above which it is localised in one stretch. If there are bursts
+            of outliers elsewhere, the effect is tested without that stretch.
     """
 
     fewest_samples: int = 40
@@ -160,28 +167,28 @@ class SearchSettings(_Stage):
 
 @dataclass(frozen=True)
 class NamingSettings(_Stage):
-    """Which physics it is: handicaps of what can imitate others, and what counts as told apart.
+    """Which effect is named: penalties of candidates that can imitate others, and limits of separability.
 
-    Akaike's and Schwarz's criteria, one nat and half the logarithm of the number of samples for each number, are no
-    settings. Handicaps are by judgement, on generated recordings.
+    Akaike's and Schwarz's criteria, 1 nat and half the logarithm of the number of samples for each number, are not
+    settings. Penalties are by judgement, on generated recordings.
 
     Attributes:
-        separable: nats by which a rival has to be less likely to count as told apart: three standard errors of what
-            sets the two apart, whose square is twice the nats.
-        kept: share of the gain that a joint fit has to keep of what the search, which is linear, promised.
-        nameless: nats that a curve without a name gives: it can follow any named effect a little better.
-        over_driver: share of its gain that such a curve gives over a driver.
-        over_motion: the same over the motion itself, of which all forces are functions, and which repeats itself.
-        is_generalisation: nats that a form gives which has named ones as special cases, as a power law has drags: it can follow
-            any of them a little better.
-        roleless: share of its gain that a column of unknown role gives: it may be a consequence of a known driver.
-        follower: the same where it goes along with a known driver.
-        alike_columns: correlation, of either sign, above which columns go along.
-        event: share of its gain that an event in time gives where it goes along with a known driver.
-        alike_event: correlation, of either sign, above which it does.
-        shape_clear: nats by which the noise of the search has to prefer another shape, an onset say, to that of the
-            joint fit, which takes noise for white.
-        shape_alike: nats within which neighbouring shapes are not told apart; the middle one is taken.
+        separable: nats by which a rival has to be less likely to be distinguishable: three standard errors, because the
+            squared number of standard errors is twice the nats.
+        kept: share of the linear search's gain that a joint fit has to reach.
+        nameless: penalty of a curve without a name, in nats: it can follow any named effect slightly better.
+        over_driver: penalty of such a curve over a driver, as a share of its gain.
+        over_motion: the same over the motion itself, which repeats and which all forces depend on.
+        is_generalisation: penalty in nats of a form that includes named forms as special cases, as a power law includes
+            drags: it can follow each of them slightly better.
+        roleless: penalty of a column of unknown role, as a share of its gain: it may depend on a known driver.
+        follower: the same for a column that correlates with a known driver.
+        alike_columns: absolute correlation above which two columns count as correlated.
+        event: penalty of an event in time that correlates with a known driver, as a share of its gain.
+        alike_event: absolute correlation above which an event correlates with a driver.
+        shape_clear: nats by which the coloured noise of the search has to prefer another shape, such as an onset, to
+            that of the joint fit, which assumes white noise.
+        shape_alike: nats within which neighbouring shapes are equivalent; the middle of them is taken.
     """
 
     separable: float = 4.5
@@ -201,21 +208,21 @@ class NamingSettings(_Stage):
 
 @dataclass(frozen=True)
 class ConfirmationSettings(_Stage):
-    """When what was located counts as a finding, and when the search goes on. By judgement, unless a source is named.
+    """When a candidate counts as a finding, and when the search continues. By judgement, unless a source is named.
 
     Attributes:
-        folds: of the held-out blocks, at least 3. Five are usual (Hastie, Tibshirani & Friedman, "The Elements of
-            Statistical Learning", 2009, 7.10).
-        blocks_per_fold: blocks of a fold, all over the recording.
-        gap: share of the recording that is left out beside a held-out block; a correlation time at least.
-        beyond_doubt: nats beyond all draws of noise from which unseen blocks need only not to be clearly worse with a
+        folds: number of folds of the held-out blocks, at least 3. Five are usual (Hastie, Tibshirani & Friedman, "The
+            Elements of Statistical Learning", 2009, 7.10).
+        blocks_per_fold: number of blocks per fold, spread over the recording.
+        gap: share of the recording that is left out next to a held-out block; a correlation time at least.
+        beyond_doubt: nats beyond all surrogates from which held-out blocks need only not to be clearly worse with a
             first finding.
-        further: nats beyond all draws from which they need only to lean the way of a further one.
-        quiet: p-value of a first look beside a finding above which nothing further is searched; at least the level.
-        glance: draws of noise of a first look; more make it slower.
-        near: share of the recording within which a step is the one found before.
-        unrecorded: share of the level at which a cause that was not recorded is told: the question is asked last, of
-            recordings in which the search found nothing.
+        further: nats beyond all surrogates from which held-out blocks need only a positive gain for a further finding.
+        screening_level: p-value of the screening after a finding above which the search ends; at least the level.
+        screening_draws: number of surrogates of the screening; more make it slower.
+        near: share of the recording within which two steps count as the same step.
+        unrecorded: share of the level at which an unrecorded cause is reported: it is tested last, on recordings in
+            which the search found nothing.
     """
 
     folds: int = 5
@@ -223,8 +230,8 @@ class ConfirmationSettings(_Stage):
     gap: float = 0.01
     beyond_doubt: float = 8.0
     further: float = 20.0
-    quiet: float = 0.1
-    glance: int = 49
+    screening_level: float = 0.1
+    screening_draws: int = 49
     near: float = 0.05
     unrecorded: float = 0.1
 
@@ -236,35 +243,36 @@ class ConfirmationSettings(_Stage):
 
 @dataclass(frozen=True)
 class EvidenceSettings(_Stage):
-    """What is warned of beside a finding, and when a test says anything. By judgement, unless a source is named.
+    """When the tests of evidence report or warn. By judgement, unless a source is named.
 
     Attributes:
-        inlier: scales d of the density within which a sample is in the root mean squares that are reported, and
-        believed: the weight in the final fit above which it is.
-        shift: share of the recording by which a driver is shifted at most (Harris, bioRxiv 2020.11.29.402719).
-        shift_many: share of the copies that gain as much, above which the driver is doubted.
+        inlier: scales d of the density within which a sample enters the reported root mean squares.
+        believed: weight in the final fit above which it enters them.
+        shift: largest shift of a driver, as a share of the recording (Harris, bioRxiv 2020.11.29.402719).
+        shift_many: share of the shifted copies with at least the same gain, above which the driver is doubted.
         low_share: share of the samples, with the lowest values of a driver, that an extrapolation is fitted to.
-        low_spread: share of the driver's range that they have to cover.
-        switched: nats that a step has to lose in some stretch after its onset to come and go: one that
-            lasts loses c by chance with a probability below exp(-c), where samples are independent.
+        low_spread: share of the driver's range that these samples have to cover.
+        switched: nats that a step has to lose in some stretch after its onset to be intermittent: a lasting step loses
+            c by chance with a probability below exp(-c), for independent samples.
         switched_share: share of its whole gain that it has to lose there.
-        stand_in: p-value of what a wander's axes have in common, up to which a column may stand in for its cause.
-        stand_in_along: cosine, of either sign, from which the wander goes along the effect's direction.
-        remaining_coverage: of the intervals by which a smooth correction is better; a warning is to be rare.
-        remaining_gain: nats a sample that it has to gain, which makes residuals smaller by about a hundredth.
+        stand_in: largest p-value of the common part of a drift's axes for a column to be a proxy of its cause.
+        stand_in_along: absolute cosine from which the drift has the effect's direction.
+        remaining_coverage: coverage of the intervals for the gain of a smooth correction; high, to warn rarely.
+        remaining_gain: nats per sample that the correction has to gain, which reduce residuals by about 1 %.
         density_off: distance of two distribution functions, times the root of the number of samples, above which a
-            density is off: one set of samples in a thousand is (Kolmogorov); of a density that was fitted, far fewer.
-        student_closer: share of the density's distance that a Student-t's has to be below for a warning.
-        white_level: share of white channels that are called correlated, half of it by either criterion (Ljung & Box,
+            density is rejected: one set of samples in a thousand exceeds it (Kolmogorov); with a fitted density, far
+            fewer.
+        student_closer: ratio of the Student-t's distance to the density's below which a warning is given.
+        white_level: share of white channels that are called correlated, half of it by either test (Ljung & Box,
             Biometrika 65, 1978; Bartlett, J. R. Stat. Soc. Suppl. 8, 1946).
-        followed: share of an output's variation that a free run has to explain to follow it at all.
-        useful: share of all outputs' variation, each by its own, that the best model's free run has to explain for a
-            simulation that does not follow to be judged at all.
-        above_floor: times a declared noise floor above which a residual is more than the sensor's noise.
-        shape_level: chance with which a free curve is as much better where a name's shape is right, below which the
-            name is but the nearest in the catalogue, and
-        shape_nats: what the curve has to gain beyond Schwarz's price of its numbers.
-        disturbed: seconds from which a stretch of rejected samples is warned of; shorter ones are bursts of outliers.
+        followed: share of an output's variation that the open-loop simulation has to explain for a good fit.
+        useful: mean explained share over all outputs that the best model has to reach open loop, if the simulation's
+            fit is poor, for a verdict other than unfit.
+        above_floor: ratio to a declared noise floor above which a residual is more than the sensor's noise.
+        shape_level: p-value of a free curve's gain below which a name is only the nearest in the catalogue, and
+        shape_nats: the gain that the curve needs beyond Schwarz's penalty of its numbers.
+        disturbed: length in seconds from which a stretch of rejected samples is warned of; shorter stretches are bursts
+            of outliers.
     """
 
     inlier: float = 3.0
@@ -292,17 +300,18 @@ class EvidenceSettings(_Stage):
 
 @dataclass(frozen=True)
 class Settings:
-    """The numbers that decide, by the stages of a diagnosis; an argument of :func:`mkc_torch.diagnose`.
+    """The thresholds of a diagnosis by stage; an argument of :func:`mkc_torch.diagnose`.
 
-    Others than those given void what was measured of false alarms and power: measure again where the truth is known.
+    The published rates of false alarms and the power hold for the defaults only; with other numbers, measure them again
+    where the truth is known.
 
     Attributes:
         drivers: which columns can drive an effect.
-        noise: which samples count, and what noise an effect is judged against.
-        search: how far the search goes, and when what it finds is doubted.
-        naming: which physics it is, and what counts as told apart.
-        confirmation: when what was located counts as a finding.
-        evidence: what is warned of beside a finding.
+        noise: which samples count, and the noise models that an effect is tested against.
+        search: how far the search goes, and when its results are checked again.
+        naming: which effect is named, and limits of separability.
+        confirmation: when a candidate counts as a finding.
+        evidence: when tests of evidence report or warn.
 
     Example:
         >>> from dataclasses import replace
@@ -323,15 +332,15 @@ class Settings:
         for stage in fields(self):
             kind = type(stage.default)
             name = kind.__name__
-            refuse_other_type(stage.name, getattr(self, stage.name), kind, name, f"pass one, {name}()")
+            refuse_other_type(stage.name, getattr(self, stage.name), kind, name, f"pass {name}()")
 
 
 _QUICK = {"refitted": 3, "refitted_elsewhere": 1, "parts": 1, "leading": 1, "shapes": 2, "own_noise": 3}
-"""Most that a quick look refits, of each number of :class:`SearchSettings`."""
+"""Upper limits of numbers of :class:`SearchSettings` in a quick look."""
 
 
 def quick_settings(settings: Settings) -> Settings:
-    """The same for a quick look, which refits fewer candidates.
+    """Return the settings of a quick look, which refits fewer candidates.
 
     Example:
         >>> quick_settings(Settings()).search.own_noise

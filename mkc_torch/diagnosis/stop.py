@@ -1,4 +1,4 @@
-"""What a quick look or a stopped search leaves unknown, as a diagnosis says it first of all."""
+"""What a quick look or a stopped search leaves unknown, as sentences of a diagnosis."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _QUICK = (
 
 @dataclass(frozen=True)
 class Stop:
-    """Why a diagnosis ended before its search had, and what was not done.
+    """Why a diagnosis was stopped before its end, and what was not done.
 
     Attributes:
         reason: "time limit" or "interrupt".
-        seconds: after which it was stopped.
-        not_done: what was left undone, as nouns.
+        seconds: run time until the stop.
+        not_done: the missing parts, as nouns.
     """
 
     reason: Reason
@@ -34,7 +34,7 @@ class Stop:
 
 
 def notices(stop: Stop | None, *, quick: bool) -> tuple[str, ...]:
-    """The sentences.
+    """Return the sentences.
 
     Example:
         >>> notices(Stop("time limit", 60.2, ("the search for effects",)), quick=False)

@@ -1,4 +1,4 @@
-"""The verdict by four questions: does it follow, is the rest noise, is it physics with a name, what is it if not."""
+"""The verdict from four questions: is the fit good, is the residual noise, do the findings have names, what remains."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
 from mkc_torch.diagnosis.result import Finding
 from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["FitAssessment", "assess", "assess_baseline", "lost_from_the_start", "noise_environment", "verdict_of"]
+__all__ = ["FitAssessment", "assess", "assess_baseline", "impossible_rotations", "noise_environment", "verdict_of"]
 
 
 @dataclass(frozen=True)
 class FitAssessment:
-    """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left.
+    """Goodness of fit without and with the findings, and the remaining noise.
 
-    ``lost`` says that no finding can make it follow: its recorded turns are wrong.
+    Attributes:
+        follows: goodness of fit of the simulation without findings, by output.
+        corrected: goodness of fit with the findings, by output.
+        noise: the remaining noise of differential equations; None for other simulations.
+        lost: True if no finding can make the fit good: the recorded rotations are wrong.
     """
 
     follows: tuple[GoodnessOfFit, ...]
@@ -32,37 +36,37 @@ class FitAssessment:
     lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
-        """Whether neither the simulation nor it with its findings explains what the recording varies by."""
+        """Whether the simulation explains too little of the variation, both without and with its findings."""
         if self.lost:
             return True
         if not poor_fits(self.follows, settings.followed):
             return False
-        shares = [pooled(one) for one in (self.follows, self.corrected) if one]
+        shares = [pooled(fits) for fits in (self.follows, self.corrected) if fits]
         return not shares or max(shares) < settings.useful
 
 
 def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
-    """How the simulation alone follows each output."""
+    """Return the goodness of fit of the simulation without findings, by output."""
     free = base.free
     prepared = base.fit.model.prepared if free is None else free.model.prepared
-    floor = None if base.noise is None else base.noise.disturbed.sensor.tolist()
+    floor = None if base.noise is None else base.noise.selected.sensor.tolist()
     return goodness_of_fit(prepared, None if free is None else free.residual, declared, floor)
 
 
-def lost_from_the_start(base: ProcessNoiseFit) -> bool:
-    """Whether nothing is to be searched: its recorded turns are what they cannot be."""
+def impossible_rotations(base: ProcessNoiseFit) -> bool:
+    """Whether a search is pointless: the recorded rotations are impossible."""
     return bool(wrong_turns(base.fit.model.prepared))
 
 
 def assess(
     base: ProcessNoiseFit, final: FittedModel, declared: Mapping[str, float], noise: NoiseSettings
 ) -> FitAssessment:
-    """What stands around the simulation alone and with what was found.
+    """Assess the simulation without and with the findings.
 
     Args:
-        base: alone.
-        final: with all findings, under the pushes that are left.
-        declared: standard deviation of the white noise of outputs that it is known of.
+        base: the fit without findings.
+        final: the fit with all findings, under the remaining process noise.
+        declared: known standard deviations of the outputs' white noise.
         noise: settings.
     """
     follows = assess_baseline(base, declared)
@@ -70,7 +74,7 @@ def assess(
     corrected: tuple[GoodnessOfFit, ...] = ()
     if final.model.terms:
         free = refit_open_loop(final)
-        floor = [one.noise_floor for one in follows]
+        floor = [fit.noise_floor for fit in follows]
         corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared, floor)
     return FitAssessment(follows, corrected, left, bool(wrong_turns(final.model.prepared)))
 
@@ -78,7 +82,7 @@ def assess(
 def noise_environment(
     base: ProcessNoiseFit, final: FittedModel, known: FitAssessment, *, unfit: bool
 ) -> NoiseEnvironment:
-    """What is told of the world around."""
+    """Return the goodness of fit and the noise for the report."""
     prepared = final.model.prepared
     reasons: tuple[str, ...] = ()
     if unfit:
@@ -86,12 +90,14 @@ def noise_environment(
         reasons = reasons_of(fits, known.follows)
     if not isinstance(prepared, PreparedDynamics) or known.noise is None:
         return NoiseEnvironment(known.follows, reasons, starts=base.starts)
+    model, theta = final.model, final.parameters
+    noise = sized_noise(prepared, theta[: model.base], model.changes(theta), model.near, known.noise)
     return NoiseEnvironment(
         known.follows,
         reasons,
-        pushes_of(prepared, known.noise),
+        pushes_of(prepared, noise),
         dict(prepared.input_hold),
-        () if unfit else forcing_of(final, known.noise),
+        () if unfit else forcing_of(final, noise),
         base.starts,
     )
 
@@ -104,28 +110,28 @@ def verdict_of(
     white: bool,
     settings: EvidenceSettings,
 ) -> Verdict:
-    """The answer to the four questions.
+    """Return the verdict.
 
     Args:
-        known: what stands around the fits.
+        known: the assessed fits.
         findings: with their grades.
-        structure: whether there is some beyond the findings: a candidate that noise rarely makes, or what remains.
-        white: whether what is left over is white.
-        settings: the numbers that decide.
+        structure: whether there is structure beyond the findings: a significant candidate, or a smooth remainder.
+        white: whether the residual is white.
+        settings: thresholds.
     """
     if known.unfit(settings):
         return "unfit"
-    disturbances = () if known.noise is None else known.noise.disturbed.disturbances
-    # beside a finding a sensor's own slow error is noise, and told as that
-    pushed = any(one.at_rate or not findings for one in disturbances)
+    disturbances = () if known.noise is None else known.noise.selected.disturbances
+    # with a finding, a sensor's own slow error counts as noise
+    disturbed_state = any(disturbance.at_rate or not findings for disturbance in disturbances)
     above = [
-        one
-        for one in (known.corrected if findings else known.follows)
-        if one.floor_source == "declared" and one.residual > settings.above_floor * one.noise_floor
+        fit
+        for fit in (known.corrected if findings else known.follows)
+        if fit.floor_source == "declared" and fit.residual > settings.above_floor * fit.noise_floor
     ]
-    clean = white and not pushed and not structure and not above
+    clean = white and not disturbed_state and not structure and not above
     if not findings:
         follows = not poor_fits(known.follows, settings.followed)
         return "adequate" if clean and follows else "unexplained"
-    named = all(one.grade in ("left out", "real but small") for one in findings)
+    named = all(finding.grade in ("left_out", "small") for finding in findings)
     return "explained" if named and clean else "unexplained"

@@ -7,8 +7,8 @@ that is from.
 To add an effect to the catalogue, write it into a file of its own and enter it in the list of that folder's
 ``__init__``: ``sensor/`` and ``SENSOR`` for a vector sensor and the field around it (``ATTITUDE`` for a recorded
 attitude), ``dynamics/`` and ``DYNAMICS`` for rates, inputs and outputs of differential equations, ``paired/`` and
-``PAIRED`` for outputs of simulations without a state. What all effects share has defaults in :class:`Effect`; give what
-differs. The tests ask every effect of the catalogue the same questions, and so the new one.
+``PAIRED`` for outputs of simulations without a state. What all effects share has defaults in :class:`Effect`; override
+what differs. The tests run one common suite over every effect of the catalogue, the new effect included.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ __all__ = [
     "words_of",
 ]
 
-# what each of them asked for has a default in every effect
+# all that these classes required has a default in Effect
 AnchoredEffect = Effect
 """Another name of :class:`Effect`, for files of users that import it."""
 ContinuousEffect = Effect
@@ -73,17 +73,17 @@ SignalEffect = Effect
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""
 
-_WORDS = {effect.id: effect.display_name for effect in CATALOGUE}
-_WORDS_BY_KIND = {(effect.id, kind): name for effect in CATALOGUE for kind, name in effect.words_by_kind.items()}
+_NAMES = {effect.id: effect.display_name for effect in CATALOGUE}
+_NAMES_BY_KIND = {(effect.id, kind): name for effect in CATALOGUE for kind, name in effect.display_name_by_kind.items()}
 _CURVES = frozenset(effect.id for effect in CATALOGUE if effect.is_curve)
 
 
 def words_of(effect_id: str, kind: str = "") -> str:
-    """The name of an effect in words, as a report tells it; of a user's own, its id in words.
+    """The name of an effect in a report; for a user's own effect, its id in words.
 
     Args:
-        effect_id: its id.
-        kind: of the quantity that it acts on, such as "temperature", see :func:`kind_of`; empty if not known.
+        effect_id: id of the effect.
+        kind: kind of the quantity it acts on, such as "temperature", see :func:`kind_of`; empty if not known.
 
     Example:
         >>> words_of("linear_drag"), words_of("linear_drag", "temperature")
@@ -91,11 +91,11 @@ def words_of(effect_id: str, kind: str = "") -> str:
         >>> words_of("hard_iron_step"), words_of("coulomb_friction"), words_of("unknown"), words_of("supply_offset")
         ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue', 'supply offset')
     """
-    return _WORDS_BY_KIND.get((effect_id, kind)) or _WORDS.get(effect_id) or in_words(effect_id)
+    return _NAMES_BY_KIND.get((effect_id, kind)) or _NAMES.get(effect_id) or in_words(effect_id)
 
 
 def is_curve(effect_id: str) -> bool:
-    """Whether an effect of the catalogue with this id is a curve that follows the data and no physics.
+    """Whether the catalogue's effect with this id is a curve fitted to the data rather than physics.
 
     Example:
         >>> is_curve("unknown"), is_curve("linear_drag")

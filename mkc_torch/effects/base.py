@@ -1,4 +1,4 @@
-"""What an effect is: physics with an amplitude γ that changes what passes through a port of a simulation."""
+"""The base classes of effects: physics with an amplitude γ that changes the signal at a port of a simulation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Effect", "GainEffect", "in_words"]
 
-_WRITTEN = {
+_SPELLINGS = {
     "hard iron": "hard-iron",
     "soft iron": "soft-iron",
     "coulomb": "Coulomb",
@@ -27,77 +27,77 @@ _WRITTEN = {
     "wen": "Wen",
     "magnus": "Magnus",
 }
-"""Names of people, and words that are written as one."""
+"""Spellings that differ from the plain words of an id: names of people and hyphenated words."""
 
 
 class Effect(ABC):
     """A piece of physics with an amplitude γ of q numbers. At γ = 0 it changes nothing.
 
-    Derive from it, set ``id`` and what a user reads, and give :meth:`quantities` and :meth:`change`. All else has a
-    default, and is for an effect that is, or can do, more. :class:`GainEffect` has these two methods as well, for a
-    gain per channel times one course.
+    Derive from it, set ``id`` and the texts for the user, and implement :meth:`quantities` and :meth:`change`. All else
+    has a default. :class:`GainEffect` implements these two methods for a gain per channel times one waveform.
 
-    What a user reads:
+    Texts for the user:
 
     Attributes:
-        id: its name in ``diagnosis.json`` and ``model.json``; every effect needs one.
-        display_name: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
-            tells an effect that is not in the catalogue by its id in words.
-        words_by_kind: that name by the kind of quantity that it acts on, where the plain one does not suit it; default
-            none.
-        equation: what it adds, in symbols; :meth:`equation_of` where the shape chooses its form.
+        id: name in ``diagnosis.json`` and ``model.json``; required.
+        display_name: name in a sentence; default the id in words, see :func:`in_words`. A report knows only the id, so
+            an effect outside the catalogue appears there under its id in words.
+        display_name_by_kind: kind of the quantity it acts on to a name that suits this kind better; default none.
+        equation: what it adds, in symbols; override :meth:`equation_of` where the shape chooses its form.
         explanation: a sentence on what happens.
         advice: a sentence on what to do about it.
-        by_kind: explanation and advice by the kind of quantity that it acts on, such as "temperature", see
-            :mod:`mkc_torch.effects.kinds`, where the plain ones do not suit it; default none.
-        recurrence: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start";
-            default empty, nothing is said of it.
-        source: where the physics and its size are from.
-        plausible: largest plausible size of each number of the first quantity of γ; default infinite, nothing is known.
-        plausible_unit: the unit of ``plausible``; default empty, the quantity's own.
+        by_kind: kind of the quantity it acts on, such as "temperature", see :mod:`mkc_torch.effects.kinds`, to an
+            explanation and an advice that suit this kind better; default none.
+        recurrence: when it recurs in another recording, a clause such as "a warm-up comes again after a cold start";
+            default empty, not stated.
+        source: reference for the physics and its size.
+        plausible: largest plausible size of each number of the first quantity of γ; default infinite, not known.
+        plausible_unit: unit of ``plausible``; default empty, the quantity's unit.
 
     Where it is tried:
 
     Attributes:
         port: name or kind of the ports where it acts; default "sensor".
         needs: parts that such a port must have; default none.
-        excludes: parts that such a port must not have, as another form of the effect is for those; default none.
-        roles: of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` gives them; default empty, it
-            follows time or the signal alone.
-        driver_optional: whether one with roles is tried without a driver too; default False.
+        excludes: parts that such a port must not have, because another form of the effect covers them; default none.
+        roles: roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` assigns them; default
+            empty: it depends on time or the signal only.
+        driver_optional: whether an effect with roles is also tried without a driver; default False.
         follows_signal: whether its change depends on the signal at its port; default False.
-        location_specific: whether it is of the place or the attitude of its recording, which another one does not have; default
-            False.
-        is_curve: whether it is a curve that follows the data and no physics; default False. Named physics goes first.
-        is_generalisation: whether it has named ones as special cases, such as drags or an added mass; these go first where they
-            do as well. Default False.
-        unrecorded: whether it is a course along time that stands for a cause in no column; default False.
-        remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
-            input or an output those act first. Default False.
-        settles: parts of the clocks, "offset" or "rate", that it is the same as where it acts on all outputs: beside it
-            the simulation's own are held. Default none.
+        location_specific: whether it belongs to the place or the attitude of its recording and does not transfer to
+            another recording; default False.
+        is_curve: whether it is a curve fitted to the data rather than physics; default False. Named physics is
+            preferred to it.
+        is_generalisation: whether named effects, such as drags or an added mass, are special cases of it; they are
+            preferred where they fit as well. Default False.
+        unrecorded: whether it is a waveform in time whose cause is in no column; default False.
+        remembers: whether its change at a moment depends on the signal at other moments; such effects act first where
+            several are in series on an input or an output. Default False.
+        settles: parameters of the clocks, "offset" or "rate", that it is equivalent to where it acts on all outputs;
+            they are held at 0 while it is fitted. Default none.
 
-    Of its amplitude and its shape:
+    Amplitude and shape:
 
     Attributes:
-        least, most: bounds of each number of γ; default −∞ and ∞.
-        relative: name of a number of its shapes to the part of the signal it is a share of, or "driver", and whether
-            of its "typical" or its "largest" size; such numbers are in that part's unit once a recording is known.
-        continuous: name of a number that can take any value, and is closed in on after the search of the grid, to its
-            least and largest value as shares of the recording's length; such a number is in s.
-        fitted_shape: name of a number that is fitted together with γ once the effect is known to be there, to its
-            least and greatest value, in the same shares where it is relative or continuous. ``change`` and
-            ``quantities`` have to take it as a tensor, and ``change`` to have a slope in it. One that is always
-            positive is fitted as its logarithm.
-        natural_ends: of numbers that are fitted, which end of the range, "least" or "greatest", is a value like any
-            other; at another end a number is to be doubted. Default none.
-        form_parameters: names of the numbers that choose a form and are not measured; the equation tells them.
-        shape_units: name of a number of the shape to its unit, of those that have one whatever is recorded; default
-            times that are called onset, lag, delay or time_constant.
-        plot_axis: the part of the signal that it mainly follows, along which its curve is drawn; default none.
-        reduces_to: another effect that this one is with fewer numbers, its shape among this one's; default None.
-        simpler: the same physics with fewer numbers in γ, each of which stands for several of this one's, one after
-            the other; its shapes are the same. It is taken where it predicts unseen blocks as well. Default None.
+        lower, upper: bounds of each number of γ; default −∞ and ∞.
+        relative: name of a shape parameter to the part of the signal, or "driver", that it is a share of, and whether
+            of its "typical" or its "largest" size; once a recording is known the parameter is in that part's unit.
+        continuous: name of a shape parameter that can take any value and is refined after the grid search, to its
+            smallest and largest value as shares of the recording's length; the parameter is in s.
+        fitted_shape: name of a shape parameter that is fitted jointly with γ once the effect is found, to its smallest
+            and largest value, as shares where it is relative or continuous. ``change`` and ``quantities`` must accept
+            it as a tensor, and ``change`` must be differentiable in it. An always positive one is fitted as its
+            logarithm.
+        natural_ends: name of a fitted shape parameter to the ends of its range, "least" or "greatest", that are
+            ordinary values; an estimate at any other end is doubtful. Default none.
+        form_parameters: names of shape parameters that choose a form and are not measured; the equation states them.
+        shape_units: name of a shape parameter to its unit, for those whose unit does not depend on the recording;
+            default s for onset, lag, delay and time_constant.
+        plot_axis: part of the signal over which its curve is drawn; default none.
+        reduces_to: a special case of this effect with fewer numbers, whose shape is a part of this effect's shape;
+            default None.
+        simpler: the same physics with fewer numbers in γ, each shared by several consecutive numbers of this effect's
+            γ, and with the same shapes. It is preferred where it predicts unseen blocks as well. Default None.
 
     Example:
         >>> import torch
@@ -120,7 +120,7 @@ class Effect(ABC):
     explanation: str = ""
     advice: str = ""
     by_kind: Mapping[str, tuple[str, str]] = {}
-    words_by_kind: Mapping[str, str] = {}
+    display_name_by_kind: Mapping[str, str] = {}
     recurrence: str = ""
     source: str = ""
     plausible: float = math.inf
@@ -152,14 +152,14 @@ class Effect(ABC):
 
     @abstractmethod
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
-        """The parameters that γ holds, in its order; their sizes add up to q."""
+        """The parameters in γ, in its order; their sizes add up to q."""
 
     @abstractmethod
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        """What the effect adds to the c channels of its port."""
+        """The change, (N, c), that the effect adds to the c channels of its port."""
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        """The grid of shapes that is searched, for a recording at these times in s; default one without numbers."""
+        """The grid of shapes to search, for a recording at these times in s; default one empty shape."""
         return ({},)
 
     @property
@@ -176,17 +176,17 @@ class Effect(ABC):
         return self.lower >= 0.0
 
     def within_a_sample(self, shape: Shape, step: float) -> bool:  # noqa: ARG002
-        """Whether this shape says no more than what an input does between two samples, ``step`` s apart."""
+        """Whether this shape only changes an input between two samples, ``step`` s apart."""
         return False
 
     def reports(self, name: str) -> bool:
-        """Whether a number of the shape is told as a parameter; default all that choose no form."""
+        """Whether reports list a shape parameter; default all but the ``form_parameters``."""
         return name not in self.form_parameters
 
     def unit_of_shape(self, name: str, context: Context) -> str:
-        """The unit of a number of the shape; empty where it has none.
+        """The unit of a shape parameter; empty where it has none.
 
-        Default that of what it is ``relative`` to, else the one in ``shape_units``.
+        Default the unit of what it is ``relative`` to, else its unit in ``shape_units``.
         """
         if name in self.relative:
             part = self.relative[name][0]
@@ -194,70 +194,70 @@ class Effect(ABC):
         return self.shape_units.get(name, "")
 
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
-        """The equation in the form that the shape chose; default ``equation``."""
+        """The equation in the form that the shape chooses; default ``equation``."""
         return self.equation
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
-        """The explanation for the kind of quantity that it acts on, with sizes where it tells them."""
+        """The explanation for the kind of quantity it acts on, with sizes where the effect states them."""
         return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[0]
 
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
-        """The advice for the kind of quantity that it acts on, with sizes where it tells them."""
+        """The advice for the kind of quantity it acts on, with sizes where the effect states them."""
         return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[1]
 
     def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
-        """What each number of a quantity is, in their order; default empty, they are one for each channel."""
+        """Labels of the numbers of a quantity, in order; default empty: one number for each channel."""
         return ()
 
     def moments(self, context: Context) -> tuple[float, ...]:  # noqa: ARG002
-        """When it sets in, in s and ascending, where that is several moments known beforehand; default none."""
+        """Its onsets in s, ascending, where they are known before the fit; default none."""
         return ()
 
     def bind(self, shape: Shape, context: Context) -> Shape:  # noqa: ARG002
-        """The shape with what it needs to know of this recording to act on another one; default as it is."""
+        """The shape with all that the effect needs from this recording to act on another; default unchanged."""
         return shape
 
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:  # noqa: ARG002
-        """Of an effect that is ``basis @ γ``: many of its shapes are tried in no time. Ask ``has_basis`` before."""
+        """The basis of an effect that is ``basis @ γ``, whose shapes are fast to search. Check ``has_basis`` first."""
         self._refuse("basis")
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
-        """Of an effect that is ``gain ⊗ waveform``: the waveform at a gain of one. Ask ``has_course`` before."""
-        self._refuse("course")
+        """The waveform at a gain of 1 of an effect ``gain ⊗ waveform``. Check ``has_waveform`` first."""
+        self._refuse("waveform")
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
-        """Of an effect that is bound to the time of its recording: what a later one has of it. Ask ``persistent_change`` before."""
+        """What an effect bound to a time adds to a later recording. Check ``persistent_change`` first."""
         self._refuse("lasting")
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
-        """An expression of Python with torch for each channel: what is added to it. Ask ``has_code`` before.
+        """For each channel a Python expression with torch of the change. Check ``has_code`` first.
 
         Args:
-            gamma: the effect's numbers.
+            gamma: the effect's amplitudes.
             shape: its shape.
-            names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "memory", "memory_2"
-                and so on of internal states; "zero" is what makes a temperature absolute.
+            names: part of the port's signal to its expression, such as ``{"own": "x.speed"}``; internal states are
+                "memory", "memory_2" and so on; "zero" is the offset that makes a temperature absolute.
         """
         self._refuse("code")
 
     @property
     def has_basis(self) -> bool:
-        """Whether it gives a :meth:`basis`."""
+        """Whether it implements :meth:`basis`."""
         return type(self).basis is not Effect.basis
 
     @property
-    def has_course(self) -> bool:
+    def has_waveform(self) -> bool:
         """Whether its change is a gain per channel times its :meth:`waveform`."""
         return type(self).change is GainEffect.change
 
     @property
     def persistent_change(self) -> bool:
-        """Whether it says what is :meth:`lasting`."""
+        """Whether it implements :meth:`lasting`."""
         return type(self).lasting is not Effect.lasting
 
     @property
     def has_code(self) -> bool:
-        """Whether it can be written out as :meth:`code`; ``code = Effect.code`` gives that up in a derived one."""
+        """Whether it implements :meth:`code`; a derived class opts out by ``code = Effect.code``."""
         return type(self).code is not Effect.code
 
     def _refuse(self, method: str) -> NoReturn:
@@ -265,10 +265,10 @@ class Effect(ABC):
 
 
 class GainEffect(Effect):
-    """An effect that adds a gain per channel times one course: ``gain ⊗ waveform``. Give it a ``waveform``.
+    """An effect that adds a gain per channel times one waveform, ``gain ⊗ waveform``. Implement :meth:`waveform`.
 
     Attributes:
-        gain: what a user reads the gain as.
+        gain: name of the gain in reports.
 
     Example:
         A user's own effect, a bus voltage that shifts the offset:
@@ -290,7 +290,7 @@ class GainEffect(Effect):
     gain: str = "gain"
 
     def unit(self, context: Context) -> str:
-        """Of the gain: the signal's unit, for each unit of the driver."""
+        """The unit of the gain: the signal's unit per unit of the driver."""
         return per(context.signal_unit, context.units[0]) if context.units else context.signal_unit
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
@@ -301,13 +301,13 @@ class GainEffect(Effect):
 
 
 def in_words(effect_id: str) -> str:
-    """An id in words: blanks for underscores, people's names with a capital.
+    """An id in words: blanks for underscores, names of people capitalised.
 
     Example:
         >>> in_words("soft_iron_step"), in_words("coulomb_friction"), in_words("supply_offset")
         ('soft-iron step', 'Coulomb friction', 'supply offset')
     """
-    told = f" {effect_id.replace('_', ' ')} "
-    for plain, written in _WRITTEN.items():
-        told = told.replace(f" {plain} ", f" {written} ")
-    return told[1:-1]
+    words = f" {effect_id.replace('_', ' ')} "
+    for plain, written in _SPELLINGS.items():
+        words = words.replace(f" {plain} ", f" {written} ")
+    return words[1:-1]

@@ -1,4 +1,4 @@
-"""Courses along a recording that several effects are made of."""
+"""Waveforms along a recording that several effects share."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ if TYPE_CHECKING:
 
 __all__ = ["after", "combined", "gained", "in_contact", "lagged", "per", "played"]
 
-_LEAST = 1e-12
+_MIN_RATIO = 1e-12
+"""Lower limit of a sampling interval over the lag, a divisor."""
 
 
-def gained(course: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
-    """A course times a gain for each channel."""
-    return course.unsqueeze(-1) @ gain.unsqueeze(0)
+def gained(waveform: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
+    """A waveform times a gain for each channel, (N, c)."""
+    return waveform.unsqueeze(-1) @ gain.unsqueeze(0)
 
 
 def per(unit: str, other: str) -> str:
-    """The unit of one for each of the other.
+    """The unit of a quotient, with K for a difference in °C.
 
     Example:
         >>> per("µT", "A"), per("µT", ""), per("µT", "°C")
@@ -33,28 +34,28 @@ def per(unit: str, other: str) -> str:
 
 
 def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
-    """0 before the onset, 1 from it on."""
+    """A unit step: 0 before the onset, 1 from the onset on."""
     return (time >= onset).to(time.dtype)
 
 
 def combined(basis: Float[Tensor, "N c q"], gamma: Float[Tensor, " q"]) -> Float[Tensor, "N c"]:
-    """``basis @ γ``."""
-    # as one matrix: with many γ at once the basis of each sample would be copied for each of them
+    """The change ``basis @ γ``, (N, c)."""
+    # as one matrix: a batch of γ would otherwise copy the basis of each sample for each γ
     return (basis.flatten(0, 1) @ gamma).unflatten(0, basis.shape[:2])
 
 
 def lagged(
     values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float, run: Int[Tensor, " N"] | None = None
 ) -> Float[Tensor, " N"]:
-    """Values behind a first-order lag with this time constant in s, at rest before the first sample of each run.
+    """Values behind a first-order lag, in steady state before the first sample of each run.
 
-    ``lag ẏ = x − y``, exact for intervals of any length where x goes straight from sample to sample.
+    Solves ``lag ẏ = x − y`` exactly for x linear between samples, at any sampling intervals.
 
     Args:
         values: x at the samples.
-        time: of the samples in s.
-        lag: in s; nothing changes where it is not positive.
-        run: of each sample's run; None where a run begins when time goes back, and only there.
+        time: times of the samples in s.
+        lag: time constant in s; if not positive, the values are returned unchanged.
+        run: number of each sample's run; None: a run begins only where time goes back.
 
     Example:
         >>> time = torch.arange(0.0, 5.0, 0.01, dtype=torch.float64)
@@ -66,7 +67,7 @@ def lagged(
     first = first_of_runs(run_numbers(time) if run is None else run)
     ratio = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0) / lag
     keep = torch.where(first, 0.0, torch.exp(-ratio))
-    ratio = ratio.clamp(min=_LEAST)
+    ratio = ratio.clamp(min=_MIN_RATIO)
     late = torch.where(first, 0.0, -torch.expm1(-ratio) / ratio)
     away = values - values[0]
     before = torch.cat([away[:1], away[:-1]])
@@ -79,13 +80,13 @@ def played(
     half_gap: float | Tensor,
     run: Int[Tensor, " N"] | None = None,
 ) -> Float[Tensor, " N"]:
-    """Values behind play, in the middle of the gap at the first sample of each run.
+    """Values behind backlash, in the middle of the gap at the first sample of each run.
 
     Args:
-        values: of the drive, at the samples.
-        time: of the samples in s.
+        values: values of the drive at the samples.
+        time: times of the samples in s.
         half_gap: half the width of the gap, in the values' unit; at least 0.
-        run: of each sample's run; None where a run begins when time goes back, and only there.
+        run: number of each sample's run; None: a run begins only where time goes back.
 
     Example:
         >>> there_and_back = torch.tensor([0.0, 1.0, 3.0, 2.0, 1.0, 0.0])
@@ -99,13 +100,13 @@ def played(
 
 
 def in_contact(values: Float[Tensor, " N"], gap: Float[Tensor, " N"]) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
-    """Where a load behind play was last in contact with its drive: the samples, and the sides, 0 where there is no gap.
+    """The samples at which a load behind backlash was last in contact with its drive, and the sides, 0 without a gap.
 
-    By these what is behind play is differentiated without differentiating each step of the way.
+    With them the backlash is differentiated without differentiating through the recursion over the samples.
 
     Args:
-        values: of the drive.
-        gap: half the width of the gap at each sample; 0 at the first one of each run.
+        values: values of the drive.
+        gap: half the width of the gap at each sample; 0 at the first sample of each run.
 
     Example:
         >>> in_contact(torch.tensor([0.0, 1.0, 3.0, 2.0]), torch.tensor([0.0, 1.0, 1.0, 1.0]))

@@ -1,4 +1,4 @@
-"""What kind of quantity a state, an input or an output is, as far as its unit and its name tell."""
+"""The kind of quantity of a state, an input or an output, from its unit and its name."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from mkc_torch.effects.context import Context
 __all__ = ["CELSIUS", "MOTION", "Kind", "kind_at", "kind_of", "zero_of"]
 
 Kind = Literal["temperature", "angle", "rotation", "position", "speed", "level", "voltage", "current", "pressure", ""]
-"""Empty where it is not known."""
+"""Kind of a quantity; empty if not known."""
 
 MOTION: tuple[Kind, ...] = ("angle", "rotation", "position", "speed")
-"""The kinds of which mechanics speaks: with speeds, loads and springs."""
+"""The mechanical kinds."""
 
 CELSIUS = ("°C", "degC", "deg_C", "celsius", "Celsius")
 """Ways to write degrees Celsius."""
 
 _JOINTS = "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw"
-"""Words of which the names of joints' angles are made."""
+"""Words in the names of joint angles."""
 
 _UNITS: dict[str, Kind] = {
     **dict.fromkeys((*CELSIUS, "K", "degK", "kelvin", "°F", "degF"), "temperature"),
@@ -42,15 +42,15 @@ _NAMES: dict[str, Kind] = {
 }
 
 _LEVELS: tuple[Kind, ...] = ("position", "voltage", "current", "")
-"""Kinds of units that the sensor of a level has; its name decides."""
+"""Kinds of the units of level sensors; a name with "level" takes precedence over them."""
 
 
 def kind_of(unit: str, name: str = "") -> Kind:
-    """The kind of a quantity by its unit; by its name where the unit tells nothing, or where it is called a level.
+    """The kind of a quantity by its unit; by its name where the unit is empty, or where the name is a level's.
 
     Args:
-        unit: as the recording or the simulation has it.
-        name: of the column or the state.
+        unit: unit in the recording or the simulation.
+        name: name of the column or the state.
 
     Example:
         >>> kind_of("degC"), kind_of("", "temp_2"), kind_of("V", "level1"), kind_of("V"), kind_of("", "x")
@@ -65,9 +65,9 @@ def kind_of(unit: str, name: str = "") -> Kind:
 
 
 def kind_at(context: Context) -> Kind:
-    """The kind of what an effect acts on: of a state without a speed a length is a level.
+    """The kind of the quantity an effect acts on; a length without a speed is a level.
 
-    At the rate of a state it is the state's, at an input or an output its own.
+    At the rate of a state it is the kind of the state, at an input or an output that of the input or output.
     """
     name = context.parts.get("own", context.channels[0] if context.channels else "")
     kind = kind_of(context.part_units.get("own", context.signal_unit), name)
@@ -75,7 +75,7 @@ def kind_at(context: Context) -> Kind:
 
 
 def zero_of(unit: str) -> float:
-    """What makes a temperature in this unit absolute, in K.
+    """The offset in K that makes a temperature in this unit absolute.
 
     Example:
         >>> zero_of("°C"), zero_of("degC"), zero_of("K")

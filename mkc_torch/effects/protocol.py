@@ -1,4 +1,4 @@
-"""Where files that were written for users look for :func:`lagged`; today it is in :mod:`mkc_torch.effects`."""
+"""The former module of :func:`lagged`, for generated files that import it; it is in :mod:`mkc_torch.effects`."""
 
 from mkc_torch.effects.courses import lagged
 

@@ -1,4 +1,4 @@
-"""Which run of a recording each sample is of, and what is passed on from sample to sample within a run."""
+"""Run numbers of samples, and recurrences along the samples within runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["first_of_runs", "passed_on", "passed_on_within", "run_numbers"]
 
 
 def run_numbers(time: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
-    """Of each sample's run: where time goes back, a new one begins.
+    """Number of each sample's run; a run begins where time goes back.
 
     Example:
         >>> run_numbers(torch.tensor([0.0, 1.0, 0.0, 1.0]))
@@ -29,10 +29,10 @@ def first_of_runs(run: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
 
 
 def passed_on(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """``y[k] = factor[k] y[k-1] + level[k]``, from ``y[-1] = 0``: affine maps composed by doubling.
+    """The recurrence ``y[k] = factor[k] y[k-1] + level[k]`` from ``y[-1] = 0``, by a parallel scan of affine maps.
 
-    A factor of 0 begins anew. Its derivatives are recurrences of the same factors, so that none of them differentiates
-    the composition. Blelloch, "Prefix sums and their applications" (1990).
+    A factor of 0 restarts it. Its derivatives are recurrences with the same factors, so the scan itself is never
+    differentiated. Blelloch, "Prefix sums and their applications" (1990).
 
     Example:
         >>> passed_on(torch.tensor([0.0, 0.5, 0.5]), torch.tensor([4.0, 0.0, 1.0]))
@@ -56,7 +56,7 @@ def _composed(factor: Float[Tensor, "*#b N"], level: Float[Tensor, "*#b N"]) -> 
 
 
 def _before(values: Float[Tensor, "*b N"]) -> Float[Tensor, "*b N"]:
-    """Each value's predecessor; 0 before the first."""
+    """Each value's predecessor; 0 for the first."""
     return torch.cat([torch.zeros_like(values[..., :1]), values[..., :-1]], -1)
 
 
@@ -105,9 +105,9 @@ class _PassedOn(torch.autograd.Function):
 
 
 def passed_on_within(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """``y[k] = max(low[k], min(high[k], y[k-1]))``: clamps are composed by doubling, for one after another is a clamp.
+    """The recurrence ``y[k] = max(low[k], min(high[k], y[k-1]))``, by a parallel scan: a clamp of a clamp is a clamp.
 
-    Where ``low`` and ``high`` are one, as at the first sample they have to be, it begins anew.
+    It restarts where ``low`` equals ``high``, as must be the case at the first sample.
 
     Example:
         >>> passed_on_within(torch.tensor([0.0, 1.0, 0.5, -2.0]), torch.tensor([0.0, 3.0, 2.5, 0.0]))
@@ -115,9 +115,9 @@ def passed_on_within(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> Flo
     """
     shift = 1
     while shift < len(low):
-        least, most = low[shift:], high[shift:]
-        tail_low = torch.maximum(least, torch.minimum(most, low[:-shift]))
-        tail_high = torch.maximum(least, torch.minimum(most, high[:-shift]))
+        floor, ceiling = low[shift:], high[shift:]
+        tail_low = torch.maximum(floor, torch.minimum(ceiling, low[:-shift]))
+        tail_high = torch.maximum(floor, torch.minimum(ceiling, high[:-shift]))
         low, high = torch.cat([low[:shift], tail_low]), torch.cat([high[:shift], tail_high])
         shift *= 2
     return low

@@ -1,4 +1,4 @@
-"""What effects share whose amplitude is a share: none of it at γ = 0, all of it at γ = 1."""
+"""Effects whose amplitude is a share: absent at γ = 0, complete at γ = 1."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ if TYPE_CHECKING:
 __all__ = ["CORNER", "SOFTNESS", "Saturation", "ShareEffect", "soft_clip"]
 
 CORNER = 0.1
-"""Softness of a corner that is searched; see :func:`soft_clip`."""
+"""Softness of a corner in the grid search; see :func:`soft_clip`."""
 
 SOFTNESS = 0.02, 2.0
-"""Of a corner that is fitted."""
+"""Range of the softness of a corner in a fit."""
 
 
 class ShareEffect(GainEffect):
-    """An effect that is there to a share between 0 and 1, on an input or an output. Give it a ``waveform``."""
+    """An effect on an input or an output whose amplitude is a share between 0 and 1. Implement ``waveform``."""
 
     port = "input"
     follows_signal = True
     natural_ends: Mapping[str, tuple[str, ...]] = {"softness": ("least", "greatest")}
-    least, most = 0.0, 1.0
+    lower = 0.0
+    upper = 1.0
     needs: tuple[str, ...] = ("own",)
     plausible = 1.5
     gain = "share"
@@ -39,7 +40,7 @@ class ShareEffect(GainEffect):
 
 
 class Saturation(ShareEffect):
-    """A signal that goes no further than a limit on either side. Give it its ``limits``, as shares of the largest."""
+    """A signal limited on both sides. Set the ``limits`` to search, as shares of the largest value."""
 
     relative: Mapping[str, tuple[str, str]] = {"limit": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"limit": (0.2, 0.99)}
@@ -60,21 +61,21 @@ class Saturation(ShareEffect):
 
 
 def soft_clip(values: Float[Tensor, " N"], limit: float | Tensor, softness: float | Tensor) -> Float[Tensor, " N"]:
-    """Values that go no further than a limit on either side, with a rounded corner there.
+    """Values limited on both sides, with rounded corners.
 
     ``s c ln(cosh((u + b) / w) / cosh((u − b) / w))`` with the corner at ``b = c tanh(1 / (2 s))`` and ``w = 2 s b``:
-    its slope at zero is one and its limit is c, whatever the softness s. A small one is a hard clip, a large one
+    its slope at 0 is 1 and its limit is c for any softness s. A small softness is a hard clip, a large softness
     ``c tanh(u / c)``.
 
     Args:
         values: u.
         limit: c, in the values' unit; positive.
-        softness: s, the corner's width as a share of where it is; positive.
+        softness: s, the width of the corner as a share of its position; positive.
 
     Example:
-        >>> [round(float(one), 2) for one in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 0.02)]
+        >>> [round(float(u), 2) for u in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 0.02)]
         [0.5, 0.99, 1.0]
-        >>> [round(float(one), 2) for one in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 3.0)]
+        >>> [round(float(u), 2) for u in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 3.0)]
         [0.46, 0.76, 1.0]
     """
     softness = torch.as_tensor(softness, dtype=values.dtype, device=values.device)
@@ -84,5 +85,5 @@ def soft_clip(values: Float[Tensor, " N"], limit: float | Tensor, softness: floa
 
 
 def _log_cosh(values: Tensor) -> Tensor:
-    """Less its constant."""
+    """log cosh plus log 2."""
     return values.abs() + torch.nn.functional.softplus(-2.0 * values.abs())

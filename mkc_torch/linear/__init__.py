@@ -1,9 +1,9 @@
 """Linear regression, one estimator a file, all with ``fit(X, Y, sample_weight=None)`` and ``coef_``.
 
 X is (*, N, m, n) with Y (*, N, m), N samples of m channels and n coefficients, or (*, N, n) with Y (*, N) for one
-channel; ``*`` are batch dimensions. With X (A, B, n) and Y (A, B) both readings fit. It is A samples of B channels,
-unless B exceeds n and also exceeds 16 or A: more channels than that are not meant, and it is A problems of B samples.
-``X.unsqueeze(-2), Y.unsqueeze(-1)`` says "one channel" whatever the sizes.
+channel; ``*`` are batch dimensions. X (A, B, n) with Y (A, B) fits both shapes. It is read as A samples of B channels,
+unless B exceeds n and also exceeds 16 or A; then it is read as A problems of B samples.
+``X.unsqueeze(-2), Y.unsqueeze(-1)`` means one channel whatever the sizes.
 """
 
 from mkc_torch.linear._estimator import NotFittedError

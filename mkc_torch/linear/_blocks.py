@@ -1,7 +1,7 @@
-"""What one pass over the rows of a regression adds up for the MKC likelihood, a block of rows at a time.
+"""Sums over the rows of a regression that the MKC likelihood needs, computed in one pass, a block of rows at a time.
 
-A block stays in a processor's cache while its residual, weights and sums are made, so that a pass reads the data once.
-Whatever the dtype of the data, blocks and sums are float64. Sums of blocks add up to those of all rows.
+A block stays in the processor's cache while its residual, weights and sums are computed, so a pass reads the data once.
+Blocks and sums are float64 whatever the dtype of the data. The sums of blocks add up to those of all rows.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
 VALUES = 1 << 15
-"""Values in a block: 2.4 MB of nine columns. Half as many take a fifth longer, twice as many two fifths."""
+"""Values in a block: 2.4 MB with nine columns. Half as many take 20 % longer, twice as many 40 %."""
 
 _STRIP = 1 << 12
-"""Rows whose products are formed at once; of 16384 they take twice as long."""
+"""Rows whose products are formed at once; 16384 rows take twice as long."""
 
 _PLAIN_KAPPA = 1e-2
-"""From here on differences of sums over κ and κ² lose at most four digits, so that three sums give every derivative."""
+"""κ from which differences of sums over κ and κ² lose at most four digits, so that three sums give all derivatives."""
 
 
 class Block(NamedTuple):
@@ -44,10 +44,10 @@ class Density(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What a step in the coefficients, κ and log d needs of the rows.
+    """Sums over the rows for a step in the coefficients, κ and log d.
 
-    ``terms`` are what :func:`energy_of` makes the energy and its derivatives of; ``score`` is the sum of ``w e x``, w
-    being the kernel's weight.
+    :func:`energy_of` computes the energy and its derivatives from ``terms``. ``score`` is the sum of ``w e x``, where w
+    is the weight.
     """
 
     weight: Float64[Tensor, " m"]
@@ -59,9 +59,9 @@ class Sums(NamedTuple):
 
 
 class CurvatureSums(NamedTuple):
-    """What changes little from step to step: curvature by the coefficients, and more that is wanted but once.
+    """Sums that change little from step to step: the curvature by the coefficients, and sums needed only once.
 
-    ``curvature`` is the Hessian of the summed energy, ``spread`` the products of each sample's score with itself,
+    ``curvature`` is the Hessian of the summed energy, ``spread`` the products of each sample's score,
     ``tilt`` the sum of ``q w e x`` with ``q = e² / (2 d²)``, ``moment`` that of ``e x`` and ``square`` that of ``e²``.
     """
 
@@ -76,7 +76,7 @@ class CurvatureSums(NamedTuple):
 
 
 class ResidualRange(NamedTuple):
-    """Least and largest residual of each channel among the samples in use."""
+    """Smallest and largest residual of each channel over the samples in use."""
 
     low: Float64[Tensor, " m"]
     high: Float64[Tensor, " m"]
@@ -92,7 +92,7 @@ def blocks(
     frame: Float64[Tensor, "n n"] | None = None,
     values: int = VALUES,
 ) -> Iterator[Block]:
-    """Rows times ``frame``, targets and weights in blocks of so many values."""
+    """Yield rows times ``frame``, targets and weights in blocks of ``values`` values."""
     step = max(1, values // Y.shape[-1])
     for first in range(0, Y.shape[0], step):
         part = slice(first, first + step)
@@ -119,7 +119,7 @@ def residual_range(block: Block, coef: Float64[Tensor, " n"]) -> ResidualRange:
 
 
 def kernel(error: Float64[Tensor, "b m"], density: Density) -> tuple[Float64[Tensor, "b m"], Float64[Tensor, "b m"]]:
-    """q = e² / (2 d²) and the kernel's weight ``exp(-κ q)``."""
+    """Return ``q = e² / (2 d²)`` and the weight ``exp(-κ q)``."""
     q = error.square() * (0.5 / density.d.square())
     return q, torch.exp(q * -density.kappa)
 
@@ -132,7 +132,7 @@ def _moments(values: Float64[Tensor, "b m"], block: Block) -> Float64[Tensor, "m
 
 
 def sums(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> Sums:
-    """The sums of a block at its residual and :func:`kernel`."""
+    """The sums of a block, from its residual and the results of :func:`kernel`."""
     weighted = w if block.weight is None else w * block.weight
     weight = error.new_full((error.shape[1],), float(error.shape[0])) if block.weight is None else block.weight.sum(0)
     if _plain(density.kappa):
@@ -164,7 +164,7 @@ def energy_of(total: Sums, kappa: Float64[Tensor, " m"]) -> Derivatives:
 def _products(
     rows: Float64[Tensor, "k n"], others: Float64[Tensor, "k n"], weight: Float64[Tensor, " k"]
 ) -> Float64[Tensor, "n n"]:
-    """Sum of weight times a row times the other, by NumPy, which takes half as long as torch where MKL is slow."""
+    """Sum of weight · rowᵀ · other row, by NumPy, which takes half as long as torch where MKL is slow."""
     total = np.zeros((rows.shape[1], others.shape[1]))
     for first in range(0, rows.shape[0], _STRIP):
         part = slice(first, first + _STRIP)
@@ -172,11 +172,11 @@ def _products(
     return torch.from_numpy(total)
 
 
-def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> CurvatureSums:
-    """Those of a block at its residual and :func:`kernel`."""
+def curvature_sums(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> CurvatureSums:
+    """The curvature sums of a block, from its residual and the results of :func:`kernel`."""
     weighted, plain = (w, error) if block.weight is None else (w * block.weight, error * block.weight)
     precision = density.d.pow(-2)
-    bend = weighted * (1.0 - 2.0 * density.kappa * q) * precision
+    curvature_weight = weighted * (1.0 - 2.0 * density.kappa * q) * precision
     score = weighted * error * precision
     flat = block.rows.flatten(0, 1)
     if block.rows.shape[1] == 1:
@@ -185,7 +185,7 @@ def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -
         scored = torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
         spread = torch.matmul(scored.mT, scored)
     return CurvatureSums(
-        curvature=_products(flat, flat, bend.flatten()),
+        curvature=_products(flat, flat, curvature_weight.flatten()),
         spread=spread,
         tilt=_moments(q * weighted * error, block),
         moment=_moments(plain, block),
@@ -194,7 +194,7 @@ def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -
 
 
 def triangle(block: Block, above: Float64[Tensor, "k n"] | None) -> Float64[Tensor, "k n"]:
-    """The upper triangle R of X = QR, of the rows of a block in use and of those whose triangle is ``above``."""
+    """Upper triangle R of X = QR, for the rows of a block in use and the rows whose triangle is ``above``."""
     rows = block.rows if block.weight is None else block.rows * (block.weight > 0).unsqueeze(-1)
     flat = rows.flatten(0, 1)
     return torch.linalg.qr(flat if above is None else torch.cat([above, flat]), mode="r").R

@@ -1,4 +1,4 @@
-"""Chebyshev (minimax) regression: the smallest largest absolute residual, by an exchange of n + 1 extreme rows."""
+"""Chebyshev (minimax) regression: minimise the largest absolute residual by exchanging n + 1 extreme rows."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 _STALLED = 10
+"""Exchanges without growth of the height after which Bland's rule applies."""
 
 
 @dataclass(frozen=True)
 class Minimax:
-    """Coefficients, the largest absolute residual of the rows in use, the exchanges made, and whether it is optimal."""
+    """Coefficients, largest absolute residual of the rows in use, number of exchanges, and whether it is optimal."""
 
     beta: Float[Tensor, "P n"]
     height: Float[Tensor, " P"]
@@ -25,7 +26,7 @@ class Minimax:
 
 
 def equal_heights(rows: Float[Tensor, "*batch k n"], target: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch n"]:
-    """The Chebyshev fit of k = n + 1 rows, whose residuals have one size; not finite where the rows are dependent."""
+    """Chebyshev fit of k = n + 1 rows: all residuals have equal size. Not finite where the rows are dependent."""
     q, upper = torch.linalg.qr(rows, mode="complete")
     n = rows.shape[-1]
     normal = q[..., n]
@@ -46,16 +47,16 @@ def minimax(
 ) -> Minimax:
     """Minimise the largest ``|target - rows beta|`` over the rows in use, in float64.
 
-    The simplex method on the dual, a vertex of which is n + 1 rows with the signs of their residuals: the row of the
-    largest residual enters, and the ratio test chooses the one that leaves. Where the height has not grown for some
-    exchanges the rows are taken in their order (Bland's rule), which cannot cycle.
+    The simplex method on the dual. A vertex is n + 1 rows with the signs of their residuals. The row of the largest
+    residual enters, and the ratio test chooses the row that leaves. After some exchanges without growth of the height
+    the rows are taken in order (Bland's rule), which cannot cycle.
 
     Args:
-        rows: of full column rank among those in use, of which there are more than n.
+        rows: of full column rank among the rows in use, of which there are more than n.
         target: targets.
-        used: which rows count.
+        used: mask of the rows in use.
         guess: coefficients whose largest residuals are a good first choice of rows.
-        max_iter: exchanges at most.
+        max_iter: largest number of exchanges.
 
     References:
         Stiefel, "Note on Jordan elimination, linear programming and Tchebycheff approximation", Numerische Mathematik 2
@@ -64,15 +65,15 @@ def minimax(
     P, R = target.shape
     n = rows.shape[-1]
     rows, target, guess = rows.double(), target.double(), guess.double()
-    # around the guess, so that a large offset costs no digits
+    # residuals of the guess, so that a large offset costs no digits
     centred = target - torch.matmul(rows, guess.unsqueeze(-1)).squeeze(-1)
     everywhere = rows.expand(P, -1, -1)
     basis = _first_rows(everywhere, centred, used)
     eps = torch.finfo(torch.float64).eps
     floor = 64 * eps * (target.abs() * used).amax(-1)
     sign = torch.where(_null_vector(_take(everywhere, basis)) < 0, -1.0, 1.0).to(target)
-    turned = (_null_vector(_take(everywhere, basis)) * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
-    sign = torch.where(turned, -sign, sign)
+    negative = (_null_vector(_take(everywhere, basis)) * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
+    sign = torch.where(negative, -sign, sign)
 
     beta = torch.zeros_like(guess)
     height = target.new_zeros(P)
@@ -119,7 +120,7 @@ def _take(rows: Float[Tensor, "P R n"], index: Int[Tensor, "P k"]) -> Float[Tens
 
 
 def _null_vector(rows: Float[Tensor, "P k n"]) -> Float[Tensor, "P k"]:
-    """The vector that is orthogonal to the columns of n + 1 rows of rank n."""
+    """The vector orthogonal to the columns of n + 1 rows of rank n."""
     q = torch.linalg.qr(rows, mode="complete").Q
     return q[..., -1]
 
@@ -127,7 +128,7 @@ def _null_vector(rows: Float[Tensor, "P k n"]) -> Float[Tensor, "P k"]:
 def _first_rows(
     rows: Float[Tensor, "P R n"], residual: Float[Tensor, "P R"], used: Bool[Tensor, "P R"]
 ) -> Int[Tensor, "P n+1"]:
-    """n linearly independent rows, of large residuals where there is a choice, and the largest one of the others."""
+    """n linearly independent rows, preferably with large residuals, and of the others that with the largest."""
     size = residual.abs() + 1e-3 * (residual.abs() * used).amax(-1, keepdim=True)
     size = torch.where(used, size.clamp(min=torch.finfo(size.dtype).tiny ** 0.5), 0.0)
     free = rows * used.unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""What every linear estimator shares: parameters shown, one vocabulary of results, prediction."""
+"""Base of all linear estimators: parameters, names of results, prediction."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ Self = TypeVar("Self", bound="LinearEstimator")
 
 
 class NotFittedError(AttributeError):
-    """A result was asked for before ``fit``."""
+    """A result was requested before ``fit``."""
 
 
 class Fitted(Parametrised):
-    """Results have names that end in an underscore and exist after ``fit``; a repr shows the parameters."""
+    """Base with results whose names end in an underscore and exist after ``fit``; a repr shows the parameters."""
 
     _fit_takes = "X, Y"
 
@@ -43,7 +43,7 @@ class Fitted(Parametrised):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def _keep_columns_of(self, value: object) -> None:
-        """The names of the columns of a data frame as ``feature_names_in_``, scikit-learn's name for them."""
+        """Store the column names of a data frame as ``feature_names_in_``, scikit-learn's name for them."""
         names = column_names(value)
         self.__dict__.pop("feature_names_in_", None)
         if names is not None:
@@ -57,14 +57,13 @@ class LinearEstimator(Fitted):
     """Base of the linear estimators: ``fit(X, Y, sample_weight=None)`` returns the estimator itself.
 
     ``fit`` and ``predict`` take tensors, NumPy arrays and DataFrames or Series of pandas and polars; results are
-    tensors. Arrays of float32 stay so, other numbers become float64, and beside a tensor its dtype and device.
+    tensors. Float32 arrays stay float32, other arrays become float64; with a tensor, all take its dtype and device.
 
     Attributes, after ``fit`` (``*`` are batch dimensions):
         coef_: coefficients (*, n).
-        weights_: the weight in [0, 1] with which each value entered the fit, (*, N, m); m is 1 for
-            one channel given as (*, N).
-        feature_names_in_: names of the columns of X, where it was a DataFrame with such; ``predict`` then refuses one
-            with others.
+        weights_: weight of each value in the fit, in [0, 1], (*, N, m); m is 1 for one channel given as (*, N).
+        feature_names_in_: column names of X, if it was a DataFrame that has some; ``predict`` then refuses a DataFrame
+            with other names.
     """
 
     coef_: Float[Tensor, "*batch n"]
@@ -72,7 +71,7 @@ class LinearEstimator(Fitted):
     feature_names_in_: tuple[str, ...]
 
     def __init__(self) -> None:
-        """No parameters; an estimator with some sets each under its own name."""
+        """Base without parameters; a subclass stores each parameter under its own name."""
 
     def fit(self: Self, X: Data, Y: Data, sample_weight: Data | None = None) -> Self:
         raise NotImplementedError
@@ -82,8 +81,8 @@ class LinearEstimator(Fitted):
 
         Raises:
             NotFittedError: before ``fit``.
-            TypeError: X is no floating tensor, or of another dtype or device than the coefficients, or an array of
-                something else than real numbers.
+            TypeError: X is not a floating-point tensor or an array of real numbers, or its dtype or device differs from
+                that of the coefficients.
             ValueError: X has another number of columns, columns of other names, or other batch dimensions.
         """
         n = self.coef_.shape[-1]
@@ -98,7 +97,7 @@ class LinearEstimator(Fitted):
         if X.dim() == 0 or X.shape[-1] != n:
             got = X.shape[-1] if X.dim() else 0
             raise ValueError(
-                f"Expected argument `X` with {n} columns in its last dimension but got {got}; give it those of the fit."
+                f"Expected argument `X` with {n} columns in its last dimension but got {got}; pass those of the fit."
             )
         samples = 1 if self._single_channel else 2
         common_batch("X", X.shape[: -1 - samples], "coef_", self.coef_.shape[:-1])
@@ -106,11 +105,11 @@ class LinearEstimator(Fitted):
         return torch.matmul(X, coef).squeeze(-1)
 
     def _tensors(self, X: Data, Y: Data, sample_weight: Data | None) -> tuple[Tensor, Tensor, Tensor | None]:
-        """What ``fit`` is given, as tensors; every ``fit`` begins with it."""
+        """Convert the data given to ``fit`` to tensors; every ``fit`` begins with this."""
         x, y = as_tensors(X=X, Y=Y)
         weight = None if sample_weight is None else as_tensor("sample_weight", sample_weight)
         self._keep_columns_of(X)
-        # a frame of one column is one channel, as a Series is
+        # a data frame of one column is one channel, as a Series is
         if is_frame(Y) and x.dim() == 2 and y.shape[-1] == 1:
             y = y.squeeze(-1)
         return x, y, weight
@@ -121,7 +120,7 @@ class LinearEstimator(Fitted):
         if not bool(torch.isfinite(self.coef_.detach()).all()):
             raise ValueError(
                 "The fit has no finite coefficients: squares of `X` or `Y` overflow or vanish. Divide each column by a "
-                "unit near its scale, and look for values that cannot be right."
+                "unit near its scale, and look for invalid values."
             )
         self.weights_ = problem.restore(weights)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._influence import weighed
+from mkc_torch.linear._influence import weighted
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,8 +21,8 @@ def robust_r_squared(
 ) -> Float[Tensor, "B m"]:
     """Share of the weighted spread that the fit explains, consistent for Gaussian errors.
 
-    ``(S - R) / (S + R (a - 1))`` with the weighted sums of squares S around the weighted mean, around 0 where the
-    columns hold no constant, and R around the fit; a is ``ratio``.
+    ``(S - R) / (S + R (a - 1))``: S is the weighted sum of squares about the weighted mean (about 0 where the columns
+    contain no constant), R that of the residuals, and a is ``ratio``.
 
     Renaud & Victoria-Feser, "A robust coefficient of determination for regression", Journal of Statistical Planning and
     Inference 140 (2010) 1852-1862, the version with the correction for consistency.
@@ -30,10 +30,10 @@ def robust_r_squared(
     Args:
         problem: the regression.
         beta: coefficients in the basis.
-        weight: with which each value entered the fit.
-        ratio: ``E w / E w z²`` at Gaussian errors: 1 of equal weights, 1.2076 of the bisquare at 95 % efficiency.
+        weight: weight of each value in the fit.
+        ratio: ``E w / E w z²`` for Gaussian errors: 1 for equal weights, 1.2076 for the bisquare at 95 % efficiency.
     """
-    w = weighed(problem, weight)
+    w = weighted(problem, weight)
     total = w.sum(-2, keepdim=True).clamp(min=torch.finfo(w.dtype).tiny)
     centre = torch.where(_holds_constant(problem)[:, None, :], (w * problem.Y).sum(-2, keepdim=True) / total, 0.0)
     spread = (w * (problem.Y - centre).square()).sum(-2)
@@ -43,7 +43,7 @@ def robust_r_squared(
 
 
 def _holds_constant(problem: LinearProblem) -> Tensor:
-    """Whether some combination of the columns is 1 in a channel's rows and 0 in the others', (B or 1, m)."""
+    """Whether a combination of the columns is 1 in a channel's rows and 0 in the other channels', (B or 1, m)."""
     N, m = problem.num_samples, problem.num_channels
     ones = torch.eye(m, dtype=problem.Y.dtype, device=problem.Y.device).expand(N, m, m).flatten(0, 1)
     rows = problem.basis.detach().flatten(-3, -2)

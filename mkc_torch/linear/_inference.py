@@ -1,4 +1,4 @@
-"""What follows from the covariance of coefficients: standard errors, intervals, tests, a table."""
+"""Inference from the covariance of coefficients: standard errors, intervals, tests, a table."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class WaldTest:
     """A test of linear restrictions on coefficients.
 
     Attributes:
-        statistic: the square of how far the estimates are from the restrictions, in standard errors, over the number
-            of restrictions: an F where they hold, (*,).
-        p_value: chance of more where they hold, (*,).
-        restrictions, dof: degrees of freedom of the F, above and below.
+        statistic: squared distance of the estimates from the restrictions, in standard errors, divided by the number of
+            restrictions; F-distributed if they hold, (*,).
+        p_value: probability of a larger statistic if they hold, (*,).
+        restrictions, dof: numerator and denominator degrees of freedom of the F.
     """
 
     statistic: Float[Tensor, " *batch"]
@@ -46,9 +46,9 @@ class Inference(LinearEstimator):
 
     Attributes, after ``fit``:
         covariance_: covariance of the coefficients (*, n, n).
-        dof_: degrees of freedom left, values that count less n, (*,).
-        standard_error_: of each coefficient, (*, n).
-        p_value_: chance of a coefficient as far from 0, were it 0, by Student's t, (*, n).
+        dof_: degrees of freedom, number of values in use minus n, (*,).
+        standard_error_: standard error of each coefficient, (*, n).
+        p_value_: two-sided p-value of each coefficient being 0, by Student's t, (*, n).
     """
 
     covariance_: Float[Tensor, "*batch n n"]
@@ -56,7 +56,7 @@ class Inference(LinearEstimator):
 
     @property
     def standard_error_(self) -> Float[Tensor, "*batch n"]:
-        # the root of an exact fit's 0 has no slope
+        # sqrt has no derivative at the variance 0 of an exact fit
         variance = self.covariance_.diagonal(dim1=-2, dim2=-1)
         return torch.where(variance > 0, variance, 1.0).sqrt() * (variance > 0)
 
@@ -67,10 +67,10 @@ class Inference(LinearEstimator):
         return student_tails(t, self.dof_.unsqueeze(-1).clamp(min=1.0)).to(error.dtype)
 
     def confidence_interval(self, level: float = 0.95) -> Float[Tensor, "*batch n 2"]:
-        """Interval of each coefficient, by Student's t with ``dof_`` degrees of freedom.
+        """Confidence interval of each coefficient, by Student's t with ``dof_`` degrees of freedom.
 
         Args:
-            level: share of samples whose interval holds the truth, above 0 and below 1.
+            level: probability that an interval contains the true coefficient, above 0 and below 1.
 
         Raises:
             NotFittedError: before ``fit``.
@@ -87,27 +87,27 @@ class Inference(LinearEstimator):
         return torch.stack([self.coef_ - half, self.coef_ + half], -1)
 
     def mean_interval(self, X: Data, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
-        """Interval of the fitted value at each row of X, of the shape of ``predict(X)`` with two ends last.
+        """Confidence interval of the fitted value at each row of X: the shape of ``predict(X)`` with a last axis 2.
 
         Args:
             X: as ``predict`` takes it.
-            level: share of samples whose interval holds the truth, above 0 and below 1.
+            level: probability that an interval contains the true value, above 0 and below 1.
 
         Raises:
             NotFittedError, TypeError, ValueError: as ``predict``; ``level`` out of range.
         """
-        return self._around(X, level)
+        return self._interval_at(X, level)
 
     def wald_test(self, restrictions: Tensor | Sequence[int] | None = None, value: float | Tensor = 0.0) -> WaldTest:
         """Test that some coefficients, or linear combinations of them, have given values.
 
         Args:
-            restrictions: which coefficients, by number; or a matrix (q, n) whose rows are combinations. None takes all.
-            value: what they are if the restrictions hold, a number or (q,).
+            restrictions: indices of coefficients, or a matrix (q, n) of linear combinations as rows. None takes all.
+            value: values under the null hypothesis, a number or (q,).
 
         Raises:
             NotFittedError: before ``fit``.
-            TypeError, ValueError: restrictions of another kind or shape, or dependent ones.
+            TypeError, ValueError: restrictions of the wrong type or shape, or dependent restrictions.
 
         Example:
             >>> from mkc_torch.linear import MMRegression
@@ -119,16 +119,16 @@ class Inference(LinearEstimator):
         """
         matrix = self._restrictions(restrictions)
         q = matrix.shape[0]
-        wanted = torch.as_tensor(value, dtype=matrix.dtype, device=matrix.device)
-        if wanted.dim() > 1 or (wanted.dim() == 1 and wanted.shape[0] not in (1, q)):
+        expected = torch.as_tensor(value, dtype=matrix.dtype, device=matrix.device)
+        if expected.dim() > 1 or (expected.dim() == 1 and expected.shape[0] not in (1, q)):
             raise ValueError(
-                f"Expected argument `value` to be a number or of shape ({q},) but got {tuple(wanted.shape)}; "
-                "it has one value for each restriction."
+                f"Expected argument `value` to be a number or of shape ({q},) but got {tuple(expected.shape)}; "
+                "pass one value for each restriction."
             )
-        apart = torch.matmul(self.coef_, matrix.mT) - wanted
+        difference = torch.matmul(self.coef_, matrix.mT) - expected
         spread = torch.matmul(torch.matmul(matrix, self.covariance_), matrix.mT)
-        solved = torch.linalg.solve_ex(spread, apart.unsqueeze(-1))[0].squeeze(-1)
-        statistic = (apart * solved).sum(-1) / q
+        solved = torch.linalg.solve_ex(spread, difference.unsqueeze(-1))[0].squeeze(-1)
+        statistic = (difference * solved).sum(-1) / q
         over = torch.tensor(float(q), device=statistic.device)
         p_value = fisher_tail(statistic, over, self.dof_.clamp(min=1.0)).to(statistic.dtype)
         return WaldTest(statistic, p_value, q, self.dof_)
@@ -138,17 +138,17 @@ class Inference(LinearEstimator):
     ) -> Summary:
         """Table of the coefficients with standard errors, p-values and intervals.
 
-        It prints as text, on a terminal with rich in colour, and as a table in a notebook.
+        Printed, it is text, in colour on a terminal with rich; in a notebook it is a table.
 
         Args:
-            names: of the coefficients; by default those of the columns given to ``fit``, or x0, x1, ….
-            level: of the intervals.
-            problem: which of a batch of problems, by its index in the batch dimensions.
+            names: names of the coefficients; by default the column names given to ``fit``, or x0, x1, ….
+            level: confidence level of the intervals.
+            problem: index of a problem in the batch dimensions.
 
         Raises:
             NotFittedError: before ``fit``.
-            IndexError: a batch of which no problem is chosen, or one that is not there.
-            ValueError: another number of names than coefficients; ``level`` out of range.
+            IndexError: no problem of a batch is chosen, or the index is out of range.
+            ValueError: the number of names differs from the number of coefficients; ``level`` out of range.
 
         Example:
             >>> from mkc_torch.linear import MMRegression
@@ -180,7 +180,7 @@ class Inference(LinearEstimator):
         )
 
     def _light(self, problem: tuple[int, ...]) -> tuple[int, int]:
-        """How many values there are, and how many of them the fit all but leaves out."""
+        """Number of values, and how many of them have a weight below :data:`LIGHT`."""
         weights = self.weights_[problem]
         return weights.numel(), int((weights < LIGHT).sum())
 
@@ -188,7 +188,7 @@ class Inference(LinearEstimator):
         checked_number("level", level, 0.0, 1.0, "()", "0.95 is usual")
         return student_quantile(level, self.dof_.clamp(min=1.0)).to(self.coef_.dtype)
 
-    def _around(
+    def _interval_at(
         self, X: Data, level: float, scale: Float[Tensor, "*batch m"] | None = None
     ) -> Float[Tensor, "*batch N m 2"]:
         quantile, fitted = self._quantile(level), self.predict(X)
@@ -216,11 +216,11 @@ class Inference(LinearEstimator):
                     "has a factor for each coefficient."
                 )
         else:
-            matrix = unit[[_which(k, n) for k in restrictions]]
+            matrix = unit[[_coefficient_index(k, n) for k in restrictions]]
         if int(torch.linalg.matrix_rank(matrix)) < matrix.shape[0] or not matrix.shape[0]:
             raise ValueError(
                 f"Expected argument `restrictions` to be independent but got {matrix.shape[0]} of rank "
-                f"{int(torch.linalg.matrix_rank(matrix))}; leave out those that follow from others."
+                f"{int(torch.linalg.matrix_rank(matrix))}; remove dependent restrictions."
             )
         return matrix
 
@@ -228,9 +228,9 @@ class Inference(LinearEstimator):
 class RobustInference(Inference):
     """Inference of an estimator that solves ``Σ ψ(r / s) x = 0``.
 
-    Attributes, after ``fit``, beside those of :class:`Inference`:
-        r_squared_: robust share of the spread that the fit explains, (*, m), m being 1 for one channel. Renaud &
-            Victoria-Feser, JSPI 140 (2010) 1852-1862.
+    Attributes, after ``fit``, in addition to those of :class:`Inference`:
+        r_squared_: robust coefficient of determination, (*, m), m being 1 for one channel. Renaud & Victoria-Feser,
+            JSPI 140 (2010) 1852-1862.
     """
 
     covariance: RobustCovarianceKind
@@ -266,10 +266,10 @@ class RobustInference(Inference):
         self.r_squared_ = problem.restore(robust_r_squared(problem, beta, weight, ratio))
 
     def prediction_interval(self, X: Data, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
-        """Interval of a new observation at each row of X, of the shape of ``predict(X)`` with two ends last.
+        """Prediction interval of a new observation at each row of X: the shape of ``predict(X)`` with a last axis 2.
 
-        It holds ``level`` of the good observations: their errors are taken for Gaussian ones of ``scale_``. Outliers
-        lie where they will.
+        It contains a share ``level`` of the inliers, whose errors are assumed Gaussian with standard deviation
+        ``scale_``. Outliers are not covered.
 
         Args:
             X: as ``predict`` takes it.
@@ -278,11 +278,11 @@ class RobustInference(Inference):
         Raises:
             NotFittedError, TypeError, ValueError: as ``predict``; ``level`` out of range.
         """
-        return self._around(X, level, self.scale_)
+        return self._interval_at(X, level, self.scale_)
 
 
-def _which(number: object, n: int) -> int:
-    """The number of a coefficient, counted from 0, or from the end where negative."""
+def _coefficient_index(number: object, n: int) -> int:
+    """Return the index of a coefficient, counted from 0, or from the end if negative."""
     k = checked_whole("restrictions", number, -n, f"it counts the {n} coefficients from 0")
     if k >= n:
         raise ValueError(

@@ -1,8 +1,8 @@
-"""MKC-EM on many rows: a pilot fit of few of them, a fit of more of them by Newton steps, and so of all.
+"""MKC-EM on many rows: a pilot fit to few rows, Newton steps on more rows, and at last on all.
 
-Each begins where the last ended and steps by the curvature found there, so that the passes over all rows are few; four
-or five are usual. The last ends where a Newton step with the curvature of all rows would be less than a millionth of a
-standard error long.
+Each fit starts at the result and with the curvature of the one before, so that few passes over all rows are needed;
+four or five are usual. The last fit ends where a Newton step with the curvature of all rows would be shorter than a
+millionth of a standard error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import CurvatureSums, Density, Sums
-from mkc_torch.linear._implicit.stationary import StationaryPoint
+from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
 from mkc_torch.linear._passes import DescentEnd, PassDerivatives, Rows, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
@@ -31,43 +31,49 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
 LARGE = 20_000
-"""Values from which a fit begins with a pilot: of so many rows of nine columns that is four times as fast."""
+"""Number of values from which a fit starts with a pilot; with nine columns it is four times as fast there."""
 
 _GROWTH = 16
-"""Of the rows from one fit to the next: each begins some ten of its standard errors from its maximum."""
+"""Growth factor of the rows between fits: each fit starts some ten of its standard errors from its maximum."""
 
-_AHEAD = 8
-"""Times the rows of a fit on the way that there are in all: of fewer, passes over all cost less than one more fit."""
+_LEAST_ROWS_LEFT = 8
+"""An intermediate fit is made if all rows are at least this many times its rows; else passes over all cost less."""
 
-_NEAR, _REST = 0.03, 1e-6
-"""Standard errors from the maximum of all rows where their curvature is added up, and where the fit is at rest."""
+_NEAR = 0.03
+"""Distance from the maximum, in standard errors, below which the curvature of all rows is computed."""
 
-_NEAR_ON_THE_WAY, _REST_ON_THE_WAY = 0.5, 0.5
-"""The same of a fit of fewer rows, whose standard errors are four of those of the next."""
+_STOP = 1e-6
+"""Length of the next step, in standard errors, below which the fit has converged."""
+
+_NEAR_INTERMEDIATE = 0.5
+"""As :data:`_NEAR`, for an intermediate fit, whose standard errors are four times those of the next."""
+
+_STOP_INTERMEDIATE = 0.5
+"""As :data:`_STOP`, for an intermediate fit."""
 
 _PASSES = 15
-"""Passes after which a fit that did not come to rest is left to the alternation over all rows."""
+"""Largest number of passes; a fit that has not converged then is left to the alternation over all rows."""
 
 _WIDEST = 2.0
-"""Robust scales of the start up to which a rough fit's d is the head's, and not that of a Gaussian over outliers."""
+"""Largest d of a rough fit, in robust scales of the start; a larger d is that of a Gaussian over the outliers."""
 
 _TAILS = (0.1, 0.2, 0.4, 1.5)
-"""κ that it begins with: one more than otherwise, for a step of the alternation costs more than a look at it."""
+"""Starting values of κ of the rough fit: one more than usual, since evaluating it costs less than an alternation."""
 
 _FOR_SLOPES = 8
-"""Times the rows of the pilot from which the curvature to step by is: each step leaves a twentieth of the way."""
+"""Rows for the first curvature, in multiples of the pilot's rows: each step then leaves a twentieth of the distance."""
 
 _CONDITION = 1e3
-"""Ratio of singular values of X, its columns scaled, up to which sums are formed from its columns as they are."""
+"""Largest ratio of singular values of X, with scaled columns, at which sums are formed without a change of basis."""
 
 _SLACK = 2.0
-"""Factor of a bound on what least squares gains, for the products of the pilot's rows are not quite those of all."""
+"""Factor on the bound of the gain of least squares, since the pilot's products only approximate those of all."""
 
 
 def is_large(values: CanonicalShapes) -> bool:
-    """Whether a fit of these is for :func:`large_maximum`: one problem of many rows on a processor.
+    """Whether :func:`large_maximum` suits these values: one problem of many rows on a CPU.
 
-    Elsewhere a block's many small operations take longer than the memory that they spare.
+    On an accelerator the many small operations of a block take longer than the memory access that they save.
     """
     return (
         values.Y.numel() >= LARGE
@@ -78,8 +84,8 @@ def is_large(values: CanonicalShapes) -> bool:
     )
 
 
-def in_its_basis(problem: LinearProblem) -> CanonicalShapes:
-    """A problem whose X is the basis of another."""
+def problem_in_basis(problem: LinearProblem) -> CanonicalShapes:
+    """Return a problem whose X is the basis of ``problem``."""
     basis, batch = problem.basis, problem.batch
     if basis.shape[0] == 1:
         basis = basis.expand(batch.numel(), *basis.shape[1:])
@@ -95,10 +101,10 @@ def in_its_basis(problem: LinearProblem) -> CanonicalShapes:
 
 @dataclass(frozen=True)
 class LargeMaximum:
-    """The maximum of the likelihood of all rows, in the columns of X; ``rest`` is a batch of it, the others are not."""
+    """Maximum of the likelihood of all rows, for the columns of X; only ``fit_state`` is a batch, of size 1."""
 
     coef: Float64[Tensor, " n"]
-    rest: StationaryPoint
+    fit_state: FitState
     weights: Float[Tensor, "N m"]
     log_likelihood: Float64[Tensor, ""]
     covariance: Float64[Tensor, "n n"]
@@ -107,55 +113,64 @@ class LargeMaximum:
 
 
 def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: int, seed: int) -> LargeMaximum | None:
-    """The maximum of the likelihood of one problem of many rows.
+    """Maximise the likelihood of one problem of many rows.
 
-    None where the values are not finite, where no pilot stands for all rows or its rough fit finds no head, where most
-    values are fitted exactly or d ends at its least, where a Gaussian is likelier than what was found, or where the
-    passes do not come to rest: an alternation over all rows then tells what is wrong, or finds its way.
+    Returns None if values are not finite, no pilot represents all rows, the rough fit finds no head, most values are
+    fitted exactly, d ends at its least, a Gaussian has a higher likelihood than the result, or the passes do not
+    converge. An alternation over all rows then reports the error or finds the maximum.
     """
     rows, passes = _rows_of(values), min(max_iter, _PASSES)
-    pilot = _pilot(values, known, max_iter, seed) if _sound(rows) else None
+    pilot = _pilot(values, known, max_iter, seed) if _is_valid(rows) else None
     if pilot is None:
         return None
-    rows, rest = replace(rows, frame=pilot.frame), pilot.rest
-    # rows drawn by leverage say nothing of the curvature of all, and seldom rows may be missing among others
+    rows, fit_state = replace(rows, frame=pilot.frame), pilot.fit_state
+    # rows drawn by leverage do not represent the curvature of all rows, and another draw may lack rare rows
     count = pilot.problem.num_samples
-    slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, rest)
+    slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
     if known.bound is None:
-        rest = replace(rest, log_bound=torch.log(_half_width(rows, rest.beta, TIGHT * pilot.begin.scale)))
-    for some in _on_the_way(values, count, pilot.frame, seed) if pilot.alike else ():
-        end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=passes)
-        if end is None or end.bends is None:
+        fit_state = replace(
+            fit_state, log_bound=torch.log(_half_width(rows, fit_state.beta, TIGHT * pilot.begin.scale))
+        )
+    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike else ():
+        end = descend(some, fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE, passes=passes)
+        if end is None or end.curvature_sums is None:
             return None
-        rest, everything = _moved(rest, end), end.sums.weight.sum()
-        slopes = replace(slopes, curvature=end.bends.curvature / everything, tilt=end.bends.tilt / everything)
+        fit_state, total_weight = _moved(fit_state, end), end.sums.weight.sum()
+        slopes = replace(
+            slopes, curvature=end.curvature_sums.curvature / total_weight, tilt=end.curvature_sums.tilt / total_weight
+        )
     first: Sums | None = None
     if known.bound is None:
-        end = descend(rows, rest, slopes, near=0.0, stop=1.0, passes=passes) if pilot.alike else None
+        end = descend(rows, fit_state, slopes, near=0.0, stop=1.0, passes=passes) if pilot.alike else None
         if end is not None:
-            rest, first = _moved(rest, end), end.sums
-        rest, first = _on_its_domain(rows, pilot, known, rest, first)
+            fit_state, first = _moved(fit_state, end), end.sums
+        fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
     weights = torch.empty_like(rows.Y)
     end = descend(
-        rows, rest, slopes, near=_NEAR, stop=_REST, passes=passes, weights=weights, first=first, alike=pilot.alike
+        rows, fit_state, slopes, near=_NEAR, stop=_STOP, passes=passes, weights=weights, first=first, alike=pilot.alike
     )
-    if end is None or end.bends is None or _pinned(end, rest) or _gaussian_is_likelier(rows, rest, end, slopes.grams):
+    if (
+        end is None
+        or end.curvature_sums is None
+        or _d_is_at_least(end, fit_state)
+        or _gaussian_is_likelier(rows, fit_state, end, slopes.grams)
+    ):
         return None
-    return _told(rows, rest, end, end.bends, weights)
+    return _result(rows, fit_state, end, end.curvature_sums, weights)
 
 
 @dataclass(frozen=True)
 class _Pilot:
-    """A rough fit of few rows, at ``rest`` in the frame of :class:`Rows`; ``alike`` where any could be among them."""
+    """A rough fit to few rows, in the frame of :class:`Rows`; ``alike``: rows were drawn with equal probability."""
 
     problem: LinearProblem
     alike: bool
     begin: RobustStart
     frame: Float64[Tensor, "n n"] | None
-    rest: StationaryPoint
+    fit_state: FitState
 
     def in_basis(self, beta: Float64[Tensor, "1 n"]) -> Float64[Tensor, "1 n"]:
-        """Coefficients in the basis of the pilot's problem."""
+        """Return coefficients in the basis of the pilot's problem."""
         return beta if self.frame is not None else torch.linalg.solve(self.problem.to_coef[0], beta.mT).mT
 
 
@@ -176,10 +191,10 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
     return _Pilot(problem, alike, begin, frame, _at(beta, rough.state))
 
 
-def _on_its_domain(
-    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: StationaryPoint, first: Sums | None
-) -> tuple[StationaryPoint, Sums | None]:
-    """Where to begin on the domain of the rule, with the sums there where they are those of the rough fit."""
+def _on_final_domain(
+    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: Sums | None
+) -> tuple[FitState, Sums | None]:
+    """Starting point on the domain of the rule; with the sums at it if it equals the rough fit."""
     d = torch.exp(rough.log_d)
     bound = _half_width(rows, rough.beta, WIDE * d)
     beta = pilot.in_basis(rough.beta)
@@ -189,10 +204,12 @@ def _on_its_domain(
     return _at(rough.beta, state), None
 
 
-def _on_the_way(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Iterator[Rows]:
-    """More and more rows drawn by chance."""
+def _intermediate_subsets(
+    values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int
+) -> Iterator[Rows]:
+    """Yield random subsets of growing size, smaller than all rows."""
     count *= _GROWTH
-    while _AHEAD * count < values.Y.shape[-2]:
+    while _LEAST_ROWS_LEFT * count < values.Y.shape[-2]:
         yield _drawn(values, count, frame, seed)
         count *= _GROWTH
 
@@ -202,14 +219,14 @@ def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | 
 
 
 def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:
-    """That of :func:`domain_rule` for the residuals of all rows."""
+    """Half-width of the domain by :func:`domain_rule`, from the residuals of all rows."""
     low, high = rows.range_at(beta[0])
     return torch.maximum(0.5 * (high - low), least)
 
 
-def _moved(rest: StationaryPoint, end: DescentEnd) -> StationaryPoint:
+def _moved(fit_state: FitState, end: DescentEnd) -> FitState:
     point = end.place.point
-    return replace(rest, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
+    return replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
 
 
 def _rows_of(values: CanonicalShapes) -> Rows:
@@ -218,8 +235,8 @@ def _rows_of(values: CanonicalShapes) -> Rows:
     return Rows(X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:]), weight)
 
 
-def _sound(rows: Rows) -> bool:
-    """Whether all values are finite, weights fit, and squares of squares of Y neither overflow nor vanish."""
+def _is_valid(rows: Rows) -> bool:
+    """Whether all values are finite, weights valid, and fourth powers of Y neither overflow nor underflow."""
     if rows.weight is not None:
         least, most = (float(v) for v in torch.aminmax(rows.weight))
         if not (least >= 0.0 and most < math.inf and bool((rows.weight.sum(0) > 0).all())):
@@ -229,24 +246,24 @@ def _sound(rows: Rows) -> bool:
     return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
 
 
-def _pinned(end: DescentEnd, rest: StationaryPoint) -> bool:
-    """Whether d ended at its least, which is that of the pilot's rows."""
-    assert rest.log_d_min is not None
-    return rest.free_d and bool((end.place.point.log_d <= rest.log_d_min).any())
+def _d_is_at_least(end: DescentEnd, fit_state: FitState) -> bool:
+    """Whether d ended at its least, which is that of the pilot."""
+    assert fit_state.log_d_min is not None
+    return fit_state.free_d and bool((end.place.point.log_d <= fit_state.log_d_min).any())
 
 
 def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
-    """The pilot's basis where columns of X nearly depend on one another, as a time in seconds does on an intercept.
+    """The pilot's basis where columns of X are nearly dependent, such as a time in seconds and an intercept; else None.
 
-    Their products would lose the digits that tell them apart.
+    The products of such columns would lose the digits that distinguish them.
     """
     upper = torch.linalg.inv(problem.to_coef[0])
     singular = torch.linalg.svdvals(upper / upper.square().sum(0).sqrt())
     return None if float(singular[0]) <= _CONDITION * float(singular[-1]) else problem.to_coef[0]
 
 
-def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> StationaryPoint:
-    return StationaryPoint(
+def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
+    return FitState(
         beta=beta,
         kappa=state.kappa,
         log_d=state.log_d,
@@ -258,57 +275,59 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> StationaryPoint:
     )
 
 
-def _slopes(rows: Rows, rest: StationaryPoint) -> PassDerivatives:
-    total, found = rows.look(rest.beta[0], Density(rest.kappa[0], torch.exp(rest.log_d[0])), bend=True)
+def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
+    total, found = rows.evaluate(
+        fit_state.beta[0], Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0])), with_curvature=True
+    )
     assert found is not None
-    everything = total.weight.sum()
-    grams = torch.stack([_gram(rows, rest, channel) for channel in range(rows.Y.shape[-1])])
-    return PassDerivatives(found.curvature / everything, found.tilt / everything, grams / everything)
+    total_weight = total.weight.sum()
+    grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])
+    return PassDerivatives(found.curvature / total_weight, found.tilt / total_weight, grams / total_weight)
 
 
-def _gram(rows: Rows, rest: StationaryPoint, channel: int) -> Float64[Tensor, "n n"]:
+def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n"]:
     """Sum of ``x xᵀ`` of a channel: the curvature of a Gaussian with d = 1."""
     part = slice(channel, channel + 1)
     weight = None if rows.weight is None else rows.weight[:, part]
     own = Rows(rows.X[:, part], rows.Y[:, part], weight, rows.frame)
-    kappa = torch.zeros_like(rest.kappa[0, part])
-    _, found = own.look(rest.beta[0], Density(kappa, torch.ones_like(kappa)), bend=True)
+    kappa = torch.zeros_like(fit_state.kappa[0, part])
+    _, found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True)
     assert found is not None
     return found.curvature
 
 
-def _gaussian_is_likelier(rows: Rows, rest: StationaryPoint, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
-    """Whether a Gaussian at least squares is likelier than the maximum found, of several channels whether it may be."""
-    if not (rest.free_kappa and rest.free_d) or not bool((end.place.point.kappa > 0).any()):
+def _gaussian_is_likelier(rows: Rows, fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
+    """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
+    if not (fit_state.free_kappa and fit_state.free_d) or not bool((end.place.point.kappa > 0).any()):
         return False
     value = float(end.place.per_sample)
-    if _gaussian_value(rest, end, grams * end.sums.weight.sum(), _SLACK) >= value:
+    if _gaussian_value(fit_state, end, grams * end.sums.weight.sum(), _SLACK) >= value:
         return False
     if grams.shape[0] > 1:
         return True
-    return _gaussian_value(rest, end, _gram(rows, rest, 0).unsqueeze(0), 1.0) < value
+    return _gaussian_value(fit_state, end, _gram(rows, fit_state, 0).unsqueeze(0), 1.0) < value
 
 
-def _gaussian_value(rest: StationaryPoint, end: DescentEnd, grams: Float64[Tensor, "m n n"], slack: float) -> float:
+def _gaussian_value(fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"], slack: float) -> float:
     """Mean negative log-likelihood of a Gaussian at the least squares of each channel.
 
-    Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g``, g being the sum of ``e x`` and G that of ``x xᵀ``.
+    Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g`` with ``g = Σ e x`` and ``G = Σ x xᵀ``.
     """
-    assert rest.log_bound is not None
-    assert rest.log_d_min is not None
+    assert fit_state.log_bound is not None
+    assert fit_state.log_d_min is not None
     root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
-    assert end.bends is not None
-    moment = (end.bends.moment * root).unsqueeze(-1)
+    assert end.curvature_sums is not None
+    moment = (end.curvature_sums.moment * root).unsqueeze(-1)
     lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
-    variance = ((end.bends.square - slack * lowered) / end.sums.weight).clamp(min=0.0)
-    d = torch.maximum(variance.sqrt(), torch.exp(rest.log_d_min[0]))
-    norm = log_partition_value(torch.zeros_like(d), torch.exp(rest.log_bound[0]) / d)
+    variance = ((end.curvature_sums.square - slack * lowered) / end.sums.weight).clamp(min=0.0)
+    d = torch.maximum(variance.sqrt(), torch.exp(fit_state.log_d_min[0]))
+    norm = log_partition_value(torch.zeros_like(d), torch.exp(fit_state.log_bound[0]) / d)
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
 
 
-def _told(
-    rows: Rows, rest: StationaryPoint, end: DescentEnd, found: CurvatureSums, weights: Float[Tensor, "N m"]
+def _result(
+    rows: Rows, fit_state: FitState, end: DescentEnd, found: CurvatureSums, weights: Float[Tensor, "N m"]
 ) -> LargeMaximum:
     point = end.place.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
@@ -318,7 +337,7 @@ def _told(
         coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
     return LargeMaximum(
         coef=coef,
-        rest=replace(rest, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
+        fit_state=replace(fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
         weights=weights,
         log_likelihood=-(end.sums.weight * end.place.by_channel.value).sum(),
         covariance=covariance,

@@ -1,4 +1,4 @@
-"""The search for the maximum of the MKC likelihood of a linear problem, in its basis: Algorithm 3 of the paper."""
+"""Maximisation of the MKC likelihood of a linear problem, in its basis: Algorithm 3 of the paper."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 __all__ = ["TIGHT", "FixedParameters", "LikelihoodMaximum", "given_bound", "least_d", "maximise", "rough_fit"]
 
 _FLOOR = 0.3
-"""Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
+"""Least d in robust scales. Outliers at most double a scale; the d of a fit that interpolates is far smaller."""
 
 TAILS = (0.1, 0.4, 1.5)
-"""κ of the densities that a fit begins with the likeliest of."""
+"""κ of the candidate densities at the start of a fit."""
 
 TIGHT = 5.0
-"""Least half-width, in robust scales, of the domain of a rough fit."""
+"""Least half-width of the domain of a rough fit, in robust scales."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class LikelihoodMaximum:
 def _alternate(
     problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
 ) -> LikelihoodMaximum:
-    """E-steps and M-steps in turn; a problem leaves the batch after ``patience`` of them without progress."""
+    """Alternate E-steps and M-steps; a problem leaves the batch after ``patience`` of them without progress."""
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
     out_beta, out_state = beta.clone(), state
@@ -47,7 +47,7 @@ def _alternate(
     converged = torch.zeros(size, dtype=torch.bool, device=beta.device)
     history = [value]
     weight = normalised(problem.sample_weight)
-    quiet = torch.zeros(size, dtype=torch.int64, device=beta.device)
+    stalled = torch.zeros(size, dtype=torch.int64, device=beta.device)
     for _ in range(max_iter):
         residual = problem.residual(beta)
         before = state
@@ -59,11 +59,11 @@ def _alternate(
         now = state.value.sum(-1)
         rounding = 8 * torch.finfo(beta.dtype).eps * now.abs()
         improved = history[-1][index] - now > tol + rounding
-        quiet = torch.where(improved, 0, quiet + conclusive(before, state).all(-1).to(quiet.dtype))
+        stalled = torch.where(improved, 0, stalled + conclusive(before, state).all(-1).to(stalled.dtype))
         current = history[-1].clone()
         current[index] = now
         history.append(current)
-        done = quiet >= patience
+        done = stalled >= patience
         if bool(done.any()) or len(history) > max_iter:
             out_beta[index] = beta
             out_state = written(out_state, index, state)
@@ -71,7 +71,7 @@ def _alternate(
             keep = (~done).nonzero().squeeze(-1)
             if keep.numel() == 0:
                 break
-            index, beta, quiet = index[keep], beta[keep], quiet[keep]
+            index, beta, stalled = index[keep], beta[keep], stalled[keep]
             state, problem = state.select(keep), problem.select(keep)
             weight = None if weight is None else weight[keep]
     return LikelihoodMaximum(out_beta, out_state, history[-1], converged, history)
@@ -80,7 +80,7 @@ def _alternate(
 def _gaussian_candidate(
     problem: LinearProblem, maximum: LikelihoodMaximum, *, max_iter: int, tol: float
 ) -> LikelihoodMaximum:
-    """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
+    """Continue from a Gaussian density at weighted least squares where it has a higher likelihood than the result."""
     state = maximum.state
     beta = problem.weighted_fit(torch.ones_like(problem.Y))
     weight = normalised(problem.sample_weight)
@@ -91,8 +91,8 @@ def _gaussian_candidate(
     better = (gaussian.value.sum(-1) < maximum.value).nonzero().squeeze(-1)
     if better.numel() == 0:
         return maximum
-    begun = replace(gaussian.select(better), free_kappa=True)
-    again = _alternate(problem.select(better), beta[better], begun, max_iter=max_iter, tol=tol)
+    initial = replace(gaussian.select(better), free_kappa=True)
+    again = _alternate(problem.select(better), beta[better], initial, max_iter=max_iter, tol=tol)
     steps = max(len(maximum.history), len(again.history))
     history = []
     for i in range(steps):
@@ -110,7 +110,7 @@ def _gaussian_candidate(
 
 @dataclass(frozen=True)
 class FixedParameters:
-    """What a fit is given beside the data, as it was given."""
+    """The parameters and the start that the user gave."""
 
     sigma: float | Tensor | None
     d: float | Tensor | None
@@ -118,7 +118,7 @@ class FixedParameters:
     start: Start | Tensor
 
     def in_basis_of(self, problem: LinearProblem) -> FixedParameters:
-        """The same for a problem whose X is the basis of this one."""
+        """The same for a problem whose X is the basis of ``problem``."""
         if not isinstance(self.start, Tensor):
             return self
         return replace(self, start=problem.restore(problem.in_basis(self.start.to(problem.Y))))
@@ -132,7 +132,7 @@ class FixedParameters:
         d_min: Tensor,
         tails: Sequence[float | Tensor] = TAILS,
     ) -> DensityState:
-        """The likeliest of a few densities to start from at coefficients ``beta``."""
+        """The most likely of a few densities at coefficients ``beta``."""
         d = None if self.d is None else channel_parameter("d", self.d, problem)
         sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
         if d is not None:
@@ -152,13 +152,13 @@ class FixedParameters:
 def maximise(
     problem: LinearProblem, known: FixedParameters, *, max_iter: int, tol: float, seed: int
 ) -> tuple[RobustStart, LikelihoodMaximum]:
-    """The robust start of a fit and where it ends.
+    """Return the robust start and the maximum of the likelihood.
 
     Args:
-        problem: what is fitted.
-        known: parameters that are given.
-        max_iter, tol: of the alternation.
-        seed: of the start.
+        problem: the regression.
+        known: parameters that the user gave.
+        max_iter, tol: limits of the alternation.
+        seed: seed of the start.
     """
     begin = robust_start(problem, known.start, seed=seed)
     d_min = least_d(begin)
@@ -177,12 +177,16 @@ def maximise(
 
 
 def least_d(begin: RobustStart) -> Tensor:
-    """The floor under d."""
+    """Lower bound of d."""
     return _FLOOR * begin.scale
 
 
 def given_bound(problem: LinearProblem, known: FixedParameters, begin: RobustStart) -> Tensor:
-    """The domain that is given, of every channel; a clear error where the head does not fit in."""
+    """The given domain of every channel.
+
+    Raises:
+        ValueError: the head of the density does not fit in it.
+    """
     assert known.bound is not None
     bound = channel_parameter("bound", known.bound, problem)
     refuse_bad_bound(bound, begin.scale)
@@ -197,17 +201,17 @@ def rough_fit(
     max_iter: int,
     tails: Sequence[float] = TAILS,
 ) -> LikelihoodMaximum:
-    """A fit that says which domain the rule gives, and is near to the one there.
+    """Fit from which the rule derives the domain, and which is close to the final fit.
 
-    A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
-    is made on a tight domain, where it finds the head, or on the one that is given.
+    The scale of a robust start is up to twice that of the head where outliers are many and one-sided. The rough fit
+    therefore uses a tight domain, on which it finds the head, or the given domain.
 
     Args:
-        problem: what is fitted.
-        known: parameters that are given.
+        problem: the regression.
+        known: parameters that the user gave.
         begin: the robust start.
-        max_iter: alternations at most.
-        tails: κ to begin with.
+        max_iter: largest number of alternations.
+        tails: κ of the candidate densities at the start.
     """
     if known.bound is None:
         bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)

@@ -1,4 +1,4 @@
-"""What the fixed point and MKC-EM share: weights, objective and covariance of coefficients under the MKC likelihood."""
+"""Shared by the fixed point and MKC-EM: weights, objective and covariance of coefficients under the MKC likelihood."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
-    """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m)."""
+    """Return a positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m)."""
     t = as_numbers(name, value, problem.Y.dtype, problem.Y.device).to(problem.Y)
     m = problem.num_channels
     if t.dim() > 0 and t.shape[-1] not in (1, m):
@@ -50,7 +50,7 @@ def kernel_weight(
 
 
 def fixed_point_step(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, "B *S n"]:
-    """One application of (15) of the paper."""
+    """Apply (15) of the paper once."""
     return problem.weighted_fit(kernel_weight(residual, kappa, d) * relative_precision(d).unsqueeze(-2))
 
 
@@ -64,7 +64,7 @@ def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tens
 
 
 def values_left(problem: LinearProblem) -> Float[Tensor, " B"]:
-    """Degrees of freedom: values of any weight less coefficients."""
+    """Degrees of freedom: number of values with positive weight minus number of coefficients."""
     weight = problem.sample_weight
     used = problem.total_weight().sum(-1) if weight is None else (weight > 0).sum((-2, -1)).to(weight.dtype)
     return used - problem.num_coefficients
@@ -78,7 +78,7 @@ def coefficient_covariance(
     kind: CovarianceKind,
     bandwidth: float | None,
 ) -> Float[Tensor, "*batch n n"]:
-    """Sandwich covariance of the user's coefficients; the curvature is that of the objective, not of its surrogate."""
+    """Sandwich covariance of the user's coefficients, with the Hessian of the objective, not of its surrogate."""
     residual = problem.residual(beta)
     z2 = (residual / d.unsqueeze(-2)).square()
     k = kappa.unsqueeze(-2)
@@ -93,5 +93,5 @@ def coefficient_covariance(
     dof = (left + problem.num_coefficients) / left.clamp(min=1)
     in_basis = sandwich(curvature, score, dof, kind, bandwidth)
     covariance = torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT)
-    # as many coefficients as values leave nothing to tell errors from
+    # with as many coefficients as values no residual is left to estimate the errors from
     return problem.restore(torch.where((left > 0)[:, None, None], covariance, torch.inf))

@@ -1,4 +1,4 @@
-"""Rows that stand for all of a large fit, drawn by chance, and whether they do."""
+"""Random subsets of rows for the pilot of a large fit, with a check that they represent all rows."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDefici
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
 
-_ROWS, _ROWS_A_COLUMN = 2000, 200
-"""Rows of a pilot, and no fewer for each column: coefficients within a twentieth of the noise."""
+_ROWS = 2000
+"""Least number of rows of a pilot."""
+
+_ROWS_A_COLUMN = 200
+"""Least number of rows of a pilot per column: coefficients are then within a twentieth of the noise."""
 
 _LEVERAGE = 0.05
-"""A row of more pins a direction that fewer than twenty others share; a pilot has to do without such rows."""
+"""Largest leverage of a row: beyond it, fewer than twenty rows share a direction. A pilot must do without such rows."""
 
-_LEAST = 1e-6
-"""Of what the other rows may leave of a direction, in shares of what all have."""
+_LEAST_SHARE = 1e-6
+"""Least share of a direction that the rows without high leverage must hold."""
 
 
 def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"]:
-    """About ``count`` of the rows in use, each at most once and in their order."""
+    """About ``count`` of the rows in use, drawn at random, each at most once, in their order."""
     used = _used(values)
     generator = torch.Generator().manual_seed(seed)
     among = None if used is None else used.nonzero().squeeze(-1)
@@ -34,7 +37,7 @@ def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " 
 
 
 def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShapes:
-    """Those rows in float64, as a problem of their own."""
+    """The rows at ``index`` in float64, as a problem."""
     weight = values.sample_weight
     return CanonicalShapes(
         values.X.index_select(-3, index).double(),
@@ -46,10 +49,10 @@ def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShape
 
 
 def pilot_problem(values: CanonicalShapes, seed: int) -> tuple[LinearProblem, bool] | None:
-    """A problem of few rows, and whether every row had the same chance to be in it; None where no rows will do.
+    """A problem of few rows, and whether all rows had the same chance of being drawn; None where no draw suffices.
 
-    Where rows drawn alike leave a direction to a few of them, as a column that is seldom other than 0, rows are added
-    by their leverage among all.
+    Where uniformly drawn rows leave a direction to a few rows, as for a column that is seldom other than 0, rows are
+    added in proportion to their leverage among all rows.
     """
     count = max(_ROWS, _ROWS_A_COLUMN * values.X.shape[-1])
     index = drawn_rows(values, count, seed)
@@ -75,17 +78,17 @@ def _used(values: CanonicalShapes) -> Bool[Tensor, " N"] | None:
 
 
 def _spans(problem: LinearProblem) -> bool:
-    """Whether the rows determine every coefficient without the few of most leverage."""
+    """Whether the rows determine every coefficient without the rows of highest leverage."""
     basis = problem.basis[0]
     if problem.sample_weight is not None:
         basis = basis * (problem.sample_weight[0] > 0).unsqueeze(-1)
     kept = basis.flatten(0, 1)
     kept = kept * (kept.square().sum(-1, keepdim=True) <= _LEVERAGE)
-    return bool(torch.linalg.eigvalsh(torch.matmul(kept.mT, kept))[0] > _LEAST)
+    return bool(torch.linalg.eigvalsh(torch.matmul(kept.mT, kept))[0] > _LEAST_SHARE)
 
 
 def _rows_of_leverage(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"] | None:
-    """Rows drawn with a chance in proportion to their leverage; None where columns depend on one another."""
+    """Rows drawn with probability proportional to their leverage; None where columns are linearly dependent."""
     X, Y, weight = values.X, values.Y, values.sample_weight
     X, Y = X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:])
     weight = None if weight is None else weight.reshape(weight.shape[-2:])

@@ -1,4 +1,4 @@
-"""A linear regression problem, checked once and brought into an orthonormal basis that every estimator works in."""
+"""A linear regression problem: checked, and transformed to an orthonormal basis in which every estimator works."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 MAX_IMPLIED_CHANNELS = 16
 
 _CHUNK = 1 << 22
-"""Values held at once when outer products of rows are formed."""
+"""Largest number of values held at once when outer products of rows are formed."""
 
 _BLOCK = 1 << 12
-"""Values of rows that are weighted and multiplied while they stay in a processor's cache."""
+"""Values of rows that are weighted and multiplied at a time, so that they stay in the processor's cache."""
 
-_FEW = 10
-"""Sets of weights up to which this takes less than the products of rows that are not kept."""
+_MAX_SETS_IN_BLOCKS = 10
+"""Most sets of weights for which blocks are faster than outer products of rows that are not kept."""
 
 
 class RankDeficientError(ValueError):
@@ -37,8 +37,8 @@ class LinearProblem:
     """``Y ~ X coef`` over N samples of m channels, with X = basis · to_coef⁻¹ and an orthonormal basis.
 
     Work in the basis is invariant to the scale and the correlation of the columns of X. The batch dimensions are
-    flattened to one of size B; one X that serves every Y is kept once. ``batch`` remembers the user's dimensions.
-    A stack of S candidates for each problem has its dimension after B.
+    flattened to one of size B; an X that all problems share is kept once. ``batch`` holds the user's dimensions.
+    A stack of S candidates per problem has its dimension after B.
     """
 
     basis: Float[Tensor, "#B N m n"]
@@ -62,7 +62,7 @@ class LinearProblem:
 
     @property
     def coefficients_per_channel(self) -> int:
-        """The share of the coefficients that one channel pays for in degrees of freedom."""
+        """Coefficients per channel, rounded up: the degrees of freedom that a channel loses."""
         return -(-self.num_coefficients // self.num_channels)
 
     def residual(self, beta: Float[Tensor, "B *S n"]) -> Float[Tensor, "B *S N m"]:
@@ -88,7 +88,7 @@ class LinearProblem:
         n = self.num_coefficients
         sums: Tensor | None = None
         step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
-        if step < self.num_samples and stack.shape[1] <= _FEW:
+        if step < self.num_samples and stack.shape[1] <= _MAX_SETS_IN_BLOCKS:
             gram, moment = self._sums_of_blocks(stack)
             return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
         for first in range(0, self.num_samples, step):
@@ -105,7 +105,7 @@ class LinearProblem:
         return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
 
     def _sums_of_blocks(self, stack: Tensor) -> tuple[Float[Tensor, "B S n n"], Float[Tensor, "B S n"]]:
-        """The same of a few weights of rows that are too many for their products to be kept."""
+        """Normal equations for a few sets of weights, block by block, without keeping outer products of rows."""
         gram: Tensor | None = None
         moment: Tensor | None = None
         step = max(1, _BLOCK // self.num_channels)
@@ -121,20 +121,20 @@ class LinearProblem:
 
     @property
     def _products(self) -> tuple[Tensor, bool]:
-        """Those of all samples, kept while no derivative is taken: every step of an estimator asks for them."""
+        """Outer products of all samples, kept for the next steps unless derivatives are recorded."""
         kept: tuple[Tensor, bool] | None = self.__dict__.get("_kept_products")
         if kept is None:
             kept = self._products_of(slice(None))
-            # those made without gradients are of no use with them
+            # products made without gradients cannot be used with gradients
             derived = self.basis.requires_grad or self.Y.requires_grad
             if not (derived or is_wrapped(kept[0])):
                 self.__dict__["_kept_products"] = kept
         return kept
 
     def _products_of(self, part: slice) -> tuple[Float[Tensor, "#B Nm k"], bool]:
-        """The products of each row with itself, a half of each symmetric matrix; and with its target, where it has one.
+        """Upper halves of the outer products of rows, with the products of row and target if X is not shared.
 
-        Whether the targets are in it comes second: rows that serve several problems have several.
+        The second value is whether the targets are included: a shared X has a target for every problem.
         """
         rows = self.basis[:, part].flatten(-3, -2)
         i, j, _ = _symmetric(self.num_coefficients, rows.device)
@@ -144,7 +144,7 @@ class LinearProblem:
         return torch.cat([outer, rows * self.Y[:, part].flatten(-2).unsqueeze(-1)], dim=-1), True
 
     def total_weight(self) -> Float[Tensor, "B m"]:
-        """Sum of the sample weights of each channel; the number of samples where none are given."""
+        """Sum of the sample weights of each channel; the number of samples without weights."""
         if self.sample_weight is None:
             return self.Y.new_full((self.Y.shape[0], self.num_channels), float(self.num_samples))
         return self.sample_weight.sum(-2)
@@ -159,11 +159,11 @@ class LinearProblem:
         return torch.linalg.solve(self.to_coef, flat).squeeze(-1)
 
     def restore(self, values: Float[Tensor, B * rest]) -> Float[Tensor, "*batch *rest"]:
-        """Give values of the flattened problems the user's batch dimensions."""
+        """Reshape values of the flattened problems to the user's batch dimensions."""
         return values.reshape((*self.batch, *values.shape[1:]))
 
     def select(self, index: Tensor) -> LinearProblem:
-        """The problems at ``index``, as a batch of their own."""
+        """Return the problems at ``index`` as a batch."""
         shared = self.basis.shape[0] == 1
         return replace(
             self,
@@ -175,7 +175,7 @@ class LinearProblem:
         )
 
     def select_samples(self, index: Tensor) -> LinearProblem:
-        """The same problems on the samples at ``index``; the basis is then only nearly orthonormal."""
+        """Return the same problems on the samples at ``index``; the basis is then only nearly orthonormal."""
         return replace(
             self,
             basis=self.basis[:, index],
@@ -186,8 +186,8 @@ class LinearProblem:
 
 @lru_cache(maxsize=64)
 def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns of the upper half of an n × n matrix, and where in the half each of its entries lies."""
-    # what is kept outlives an inference mode that it is made in
+    """Row and column indices of the upper half of an n × n matrix, and the position of each entry in that half."""
+    # the cached tensors outlive an inference mode in which they were created
     with torch.inference_mode(False):
         i, j = torch.triu_indices(n, n, device=device)
         place = torch.zeros(n, n, dtype=torch.int64, device=device)
@@ -196,7 +196,7 @@ def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """Solve positive semi-definite systems: Cholesky, and the pseudo-inverse where the weights removed a direction."""
+    """Solve positive semi-definite systems by Cholesky, or by the pseudo-inverse where weights removed a direction."""
     if gram.shape[-1] == 2 and not (gram.requires_grad or moment.requires_grad):
         solution, least, most = _solve_two(gram, moment)
     else:
@@ -205,7 +205,7 @@ def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch 
         pivots = factor.diagonal(dim1=-2, dim2=-1)
         least, most = torch.where(info > 0, 0.0, pivots.amin(-1)), pivots.amax(-1)
     eps = torch.finfo(gram.dtype).eps
-    # what has no factor has a pivot of 0 or NaN here
+    # a matrix without a factor has a pivot of 0 or NaN here
     weak = ~(least > (gram.shape[-1] * eps) ** 0.5 * most)
     if weak.any():
         inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
@@ -215,7 +215,7 @@ def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch 
 
 
 def _solve_two(gram: Float[Tensor, "*batch 2 2"], moment: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Cholesky's solution of many systems of two equations, all at once, and the smaller and the larger pivot."""
+    """Cholesky solution of many 2 × 2 systems at once, with the smaller and the larger pivot."""
     first = gram[..., 0, 0].sqrt()
     below = gram[..., 0, 1] / first
     second = (gram[..., 1, 1] - below * below).sqrt()
@@ -248,10 +248,10 @@ class CanonicalShapes:
 
 
 def refuse_magnitude(largest: Tensor) -> None:
-    """Refuse Y of these largest absolute values, where residuals squared twice would overflow or vanish.
+    """Refuse Y whose residuals, squared twice, would overflow or underflow.
 
     Raises:
-        ValueError: they would.
+        ValueError: the largest absolute values are out of range.
     """
     most = float(largest.detach().max())
     limit = float(torch.finfo(largest.dtype).max) ** 0.25
@@ -262,12 +262,12 @@ def refuse_magnitude(largest: Tensor) -> None:
         )
 
 
-def laid_out(
+def checked_shapes(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None = None,
 ) -> CanonicalShapes:
-    """Check types and shapes, and give one-channel input its channel dimension, without a look at the values.
+    """Check types and shapes, and add the channel dimension to one-channel input; values are not checked.
 
     Raises:
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
@@ -278,14 +278,14 @@ def laid_out(
     if X.dtype != Y.dtype or X.device != Y.device:
         raise TypeError(
             f"Expected `X` and `Y` to share dtype and device but got {X.dtype} on {X.device} "
-            f"and {Y.dtype} on {Y.device}; convert one, Y.to(X) say."
+            f"and {Y.dtype} on {Y.device}; use Y.to(X)."
         )
     if X.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected `X` of dtype float32 or float64 but got {X.dtype}; use .float().")
     if X.dim() < 2 or Y.dim() < 1 or X.shape[-2] != Y.shape[-1]:
         raise ValueError(
             f"Expected `X` of shape (*, N, m, n) with `Y` (*, N, m), or (*, N, n) with (*, N), "
-            f"but got {tuple(X.shape)} and {tuple(Y.shape)}{_mend(X, Y)}."
+            f"but got {tuple(X.shape)} and {tuple(Y.shape)}{_remedy(X, Y)}."
         )
     single = _last_is_samples(X, Y)
     if single:
@@ -302,8 +302,8 @@ def laid_out(
     return CanonicalShapes(X, Y.expand(*batch, N, m), weight, batch, single)
 
 
-def _mend(X: Tensor, Y: Tensor) -> str:
-    """What to do about shapes that do not fit, where it is plain."""
+def _remedy(X: Tensor, Y: Tensor) -> str:
+    """Remedy for shapes that do not fit, where it is clear."""
     if X.dim() == 1 and X.shape == Y.shape:
         return "; one column is X[:, None]"
     if X.dim() == Y.dim() > 1 and X.shape[:-1] == Y.shape[:-1] and Y.shape[-1] == 1:
@@ -318,13 +318,13 @@ def canonical_shapes(
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None = None,
 ) -> CanonicalShapes:
-    """Check types, shapes and values, and give one-channel input its channel dimension.
+    """Check types, shapes and values, and add the channel dimension to one-channel input.
 
     Raises:
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
         ValueError: shapes do not fit, or values are not finite.
     """
-    values = laid_out(X, Y, sample_weight)
+    values = checked_shapes(X, Y, sample_weight)
     _check_finite("X", X)
     _check_finite("Y", Y)
     refuse_magnitude(Y.detach().abs().max())
@@ -343,7 +343,7 @@ def linear_problem(
     Args:
         X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
         Y: targets.
-        sample_weight: non-negative weights (*, N) of samples or (*, N, m) of single values; 0 leaves a sample out.
+        sample_weight: non-negative weights (*, N) of samples or (*, N, m) of values; weight 0 excludes a sample.
 
     Raises:
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
@@ -355,7 +355,7 @@ def linear_problem(
     if N * m < n:
         raise ValueError(f"Expected at least {n} values for {n} coefficients but got {N} samples x {m}; add samples.")
     flat = v.batch.numel()
-    # one X for every Y is kept once; weights of 0 that differ between problems give each its own basis
+    # weights of 0 that differ between problems give each problem its own basis; otherwise a shared X is kept once
     shared = v.X.shape[:-3].numel() == 1 and (v.sample_weight is None or bool((v.sample_weight > 0).all()))
     x_batch = v.X.shape[:-3] if shared else v.batch
     basis, to_coef = _orthonormalise(v.X.expand(*x_batch, N, m, n).reshape(-1, N, m, n), v.sample_weight)
@@ -365,7 +365,7 @@ def linear_problem(
 
 def common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Size) -> torch.Size:
     try:
-        # torch's own loads a system of computer algebra
+        # torch.broadcast_shapes would import sympy
         return torch.Size(np.broadcast_shapes(shape, other_shape))
     except ValueError:
         raise ValueError(
@@ -375,7 +375,7 @@ def common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Si
 
 
 def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
-    """Whether Y is (*, N) rather than (*, N, m); the rule that the docstring of ``mkc_torch.linear`` states."""
+    """Whether Y is (*, N) rather than (*, N, m), by the rule in the docstring of ``mkc_torch.linear``."""
     if X.dim() == 2 or Y.dim() == 1 or X.shape[-3] != Y.shape[-2]:
         return True
     before, last = Y.shape[-2:]
@@ -391,7 +391,7 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
     if weight.dim() < 2 or weight.shape[-2] != N or weight.shape[-1] not in (1, m):
         raise ValueError(
             f"Expected argument `sample_weight` of shape (*, {N}) or (*, {N}, {m}) but got {tuple(weight.shape)}; "
-            "it has one weight for each sample."
+            "pass one weight for each sample."
         )
     return weight
 
@@ -411,7 +411,7 @@ def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
 
 
 def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Basis and the matrix that takes its coefficients to those of the columns of X, on the samples in use."""
+    """Basis, and the matrix that maps its coefficients to those of the columns of X, on the samples in use."""
     rows = X.flatten(-3, -2)
     if weight is not None and rows.shape[0] == weight.shape[:-2].numel():
         rows = rows * (weight > 0).reshape(rows.shape[0], -1, 1)
@@ -423,15 +423,15 @@ def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
 
 
 def refuse_dependent(upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*batch n"], num_rows: int) -> None:
-    """Refuse columns that are linearly dependent, by the R of a QR decomposition of them.
+    """Refuse linearly dependent columns, given the R of their QR decomposition.
 
     Args:
         upper: R of the columns divided by ``scale``.
-        scale: of the columns; 0 of one that is 0 on every row.
-        num_rows: how many rows there are.
+        scale: scale of each column; 0 for a column that is 0 on every row.
+        num_rows: number of rows.
 
     Raises:
-        RankDeficientError: they are, or one is 0.
+        RankDeficientError: columns are dependent, or a column is 0.
     """
     if (scale == 0).any():
         column = int((scale == 0).nonzero()[0, -1])
@@ -439,12 +439,12 @@ def refuse_dependent(upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*
     n = upper.shape[-1]
     _, singular, right = torch.linalg.svd(upper)
     tolerance = max(num_rows, n) * torch.finfo(upper.dtype).eps
-    # more unknowns than rows leaves fewer singular values than columns
+    # with fewer rows than columns there are fewer singular values than columns
     ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(())
     if (ratio <= tolerance).any():
         worst = right[..., -1, :].reshape(-1, n)[int(ratio.reshape(-1).argmin())]
         involved = [i for i in range(n) if float(worst[i].abs()) > 0.1 * float(worst.abs().max())]
         raise RankDeficientError(
             f"Expected `X` of full column rank but columns {involved} are linearly dependent "
-            f"(singular value ratio {float(ratio.min()):.1e}); remove one of them."
+            f"(singular value ratio {float(ratio.min()):.1e}); remove a column of these."
         )

@@ -1,4 +1,4 @@
-"""The ψ functions of M-estimation as weights ψ(z) / z of a standardised residual, and the constants that tune them."""
+"""The ψ functions of M-estimation as weights ψ(z) / z of a standardised residual, and their tuning constants."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ TUNING_95: dict[PsiName, Tuning] = {
     "andrews": (1.339,),
     "welsch": (2.985,),
 }
-"""Efficiency 0.95 at Gaussian residuals.
+"""Tuning constants of efficiency 0.95 at Gaussian residuals.
 
 Holland & Welsch, "Robust regression using iteratively reweighted least-squares", Communications in Statistics A6 (1977)
-813-827, table 2; Hampel's (1.5, 3.5, 8) times 0.9016085 is that of robustbase (``.Mpsi.tuning.default``).
+813-827, table 2; for Hampel's ψ (1.5, 3.5, 8) times 0.9016085, as in robustbase (``.Mpsi.tuning.default``).
 """
 
 BISQUARE_50 = 1.547644980928226
@@ -38,12 +38,12 @@ BISQUARE_50 = 1.547644980928226
 
 
 def huber_weight(z: Float[Tensor, "*shape"], k: float) -> Float[Tensor, "*shape"]:
-    """(16) of Indiveri (2009): ψ(z) = z held within ±k."""
+    """(16) of Indiveri (2009): ψ(z) = z clamped to ±k."""
     return k / z.abs().clamp(min=k)
 
 
 def hampel_weight(z: Float[Tensor, "*shape"], a: float, b: float, c: float) -> Float[Tensor, "*shape"]:
-    """(13) of Indiveri (2009): ψ is z up to a, level up to b, and falls in a line to 0 at c."""
+    """(13) of Indiveri (2009): ψ is z up to a, constant up to b, and falls linearly to 0 at c."""
     size = z.abs()
     fall = ((c - size) / (c - b)).clamp(min=0.0, max=1.0)
     return fall * a / size.clamp(min=a)
@@ -75,7 +75,7 @@ _WEIGHTS: dict[PsiName, Callable[..., Tensor]] = {
 
 
 def psi_weight(name: PsiName, tuning: Tuning) -> Callable[[Tensor], Tensor]:
-    """The weight ψ(z) / z in [0, 1] of standardised residuals, as a function of them."""
+    """Return the function that computes the weight ψ(z) / z in [0, 1] of standardised residuals."""
     weight = _WEIGHTS[name]
     return lambda z: weight(z, *tuning)
 
@@ -114,7 +114,7 @@ _SLOPES: dict[PsiName, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Psi:
-    """ψ with its constants: weight ψ(z) / z in [0, 1], value and slope at standardised residuals."""
+    """ψ with its tuning constants: weight ψ(z) / z in [0, 1], value and slope at standardised residuals."""
 
     name: PsiName
     tuning: Tuning
@@ -140,10 +140,10 @@ def _ratio(psi: Psi) -> float:
 
 
 def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, Tuning]:
-    """Name and tuning constants, the default ones where none are given.
+    """Return name and tuning constants, by default those of efficiency 0.95.
 
     Raises:
-        ValueError: no such ψ, or constants that do not suit it.
+        ValueError: unknown ψ, or constants that do not suit it.
     """
     if not isinstance(name, str) or name not in _WEIGHTS:
         raise ValueError(f"Expected argument `psi` to be one of {', '.join(map(repr, _WEIGHTS))} but got {name!r}.")
@@ -157,8 +157,8 @@ def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, T
         given = ()
     rising = all(0 < low <= high for low, high in itertools.pairwise(given))
     if len(given) != len(default) or not all(0 < t < math.inf for t in given) or not rising:
-        wanted = "three numbers 0 < a <= b < c" if name == "hampel" else "one positive number"
-        raise ValueError(f"Expected argument `tuning` of {name!r} to be {wanted} but got {tuning!r}.")
+        expected = "three numbers 0 < a <= b < c" if name == "hampel" else "one positive number"
+        raise ValueError(f"Expected argument `tuning` of {name!r} to be {expected} but got {tuning!r}.")
     if name == "hampel" and given[1] == given[2]:
         raise ValueError(
             f"Expected argument `tuning` of 'hampel' to be three numbers 0 < a <= b < c but got {tuning!r}."
@@ -187,7 +187,7 @@ def gaussian_efficiency(name: PsiName, tuning: Tuning) -> float:
 
 
 def _bisect(function: Callable[[float], float], low: float, high: float) -> float:
-    """The root of an increasing function."""
+    """Root of an increasing function between ``low`` and ``high``, by bisection."""
     for _ in range(70):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if function(middle) > 0 else (middle, high)
@@ -196,7 +196,7 @@ def _bisect(function: Callable[[float], float], low: float, high: float) -> floa
 
 @lru_cache
 def bisquare_for_efficiency(efficiency: float) -> float:
-    """The constant of the bisquare with this efficiency at Gaussian residuals: 4.685061 for 0.95."""
+    """Tuning constant of the bisquare with this efficiency at Gaussian residuals: 4.685061 for 0.95."""
     return _bisect(lambda c: gaussian_efficiency("tukey", (c,)) - efficiency, 0.5, 60.0)
 
 

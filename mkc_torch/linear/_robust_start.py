@@ -1,4 +1,4 @@
-"""The start that everything in this package fits from: robust coefficients and the scale of their residuals."""
+"""The robust start of all fits of this package: robust coefficients and the scale of their residuals."""
 
 from __future__ import annotations
 
@@ -33,42 +33,43 @@ class RobustStart:
 
 
 def checked_start(start: T, names: tuple[str, ...] = get_args(Start), others: str = "") -> T:
-    """``start``, the name of one or coefficients.
+    """Return ``start``, a known name or coefficients, if it is valid, else raise.
 
     Args:
-        start: as an estimator is given it.
-        names: of the starts that it knows.
-        others: what else it takes, as an error tells it.
+        start: the argument of an estimator.
+        names: names of the starts that the estimator knows.
+        others: further allowed values, as text for the error message.
 
     Raises:
         TypeError: complex coefficients.
-        ValueError: no such start, or coefficients that are none.
+        ValueError: unknown start, or coefficients that are not finite.
     """
     if isinstance(start, Tensor):
         refuse_complex("start", start)
         if start.dim() == 0 or not seems_finite(start):
             raise ValueError(
-                f"Expected argument `start` to be finite coefficients, (n,) or (*, n), but got {format_value(start.tolist())}."
+                "Expected argument `start` to be finite coefficients, (n,) or (*, n), but got "
+                f"{format_value(start.tolist())}."
             )
     elif not isinstance(start, str) or start not in names:
         array = isinstance(start, (list, tuple)) or hasattr(start, "__array__")
         raise ValueError(
             f"Expected argument `start` to be {', '.join(map(repr, names))} or coefficients{others} but got "
-            f"{format_value(start)}{'; make a tensor of it, torch.as_tensor(start)' if array else ''}."
+            f"{format_value(start)}{'; use torch.as_tensor(start)' if array else ''}."
         )
     return start
 
 
 def elemental_count(num_coefficients: int) -> int:
-    """Elemental sets that hold a clean one with probability 0.999 at 50 % outliers, at most 500."""
+    """Elemental sets of which at least one is clean with probability 0.999 at 50 % outliers; at most 500."""
     return min(500, math.ceil(math.log(1e-3) / math.log1p(-(0.5**num_coefficients))))
 
 
 def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
     """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with small-sample factors.
 
-    1 + 5 / (N - p) is that of Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202;
-    N / (N - p) stands for the degrees of freedom that a search for the smallest residuals uses.
+    1 + 5 / (N - p) is from Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202; N / (N - p)
+    corrects for the degrees of freedom that a search for the smallest residuals uses.
     """
     N, p = problem.num_samples, problem.coefficients_per_channel
     middle = order_statistic(residual.abs(), problem.sample_weight, default_coverage(problem))
@@ -76,18 +77,21 @@ def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> 
     return 1.4826 * (1.0 + 5.0 / left) * (N / left) * middle
 
 
-_FEW, _FEW_A_SQUARE = 300, 6
-"""Samples that the starts of a pilot are screened on, and so many times the square of the columns.
+_LEAST_SCREENED = 300
+"""Least number of samples on which the starts of a pilot are screened."""
 
-With 45 % of outliers to one side and 15 columns, where 1 of 8000 sets is clean, 24 starts of 24 were right on 1500
-samples and 19 on 450; with 9 columns 24 on 300.
+_LEAST_SCREENED_PER_SQUARE = 6
+"""Least number of such samples, in multiples of the squared number of columns.
+
+With 45 % one-sided outliers and 15 columns, where 1 of 8000 sets is clean, 24 of 24 starts were right on 1500 samples
+and 19 on 450; with 9 columns 24 on 300.
 """
 
 
 def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tensor, "B n"]:
-    """Least trimmed squares followed a few steps: near its minimum is enough for a start."""
+    """Least trimmed squares, iterated a few steps: close to its minimum is enough for a start."""
     fraction = default_coverage(problem) / problem.num_samples
-    # fits through up to three values are good enough to be ranked as they are
+    # fits through up to three values can be ranked without a concentration step
     steps = 0 if problem.num_coefficients <= 3 else 2
     search = ScaleSearch(
         TrimmedScale(fraction) if steps else QuantileScale(fraction),
@@ -98,7 +102,9 @@ def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tens
         screening_steps=steps,
         max_iter=4,
         seed=seed,
-        screened=min(SCREENED, max(_FEW, _FEW_A_SQUARE * problem.num_coefficients**2)) if pilot else SCREENED,
+        screened=min(SCREENED, max(_LEAST_SCREENED, _LEAST_SCREENED_PER_SQUARE * problem.num_coefficients**2))
+        if pilot
+        else SCREENED,
     )
     return minimise_scale(problem, search).beta
 
@@ -106,11 +112,11 @@ def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tens
 def robust_start(
     problem: LinearProblem, method: Start | Tensor = "lts", *, seed: int = 0, pilot: bool = False
 ) -> RobustStart:
-    """Coefficients by the named method, or those given, with the scale of their residuals.
+    """Coefficients by the named method or as given, with the scale of their residuals.
 
-    An exact fit has scale 0; the scale returned is then the rounding error of Y, so that what follows needs no special
-    case: the values on the fit keep weight 1 and the others lose theirs. The search for that of a ``pilot``, which more
-    samples follow, is shorter.
+    An exact fit has scale 0. The returned scale is then the rounding error of Y, so that no special case is needed: the
+    values on the fit keep weight 1, the others lose theirs. A ``pilot`` gets a shorter search, since more samples
+    follow.
     """
     if isinstance(method, Tensor):
         n = problem.num_coefficients

@@ -1,7 +1,7 @@
 """Minimise a robust residual scale over the coefficients: concentration steps from many elemental starts in one batch.
 
-Least trimmed squares and S-regression differ only in the scale. With several channels the product of the channels'
-scales is minimised; a step with the weights of the scale over its square never increases it (Rousseeuw & Van
+Least trimmed squares and S-regression differ only in the scale. With several channels the product of their scales is
+minimised; a step with the weights of the scale over its square never increases it (Rousseeuw & Van
 Driessen, "Computing LTS regression for large data sets", 2006; Salibian-Barrera & Yohai, "A fast algorithm for
 S-regression estimates", 2006).
 """
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
 
 
 class ScaleRule(Protocol):
-    """A robust scale of residuals (B, S, N, m); ``near`` is one that it is near to, where that is known."""
+    """A robust scale of residuals (B, S, N, m); ``near`` is a first guess of the scale, if known."""
 
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]: ...
 
-    def weighed(
+    def weighted(
         self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
-        """The scale, and the weights in [0, 1] of a step that lowers it, (B, S, N, m)."""
+        """Return the scale and the weights in [0, 1] of a step that lowers it, (B, S, N, m)."""
         ...
 
 
 _CHUNK = 1 << 16
-"""Residuals of one problem worked on at once, few enough to stay in a processor's cache."""
+"""Residuals of one problem processed at once, few enough to stay in a processor's cache."""
 
 _BATCH = 1 << 18
-"""Residuals of many problems worked on at once: so many that the calls themselves take little beside."""
+"""Residuals of many problems processed at once, so many that the overhead of the calls is small."""
 
 SCREENED = 1500
-"""Samples that starts are screened on."""
+"""Largest number of samples on which starts are screened."""
 
 
 @dataclass(frozen=True)
 class ScaleMinimum:
-    """The best coefficients found, in the basis, with the scale, the weights and the number of steps."""
+    """The best coefficients, in the basis, with scale, weights, number of steps and convergence."""
 
     beta: Float[Tensor, "B n"]
     scale: Float[Tensor, "B m"]
@@ -56,12 +56,12 @@ class ScaleMinimum:
 
 
 def elemental_starts(problem: LinearProblem, count: int, generator: torch.Generator) -> Float[Tensor, "B count+1 n"]:
-    """Coefficients through ``count`` random sets of n values, and the least-squares ones."""
+    """Coefficients through ``count`` random sets of n values, and the least-squares coefficients."""
     return _fits_through(problem, _drawn(problem, count, generator))
 
 
 def _drawn(problem: LinearProblem, count: int, generator: torch.Generator) -> Tensor:
-    """The numbers of the values of each set, (count, n); where weights say which can be, random keys of all values."""
+    """Indices of the values of each set, (count, n); with sample weights, random keys of all values."""
     values = problem.num_samples * problem.num_channels
     keys = torch.rand(count, values, generator=generator, dtype=torch.float64)
     if problem.sample_weight is None:
@@ -91,26 +91,27 @@ def _log_product(scale: Tensor) -> Tensor:
 
 
 def relative_precision(scale: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-    """``1 / scale²`` up to a factor, at most 1; a channel fitted exactly gets a finite share."""
+    """``1 / scale²`` up to a factor, at most 1; finite for a channel that is fitted exactly."""
     largest = scale.amax(-1, keepdim=True)
     ratio = torch.where(largest > 0, scale / largest, 1.0).clamp(min=torch.finfo(scale.dtype).eps)
     return (ratio.amin(-1, keepdim=True) / ratio).square()
 
 
 def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
-    """A scale that stands for 0: where a fit is exact, its rounding errors keep weight 1 and the others lose theirs."""
+    """Replacement of a scale of 0: values on an exact fit keep weight 1, the others lose theirs."""
     magnitude = problem.Y.abs().amax(-2)
     return 1e3 * torch.finfo(problem.Y.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
 
 
 @dataclass(frozen=True)
 class ScaleSearch:
-    """How the minimum is looked for.
+    """Options of a scale search.
 
-    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each on ``screened`` samples
-    at most; one in ``raw`` of them does where ``ranking`` orders them before. The best ``candidates`` go on: of each of
-    ``narrowing`` so many steps, after which so many candidates are left. All that may be approximate. The last go on
-    with the exact rule until a step lowers the log of the scale by less than ``tolerance``, or ``max_iter`` steps.
+    ``starts`` elemental sets and least squares are screened on at most ``screened`` samples, ``screening_steps`` steps
+    each. With ``ranking`` only the best 1 in ``raw`` of them make these steps. The best ``candidates`` continue; each
+    pair of ``narrowing`` is a number of steps and the number of candidates kept after them. All of this may use an
+    approximate scale. The last candidates continue with the ``final`` rule until a step lowers the log scale by less
+    than ``tolerance``, or for ``max_iter`` steps.
     """
 
     screening: ScaleRule
@@ -128,12 +129,13 @@ class ScaleSearch:
 
 
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule, near: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Coefficients after one concentration step, and the scale before it."""
+    """Make a concentration step: return the new coefficients, and the scale before the step."""
     residual = problem.residual(beta)
-    scale, weight = rule.weighed(problem, residual, near)
+    scale, weight = rule.weighted(problem, residual, near)
     if problem.num_channels > 1:
         share = weight if problem.sample_weight is None else weight * problem.sample_weight.unsqueeze(1)
-        spread = (share * residual.square()).sum(-2).sqrt()  # the gradient of log(scale) has its square below
+        # the gradient of log(scale) has the square of this spread in its denominator
+        spread = (share * residual.square()).sum(-2).sqrt()
         weight = weight * relative_precision(spread).unsqueeze(-2)
     return problem.weighted_fit(weight), scale
 
@@ -145,7 +147,7 @@ def _of_starts(values: Float[Tensor, "B S k"], index: Float[Tensor, "B K"]) -> F
 def _best(
     problem: LinearProblem, beta: Tensor, near: Tensor | None, rule: ScaleRule, count: int
 ) -> tuple[Tensor, Tensor]:
-    """The coefficients of the ``count`` smallest scales, and these."""
+    """The coefficients with the ``count`` smallest scales, and these scales."""
     scale = rule.scale(problem, problem.residual(beta), near)
     order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
     return _of_starts(beta, order), _of_starts(scale, order)
@@ -153,30 +155,30 @@ def _best(
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Candidates with their scales, where these are known, and whether and when they came to rest."""
+    """Candidates with their scales, if known, whether they have converged, and the number of steps."""
 
     beta: Float[Tensor, "B S n"]
     scale: Float[Tensor, "B S m"] | None
-    rest: Float[Tensor, "B S"]
+    converged: Float[Tensor, "B S"]
     n_iter: int = 0
 
     def of_starts(self, index: Tensor) -> _Candidates:
         scale = None if self.scale is None else _of_starts(self.scale, index)
-        return replace(self, beta=_of_starts(self.beta, index), scale=scale, rest=self.rest.gather(1, index))
+        return replace(self, beta=_of_starts(self.beta, index), scale=scale, converged=self.converged.gather(1, index))
 
     def select(self, index: Tensor) -> _Candidates:
         scale = None if self.scale is None else self.scale[index]
-        return replace(self, beta=self.beta[index], scale=scale, rest=self.rest[index])
+        return replace(self, beta=self.beta[index], scale=scale, converged=self.converged[index])
 
     def narrowed(self, count: int) -> _Candidates:
-        """The ``count`` candidates of the smallest scales."""
+        """The ``count`` candidates with the smallest scales."""
         if self.scale is None or count >= self.beta.shape[1]:
             return self
         return self.of_starts(_log_product(self.scale).topk(count, dim=1, largest=False).indices)
 
 
 def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Candidates]) -> _Candidates:
-    """``work`` on so many problems at once that ``values`` of each stay in the cache."""
+    """Apply ``work`` to parts of the problems, sized so that ``values`` of each problem stay in the cache."""
     every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
     parts = every.split(max(1, _BATCH // values))
     if len(parts) == 1:
@@ -186,13 +188,13 @@ def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem
     return _Candidates(
         beta=torch.cat([f.beta for f in found]),
         scale=torch.cat(scales) if scales else None,
-        rest=torch.cat([f.rest for f in found]),
+        converged=torch.cat([f.converged for f in found]),
         n_iter=max(f.n_iter for f in found),
     )
 
 
 def minimise_scale(problem: LinearProblem, search: ScaleSearch) -> ScaleMinimum:
-    """A few steps from every start on some of the samples, then the best candidates to rest on all of them."""
+    """Iterate a few steps from every start on some samples, then the best candidates on all until they converge."""
     size = problem.num_samples * problem.num_channels
     screened = min(size, search.screened * problem.num_channels) * (search.starts + 1)
     generator = torch.Generator().manual_seed(search.seed)
@@ -208,13 +210,13 @@ def minimise_scale(problem: LinearProblem, search: ScaleSearch) -> ScaleMinimum:
     for steps, left in search.narrowing:
         short = replace(search, final=search.screening, max_iter=min(steps, search.max_iter))
         found = _descended(problem, found, short).narrowed(left)
-    # what an approximate scale says of rest is not the last word
-    found = replace(found, rest=torch.zeros_like(found.rest))
+    # convergence judged by an approximate scale is not final
+    found = replace(found, converged=torch.zeros_like(found.converged))
     return _ended(problem, _descended(problem, found, search), search)
 
 
 def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: ScaleSearch) -> ScaleMinimum:
-    """Steps from coefficients to rest."""
+    """Iterate from given coefficients until convergence."""
     alone = beta.unsqueeze(1)
     found = _Candidates(alone, None, torch.zeros(alone.shape[:2], dtype=torch.bool, device=beta.device))
     return _ended(problem, _descended(problem, found, search), search)
@@ -222,18 +224,18 @@ def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: ScaleSea
 
 def _ended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> ScaleMinimum:
     best = found.narrowed(1)
-    scale, weight = search.final.weighed(problem, problem.residual(best.beta), best.scale)
-    return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.rest[:, 0])
+    scale, weight = search.final.weighted(problem, problem.residual(best.beta), best.scale)
+    return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.converged[:, 0])
 
 
 def _screened(problem: LinearProblem, drawn: Tensor, search: ScaleSearch) -> _Candidates:
-    """The candidates; the starts of a large problem are worked on so many at once that they stay in the cache."""
+    """Screen the starts, in parts that stay in the cache for a large problem, and return the candidates."""
     beta = _fits_through(problem, drawn)
     at_once = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
     found = [_screened_part(problem, part, search) for part in beta.split(at_once, dim=1)]
     beta, scale = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
-    rest = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
-    return _Candidates(beta, scale, rest).narrowed(search.candidates)
+    converged = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
+    return _Candidates(beta, scale, converged).narrowed(search.candidates)
 
 
 def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search: ScaleSearch) -> tuple[Tensor, Tensor]:
@@ -243,34 +245,34 @@ def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search:
         beta, near = _best(problem, beta, None, search.ranking, max(search.candidates, beta.shape[1] // search.raw))
     for _ in range(search.screening_steps):
         beta, now = _step(problem, beta, search.screening, near)
-        # fits that were not ranked fall too far for a scale to be near to the last
+        # without ranking a step may lower the scale so much that the last scale is not a good guess
         near = None if near is None else now
     return _best(problem, beta, near, search.screening, search.candidates)
 
 
 def _descended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
-    """Steps from every candidate that is not at rest."""
+    """Iterate every candidate that has not converged."""
     values = problem.num_samples * problem.num_channels * found.beta.shape[1]
     return _in_parts(problem, values, lambda some, part: _descend(some, found.select(part), search))
 
 
 def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
-    """As :func:`_descended`, of one part; problems whose candidates are all at rest leave it."""
+    """As :func:`_descended`, for a part; problems whose candidates have all converged leave it."""
     tolerance = max(search.tolerance, 1e2 * torch.finfo(found.beta.dtype).eps)
-    beta, near, moving = found.beta.clone(), found.scale, ~found.rest
+    beta, near, moving = found.beta.clone(), found.scale, ~found.converged
     objective = torch.full(beta.shape[:2], math.inf, dtype=beta.dtype, device=beta.device)
     scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near.clone()
     active = torch.arange(beta.shape[0], device=beta.device)
     some, n_iter = problem, 0
     while n_iter < search.max_iter:
-        awake = moving[active]
-        left = awake.any(1)
+        unfinished = moving[active]
+        left = unfinished.any(1)
         if 2 * int(left.sum()) <= active.shape[0]:
-            active, awake = active[left], awake[left]
+            active, unfinished = active[left], unfinished[left]
             if active.numel() == 0:
                 break
             some = problem.select(active)
-        going = awake.any(0).nonzero().squeeze(-1)
+        going = unfinished.any(0).nonzero().squeeze(-1)
         # copies, not views: what is written below may be part of a derivative
         at = (active.unsqueeze(-1), going)
         n_iter += 1
@@ -278,12 +280,12 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
         known = scale[at] if near is not None or n_iter > 1 else None
         proposal, now = _step(some, here, search.final, known)
         before = _log_product(now)
-        falls = (objective[at] - before > tolerance) & awake[:, going]
+        falls = (objective[at] - before > tolerance) & unfinished[:, going]
         objective[at] = torch.minimum(objective[at], before)
         beta[at] = torch.where(falls.unsqueeze(-1), proposal, here)
         scale[at] = now
         moving[at] = falls
     if n_iter and bool(moving.any()):
-        # of the last step's coefficients
+        # the scale of the last step's coefficients
         scale = search.final.scale(problem, problem.residual(beta), scale)
     return _Candidates(beta, scale, ~moving, found.n_iter + n_iter)

@@ -17,21 +17,21 @@ RobustCovarianceKind = Literal["sandwich", "hac", "homoscedastic"]
 
 
 def checked_kind(kind: CovarianceKind) -> CovarianceKind:
-    """``kind``, or a clear error."""
+    """Return ``kind`` if it is valid, else raise."""
     if kind not in ("sandwich", "hac"):
         raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {kind!r}.")
     return kind
 
 
 def checked_robust_kind(kind: RobustCovarianceKind) -> RobustCovarianceKind:
-    """``kind``, or a clear error."""
+    """Return ``kind`` if it is valid, else raise."""
     if kind not in ("sandwich", "hac", "homoscedastic"):
         raise ValueError(f"Expected argument `covariance` to be 'sandwich', 'hac' or 'homoscedastic' but got {kind!r}.")
     return kind
 
 
 def checked_bandwidth(bandwidth: float | None) -> float | None:
-    """``bandwidth``, or a clear error."""
+    """Return ``bandwidth`` if it is valid, else raise."""
     if bandwidth is None:
         return None
     return checked_number("bandwidth", bandwidth, ends="[)", advice="it counts lags; None takes Andrews' rule")

@@ -13,13 +13,13 @@ from mkc_torch._support.arrays import Data
 from mkc_torch.density.em import normalised
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.likelihood import negative_log_likelihood
-from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
-from mkc_torch.linear._implicit.stationary import StationaryPoint
+from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
+from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
-from mkc_torch.linear._large import LargeMaximum, in_its_basis, is_large, large_maximum
+from mkc_torch.linear._large import LargeMaximum, is_large, large_maximum, problem_in_basis
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
-from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
+from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
@@ -29,51 +29,51 @@ class MKCRegression(Inference):
 
     Maximises the likelihood of the MKC density over the coefficients and, for each channel, σ and d. An E-step is a
     Newton step on (σ, d), an M-step two applications of the fixed point (15). The fit starts from robust coefficients;
-    where the Gaussian likelihood at least squares is higher than what it ends at, it goes on from there.
+    where the Gaussian likelihood at least squares is higher than that of the result, the fit continues from there.
 
-    The domain ``a`` of each channel is fixed before, from a rough fit: half the range of its residuals, and no less
-    than ten of its d (:func:`mkc_torch.density.fit.domain_rule` says why), or what ``bound`` says. d stays above 0.3
-    robust scales, since the likelihood of residuals that a fit interpolates grows without limit.
+    The domain ``a`` of each channel is fixed beforehand: ``bound``, or from a rough fit half the range of its
+    residuals, and at least ten of its d (reason: :func:`mkc_torch.density.fit.domain_rule`). d stays above 0.3 robust
+    scales, since the likelihood of residuals that a fit interpolates grows without limit.
 
-    From 20 000 values on, one problem on a processor is begun on some of its rows, drawn by ``seed``, and ended with
-    joint Newton steps in all unknowns over all rows, in float64 whatever the dtype of the data: about eight passes, and
-    no copy of X. It ends where the next step is less than a millionth of a standard error. Where that does not lead to
-    a maximum, as with values most of which are fitted exactly, the fit is made as of fewer.
+    From 20 000 values on, a single problem on a CPU starts from a pilot fit to some of its rows, drawn by ``seed``.
+    Joint Newton steps in all unknowns over all rows follow, in float64 whatever the dtype of the data: about eight
+    passes, and no copy of X. They end where the next step is less than a millionth of a standard error. If they do not
+    reach a maximum, for example where most values are fitted exactly, the fit is made as for fewer values.
 
     The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or
     under a transform of ``torch.func``, ``coef_``, ``sigma_``, ``d_``, ``weights_`` and ``log_likelihood_`` carry the
     derivatives of the maximum by implicit differentiation, jointly in all its unknowns: first and second ones, in
-    reverse and forward mode and under ``vmap``. The solution is then polished by Newton steps to where the gradient of
-    the likelihood is rounding. A domain that follows from the data counts as a constant, and so does what ends at a
-    limit: σ at ``inf`` or 0.05, d at its least. There is no derivative where a fit did not come to rest or ended at no
-    strict maximum: asking for one raises. The start, ``covariance_`` and ``history_`` are constants.
+    reverse and forward mode and under ``vmap``. Newton steps then polish the solution until the gradient of the
+    likelihood is rounding. A domain that follows from the data counts as a constant, and so does an unknown that ends
+    at a limit: σ at ``inf`` or 0.05, d at its least. A fit that has not converged, or that ended at a point other than
+    a strict maximum, has no derivative: taking it raises. The start, ``covariance_`` and ``history_`` are constants.
 
     Args:
-        sigma: None learns σ; a number in [0.05, inf], (m,) or (*, m) keeps it: ``inf`` is least squares with learned
+        sigma: None learns σ; a number in [0.05, inf], (m,) or (*, m) fixes it: ``inf`` is least squares with learned
             channel weights (Remark 7).
-        d: None learns d; a value keeps it (Remark 6).
+        d: None learns d; a value fixes it (Remark 6).
         bound: half-width of the domain in the unit of Y, at least two robust scales of the residuals, a number, (m,) or
-            (*, m); None takes the rule above. A residual beyond it counts as one on the flat tail.
+            (*, m); None takes the rule above. A residual beyond it counts as being on the flat tail.
         start: "lts", "s", "least_squares", or a tensor of coefficients.
-        max_iter: alternations at most; of many rows, steps over all.
-        tol: converged when two alternations in a row each raise the mean log-likelihood by less (nats per sample).
+        max_iter: largest number of alternations, or of steps over all rows where they are many.
+        tol: converged when two successive alternations each raise the mean log-likelihood by less (nats per sample).
         covariance: "sandwich" for independent samples, "hac" for a time series.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the robust start.
+        seed: seed of the robust start.
 
     Attributes, after ``fit`` (``*`` batch dimensions; m is 1 for one channel given as (*, N)):
         coef_: (*, n).
         sigma_, d_, bound_: (*, m): bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain.
         log_likelihood_: sum over samples and channels, (*,); compare only at equal ``bound_``.
         weights_: ``exp(-e² / (2 d² σ²))`` of each value.
-        covariance_: of the coefficients at the learned σ and d, (*, n, n).
+        covariance_: covariance of the coefficients at the learned σ and d, (*, n, n).
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation or step.
-        exact_fit_: more than half of the values lie on the fit to rounding, (*,).
-        n_iter_, converged_: alternations or steps made, and whether each problem came to rest, as an exact fit has.
-        differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
+        exact_fit_: whether more than half of the values lie on the fit to rounding, (*,).
+        n_iter_, converged_: number of alternations or steps, and whether each problem converged; an exact fit has.
+        differentiable_: whether each problem's solution has a derivative, (*,); only if derivatives were recorded.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), (29)-(31), Algorithms 2 and 3, Remarks 6 and 7.
@@ -86,7 +86,7 @@ class MKCRegression(Inference):
         >>> MKCRegression().fit(X, y).coef_
         tensor([0.9992, 1.0072], dtype=torch.float64)
 
-        The last layer of a network: fitted to samples with outliers, it is judged on others, and the features learn.
+        As the last layer of a network, fitted to samples with outliers; a loss on other samples trains the features.
 
         >>> class Features(torch.nn.Module):
         ...     def __init__(self):
@@ -117,10 +117,10 @@ class MKCRegression(Inference):
     ) -> None:
         super().__init__()
         if sigma is not None:
-            refuse_out_of_range("sigma", sigma, SIGMA_LEAST, math.inf, "[]", "None learns it")
+            refuse_out_of_range("sigma", sigma, SIGMA_LEAST, math.inf, "[]", "pass None to learn it")
         for name, value in (("d", d), ("bound", bound)):
             if value is not None:
-                refuse_out_of_range(name, value, advice="it is in the unit of Y; None finds it")
+                refuse_out_of_range(name, value, advice="it is in the unit of Y; pass None to estimate it")
         self.sigma = sigma
         self.d = d
         self.bound = bound
@@ -141,15 +141,18 @@ class MKCRegression(Inference):
 
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
-            NotDifferentiableError: when a derivative is taken of a fit that has none, in the backward pass.
+            NotDifferentiableError: in the backward pass, for a fit that has no derivative.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
-        if wanted(X, Y, sample_weight, self.sigma, self.d, self.bound):
+        if needs_derivatives(X, Y, sample_weight, self.sigma, self.d, self.bound):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
-            values, known = laid_out(X, Y, sample_weight), FixedParameters(self.sigma, self.d, self.bound, self.start)
-            # scores of a time series are of use in their order alone
+            values, known = (
+                checked_shapes(X, Y, sample_weight),
+                FixedParameters(self.sigma, self.d, self.bound, self.start),
+            )
+            # a time series needs the scores in their order
             found = self._large_maximum(values, known) if self.covariance == "sandwich" else None
             if found is not None:
                 self._keep_large(values, found)
@@ -167,19 +170,19 @@ class MKCRegression(Inference):
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> MKCRegression:
-        def solve(problem: LinearProblem, given: Given) -> StationaryPoint:
+        def solve(problem: LinearProblem, given: Given) -> FitState:
             known = FixedParameters(
                 given.sigma, given.d, given.bound, self.start if given.start is None else given.start
             )
-            found = self._large_maximum(in_its_basis(problem), known.in_basis_of(problem))
+            found = self._large_maximum(problem_in_basis(problem), known.in_basis_of(problem))
             if found is not None:
                 self.n_iter_ = len(found.history) - 1
                 flag = torch.ones_like(problem.Y[:, 0, 0], dtype=torch.bool)
-                return replace(found.rest, converged=flag, extras=(~flag, found.history.unsqueeze(0)))
+                return replace(found.fit_state, converged=flag, extras=(~flag, found.history.unsqueeze(0)))
             begin, maximum = self._maximise(problem, known)
             self.n_iter_ = len(maximum.history) - 1
             state = maximum.state
-            return StationaryPoint(
+            return FitState(
                 beta=maximum.beta,
                 kappa=state.kappa,
                 log_d=state.log_d,
@@ -204,7 +207,7 @@ class MKCRegression(Inference):
         )
         assert layer.log_likelihood is not None
         self._set_layer(layer)
-        # at a finite stand-in, since the slope of 0 ** -0.5 times a gradient of 0 is NaN
+        # the rsqrt is taken of 1 for Gaussian channels: the slope of 0 ** -0.5 times a gradient of 0 is NaN
         gaussian = layer.kappa <= 0
         self.sigma_ = torch.where(gaussian, torch.inf, torch.where(gaussian, 1.0, layer.kappa).rsqrt())
         self.d_, self.bound_ = layer.d, layer.bound
@@ -219,10 +222,10 @@ class MKCRegression(Inference):
 
         self._single_channel = values.single_channel
         self.coef_, self.weights_ = restored(found.coef), restored(found.weights)
-        rest = found.rest
-        assert rest.log_bound is not None
-        self.sigma_, self.d_ = restored(rest.kappa[0].rsqrt()), restored(torch.exp(rest.log_d[0]))
-        self.bound_ = restored(torch.exp(rest.log_bound[0]))
+        fit_state = found.fit_state
+        assert fit_state.log_bound is not None
+        self.sigma_, self.d_ = restored(fit_state.kappa[0].rsqrt()), restored(torch.exp(fit_state.log_d[0]))
+        self.bound_ = restored(torch.exp(fit_state.log_bound[0]))
         self.log_likelihood_ = restored(found.log_likelihood)
         self.covariance_, self.dof_ = restored(found.covariance), restored(found.dof)
         self.history_ = torch.stack([restored(h) for h in found.history])

@@ -19,8 +19,8 @@ from mkc_torch._support.arguments import (
 )
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.torch_internals import functorch_is_active
-from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
-from mkc_torch.linear._implicit.stationary import StationaryPoint
+from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
+from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._mkc import (
     channel_parameter,
@@ -73,7 +73,7 @@ def _cholesky_factor(covariance: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
 
 
 def _refuse_no_covariance(covariance: Tensor) -> None:
-    """Refuse what its value alone says is no covariance, where that can be seen."""
+    """Refuse a tensor that is not a covariance, as far as its shape and, on a CPU, its values show."""
     refuse_no_tensor("noise_covariance", covariance, "a tensor")
     refuse_complex("noise_covariance", covariance)
     if covariance.dim() != 2 or covariance.shape[0] != covariance.shape[1]:
@@ -94,7 +94,7 @@ def descend(
     max_iter: int,
     tol: float,
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Apply (15) until a step lowers the loss by less than ``tol`` of it; with convergence and the losses."""
+    """Apply (15) until a step lowers the loss by a share below ``tol``. Returns coefficients, convergence, losses."""
     tol = max(tol, 4 * torch.finfo(beta.dtype).eps)
     history = []
     previous = beta.new_full(beta.shape[:-1], math.inf)
@@ -122,37 +122,38 @@ class _End(NamedTuple):
 class FixedPointLinear(Inference):
     """Linear regression under the MKC loss (13) with given σ and d by the fixed point (15): Algorithm 1 of the paper.
 
-    The loss has many local minima when ``h = σ d`` is small, and leverage points can make the lowest a wrong one. The
-    fit starts from robust coefficients and is led from a bandwidth of three robust scales to the given one.
+    The loss has many local minima when ``h = σ d`` is small, and leverage points can make a wrong minimum the lowest.
+    The fit starts from robust coefficients and reduces the bandwidth in steps from three robust scales to the given h.
 
     The fit is a differentiable layer: where X, Y, ``sample_weight``, σ, d or the noise covariance require a gradient,
     or under a transform of ``torch.func``, ``coef_`` and ``weights_`` carry the derivatives of the solution by implicit
-    differentiation, first and second ones, in reverse and forward mode and under ``vmap``. ``coef_`` is then polished
-    by Newton steps to where the gradient of the loss is rounding. There is no derivative where a fit did not come to
-    rest or ended at no strict minimum: asking for one raises. Start, ``covariance_`` and ``history_`` are constants.
+    differentiation, first and second ones, in reverse and forward mode and under ``vmap``. Newton steps then polish
+    ``coef_`` until the gradient of the loss is rounding. A fit that has not converged, or that ended at a point other
+    than a strict minimum, has no derivative: taking it raises. Start, ``covariance_`` and ``history_`` are constants.
 
     Args:
         sigma: bandwidth of each channel, a number, (m,) or (*, m); ``inf`` is weighted least squares exactly.
         d: scale of each channel, in the unit of Y.
         noise_covariance: covariance (m, m) of the channels' noise where it is not diagonal; X and Y are whitened by it
             and σ and d refer to the whitened channels.
-        start: "lts", "s", "least_squares" (as in the paper, not led), or a tensor of coefficients (*, n).
-        max_iter: steps at most.
+        start: "lts", "s", "least_squares" (as in the paper, without graduation), or coefficients, a tensor (*, n).
+        max_iter: largest number of steps.
         tol: converged when a step lowers the loss by a smaller share of it.
         covariance: "sandwich" for independent samples, "hac" for a time series.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the robust start.
+        seed: seed of the robust start.
 
     Attributes, after ``fit`` (``*`` batch dimensions):
         coef_: (*, n).
         weights_: ``exp(-e² / (2 d² σ²))`` of each value, (*, N, m); m is 1 for one channel.
-        covariance_: of the coefficients, (*, n, n).
+        covariance_: covariance of the coefficients, (*, n, n).
         history_: the loss (9) before every step, (steps + 1, *).
-        n_iter_: steps made. converged_: (*,).
-        differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
+        n_iter_: number of steps.
+        converged_: whether each problem converged, (*,).
+        differentiable_: whether each problem's solution has a derivative, (*,); only if derivatives were recorded.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (13)-(16), Algorithm 1.
@@ -164,7 +165,7 @@ class FixedPointLinear(Inference):
         >>> FixedPointLinear(sigma=1.0, d=1.0).fit(X, y).coef_
         tensor([1.0000, 2.0000], dtype=torch.float64)
 
-        How the slope follows each target; the four outliers have no say:
+        The derivative of the slope by each target; it is 0 for the four outliers:
 
         >>> y = y.requires_grad_()
         >>> FixedPointLinear(sigma=1.0, d=1.0).fit(X, y).coef_[1].backward()
@@ -211,10 +212,10 @@ class FixedPointLinear(Inference):
 
         Raises:
             ValueError: σ or d not positive or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
-            NotDifferentiableError: when a derivative is taken of a fit that has none, in the backward pass.
+            NotDifferentiableError: in the backward pass, for a fit that has no derivative.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
-        if wanted(X, Y, sample_weight, self.sigma, self.d, self.noise_covariance):
+        if needs_derivatives(X, Y, sample_weight, self.sigma, self.d, self.noise_covariance):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
@@ -237,12 +238,12 @@ class FixedPointLinear(Inference):
         if self.noise_covariance is not None:
             X, Y = whitened(X, Y, self.noise_covariance)
 
-        def solve(problem: LinearProblem, given: Given) -> StationaryPoint:
+        def solve(problem: LinearProblem, given: Given) -> FitState:
             assert given.sigma is not None
             assert given.d is not None
             end = self._solve(problem, given.sigma, given.d, self.start if given.start is None else given.start)
             self.n_iter_ = len(end.history) - 1
-            return StationaryPoint(
+            return FitState(
                 end.beta, end.kappa, torch.log(end.d), end.converged, extras=(torch.stack(end.history, -1),)
             )
 
@@ -268,13 +269,13 @@ class FixedPointLinear(Inference):
         return _End(beta, kappa, scale, converged, history)
 
     def _start(self, problem: LinearProblem, kappa: Tensor, d: Tensor, start: Start | Tensor) -> Float[Tensor, "B n"]:
-        """Coefficients to descend from: given, least squares, or robust ones led from a bandwidth in view of them."""
+        """Starting coefficients: given, least squares, or robust coefficients refined at decreasing bandwidths."""
         if not isinstance(start, Tensor) and (start == "least_squares" or bool((kappa == 0).all())):
             return fixed_point_step(problem, problem.Y, torch.zeros_like(kappa), d)
         robust = robust_start(problem, start, seed=self.seed)
         if isinstance(start, Tensor):
             return robust.beta
-        # three robust scales, in units of the given h = σ d of the channel that is seen worst
+        # three robust scales, in units of the given h = σ d, of the channel with the largest such ratio
         view = (3.0 * robust.scale / d * kappa.sqrt()).amax(-1, keepdim=True).clamp(min=1.0)
         beta = robust.beta
         for step in range(_GRADUATION):

@@ -1,4 +1,4 @@
-"""Generalised maximum entropy: coefficients and errors as means of the most even distributions on given supports."""
+"""Generalised maximum entropy: coefficients and errors are means of maximum-entropy distributions on given supports."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 class GeneralizedMaximumEntropy(LinearEstimator):
     """Coefficients ``θ = Z p`` and errors ``ε = V w`` with the largest entropy that satisfy ``Y = X θ + ε``, (30)-(39).
 
-    Each coefficient is the mean of a distribution p on its support points, and each error of one on its own; what the
-    data leave open stays as even as it can be. So dependent columns of X, and fewer samples than coefficients, are
-    allowed. The supports say what is believed beforehand: coefficients are drawn towards the middle of theirs. Outliers
-    are not resisted in any special way.
+    Each coefficient and each error is the mean of a distribution on its own support points. The distributions are as
+    uniform as the data allow, so dependent columns of X, and fewer samples than coefficients, are allowed. The supports
+    are prior knowledge: coefficients shrink towards the middle of their supports. The estimator is not robust to
+    outliers.
 
     The concave problem is solved through its dual, one multiplier for each value of Y, by Newton's method.
 
     Args:
-        coef_support: points of the coefficients, a tensor that broadcasts to (n, l); or a half-width c for
+        coef_support: support points of the coefficients, a tensor that broadcasts to (n, l); or a half-width c for
             ``(-c, -c/2, 0, c/2, c)``.
-        error_support: points of the errors in the unit of Y, a tensor that broadcasts to (*, N, m, l); or a half-width.
-            None takes three root mean squares of each channel of Y less its mean, or 1.1 times its largest magnitude if
+        error_support: support points of the errors in the unit of Y, a tensor that broadcasts to (*, N, m, l); or a
+            half-width. None takes three standard deviations of each channel of Y, or 1.1 times its largest magnitude if
             that is more, so that a solution always exists.
         tol: largest violation of ``Y = X θ + ε``, in units of the errors' half-width.
-        max_iter: most steps of Newton's method.
+        max_iter: largest number of Newton steps.
 
     Attributes, after ``fit``:
         coef_: (*, n).
@@ -41,17 +41,17 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         probabilities_: p, (*, n, l).
         error_probabilities_: w, (*, N, m, l).
         entropy_: -Σ p log p - Σ w log w, (35), in nats, (*,).
-        n_iter_: steps of each problem, (*,).
-        weights_: ones, (*, N, m).
+        n_iter_: number of steps of each problem, (*,).
+        weights_: all 1, (*, N, m).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         A. Golan, G. Judge, D. Miller, Maximum Entropy Econometrics (1996); G. Indiveri, Entropy 11 (2009), (30)-(39).
 
     Example:
-        >>> X = torch.tensor([[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]])  # two equal columns share what they explain
+        >>> X = torch.tensor([[1.0, 1.0], [1.0, 1.0], [1.0, 1.0]])  # two equal columns share their effect
         >>> fit = GeneralizedMaximumEntropy(100.0, 1.0).fit(X, torch.tensor([4.0, 4.0, 4.0]))
         >>> fit.coef_
         tensor([2.0000, 2.0000])
@@ -84,7 +84,7 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         Args:
             X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N); of any rank.
             Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); 0 leaves it out.
+            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
 
         Returns:
             The estimator.
@@ -107,8 +107,8 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         v = self._error_points(given).reshape(B, N * m, -1)
 
         dual = _Dual(rows, target, weight, z, v)
-        multiplier, pull, n_iter = dual.solve(self.tol, self.max_iter, (N, m))
-        p, q = dual.probabilities(multiplier, pull)
+        multiplier, tilt, n_iter = dual.solve(self.tol, self.max_iter, (N, m))
+        p, q = dual.probabilities(multiplier, tilt)
         coef, error = (p * z).sum(-1), (q * v).sum(-1)
         entropy = _entropy(p).sum(-1) + (weight * _entropy(q)).sum(-1)
         self._single_channel = given.single_channel
@@ -150,14 +150,14 @@ class GeneralizedMaximumEntropy(LinearEstimator):
 
 
 _POINTS = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0], dtype=torch.float64)
-"""(30)-(31)."""
+"""Default support points in half-widths, (30)-(31)."""
 
 _LARGEST = 1e8
-"""Multiplier, in units of the errors' half-width, that only errors at the end of their support have."""
+"""Largest multiplier, in units of the errors' half-width; only errors at the end of their support exceed it."""
 
 
 def _checked_support(name: str, support: float | Tensor) -> Tensor:
-    """Support points along the last dimension."""
+    """Support points along the last dimension; raises if they are invalid."""
     if not isinstance(support, Tensor):
         half = checked_number(name, support, advice=f"points are a tensor, torch.as_tensor({name})")
         return half * _POINTS
@@ -179,8 +179,8 @@ def _entropy(p: Tensor) -> Tensor:
 class _Dual:
     """``M(λ) = Σ_i w_i (λ_i y_i + log Σ_k exp(-λ_i v_ik)) + Σ_j log Σ_k exp(-a_j z_jk)`` with ``a = Xᵀ (w λ)``.
 
-    It is convex; its gradient is ``w (y - X θ - ε)``. Errors are in units of their half-width. The pull a is carried
-    along with λ: for wide supports of the coefficients it is a small difference of large terms.
+    It is convex; its gradient is ``w (y - X θ - ε)``. Errors are in units of their half-width. The exponents ``a`` are
+    updated along with λ, since for wide supports of the coefficients they are small differences of large terms.
     """
 
     def __init__(self, rows: Tensor, target: Tensor, weight: Tensor, z: Tensor, v: Tensor) -> None:
@@ -191,23 +191,23 @@ class _Dual:
         self.z = z
         self.v = v / self.unit.unsqueeze(-1)
 
-    def value(self, multiplier: Float[Tensor, "B R"], pull: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
+    def value(self, multiplier: Float[Tensor, "B R"], tilt: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         errors = torch.logsumexp(-multiplier.unsqueeze(-1) * self.v, -1)
-        coef = torch.logsumexp(-pull.unsqueeze(-1) * self.z, -1)
+        coef = torch.logsumexp(-tilt.unsqueeze(-1) * self.z, -1)
         return (self.weight * (multiplier * self.target + errors)).sum(-1) + coef.sum(-1)
 
-    def probabilities(self, multiplier: Tensor, pull: Tensor) -> tuple[Float[Tensor, "B n l"], Float[Tensor, "B R k"]]:
-        return torch.softmax(-pull.unsqueeze(-1) * self.z, -1), torch.softmax(-multiplier.unsqueeze(-1) * self.v, -1)
+    def probabilities(self, multiplier: Tensor, tilt: Tensor) -> tuple[Float[Tensor, "B n l"], Float[Tensor, "B R k"]]:
+        return torch.softmax(-tilt.unsqueeze(-1) * self.z, -1), torch.softmax(-multiplier.unsqueeze(-1) * self.v, -1)
 
-    def step(self, multiplier: Tensor, pull: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """How far ``y - X θ - ε`` is from 0, and Newton's step of λ and a."""
-        p, q = self.probabilities(multiplier, pull)
+    def step(self, multiplier: Tensor, tilt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the residual of ``y = X θ + ε``, and the Newton step of λ and a."""
+        p, q = self.probabilities(multiplier, tilt)
         coef, error = (p * self.z).sum(-1), (q * self.v).sum(-1)
         gap = self.target - torch.matmul(self.rows, coef.unsqueeze(-1)).squeeze(-1) - error
         root = (p * (self.z - coef.unsqueeze(-1)).square()).sum(-1).sqrt()
         spread = (q * (self.v - error.unsqueeze(-1)).square()).sum(-1)
         spread = spread.clamp(min=torch.finfo(gap.dtype).eps ** 2)
-        # the Hessian is diagonal but for the n coefficients, so that Woodbury's identity leaves an (n, n) system
+        # the Hessian is diagonal except for the n coefficients, so Woodbury's identity leaves an (n, n) system
         scaled = self.rows * root.unsqueeze(-2)
         inner = torch.matmul(scaled.mT, scaled * (self.weight / spread).unsqueeze(-1))
         inner.diagonal(dim1=-2, dim2=-1).add_(1.0)
@@ -219,19 +219,19 @@ class _Dual:
         return gap, change, torch.where(wide, -shared.squeeze(-1) / torch.where(wide, root, 1.0), summed)
 
     def solve(self, tol: float, max_iter: int, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Multipliers (B, R), pulls (B, n) and steps made (B,)."""
-        multiplier, pull = torch.zeros_like(self.target), torch.zeros_like(self.rows[:, 0])
+        """Return multipliers (B, R), exponents a (B, n) and numbers of steps (B,)."""
+        multiplier, tilt = torch.zeros_like(self.target), torch.zeros_like(self.rows[:, 0])
         used = self.weight > 0
         n_iter = torch.zeros(self.target.shape[0], dtype=torch.long, device=multiplier.device)
-        best = self.value(multiplier, pull)
+        best = self.value(multiplier, tilt)
         for iteration in range(max_iter + 1):
-            gap, change, change_pull = self.step(multiplier, pull)
+            gap, change, change_tilt = self.step(multiplier, tilt)
             size = torch.where(used, gap.abs(), 0.0)
             left = ~(size.amax(-1) <= tol)
             if not bool(left.any()):
-                return multiplier, pull, n_iter
-            # multipliers of ever larger size belong to errors at the end of their support, and so do steps to nowhere
-            steps = torch.cat([change, change_pull], -1).isfinite().all(-1)
+                return multiplier, tilt, n_iter
+            # errors at the end of their support have ever larger multipliers, and steps that are not finite
+            steps = torch.cat([change, change_tilt], -1).isfinite().all(-1)
             stuck = left & ~(steps & (multiplier.abs().amax(-1) <= _LARGEST))
             if iteration == max_iter or bool(stuck.any()):
                 left = stuck if bool(stuck.any()) else left
@@ -239,19 +239,19 @@ class _Dual:
             slope = (self.weight * gap * change).sum(-1)
             length = left.to(gap).unsqueeze(-1)
             for _ in range(60):
-                trial, trial_pull = multiplier + length * change, pull + length * change_pull
-                value = self.value(trial, trial_pull)
+                trial, trial_tilt = multiplier + length * change, tilt + length * change_tilt
+                value = self.value(trial, trial_tilt)
                 low = value <= best + 1e-4 * length.squeeze(-1) * slope + 1e-14 * best.abs()
                 if bool(low.all()):
                     break
                 length = torch.where(low.unsqueeze(-1), length, 0.5 * length)
-            multiplier, pull, best = trial, trial_pull, value
+            multiplier, tilt, best = trial, trial_tilt, value
             n_iter = n_iter + left
         problem = int(torch.where(left, size.amax(-1), -1.0).argmax())
         sample, channel = divmod(int(size[problem].argmax()), shape[1])
         at = f"sample {sample}" + (f", channel {channel}" if shape[1] > 1 else "")
         raise ValueError(
             "Expected supports within which `Y = X coef + error` can hold but at "
-            f"{at} {float((size * self.unit)[problem].max()):.3g} is left over; "
+            f"{at} {float((size * self.unit)[problem].max()):.3g} remains unexplained; "
             "widen `coef_support` or `error_support`."
         )

@@ -18,27 +18,27 @@ if TYPE_CHECKING:
 
 
 class LeastAbsoluteDeviations(LinearEstimator):
-    """The coefficients of the smallest (weighted) sum of absolute residuals, the linear program solved to its optimum.
+    """Coefficients with the smallest (weighted) sum of absolute residuals, by exact solution of the linear program.
 
-    An interior point of the bounded dual (Frisch-Newton, predictor and corrector) runs for all problems at once, then
-    the coefficients are solved exactly through the n values of the smallest residuals. It computes in float64 whatever
-    the dtype of the data. Where several coefficients share the optimum, one of them is returned.
+    An interior-point method on the bounded dual (Frisch-Newton, predictor and corrector) runs for all problems at once.
+    The coefficients are then solved exactly through the n values with the smallest residuals. Computation is in float64
+    whatever the dtype of the data. If several coefficient vectors are optimal, one of them is returned.
 
-    Outliers in Y have a bounded influence; those in X (leverage points) do not.
+    Outliers in Y have a bounded influence; outliers in X (leverage points) do not.
 
     Args:
         tol: largest gap between the objective and its lower bound from the dual, relative to the objective; in (0, 1).
-        max_iter: most interior-point iterations, at least 1; 10 to 30 are usual.
+        max_iter: largest number of interior-point iterations, at least 1; 10 to 30 are usual.
 
     Attributes, after ``fit``:
-        coef_: coefficients (*, n). Their gradient in Y is that of the solution through the n values.
-        weights_: ones, (*, N, m); the estimator weighs no value down.
+        coef_: coefficients (*, n). Their gradient by Y is that of the solution through the n values.
+        weights_: all 1, (*, N, m); the estimator does not downweight values.
         objective_: the minimum (*,) of ``sum(sample_weight * |Y - X coef|)`` over samples and channels.
         n_iter_: interior-point iterations (*,) of each problem, 0 where least squares already fits exactly.
         converged_: whether each problem (*,) reached ``tol``, or the rounding error of an objective near 0.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0], [1.0, 3.0]])
@@ -65,7 +65,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
         Args:
             X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
             Y: targets.
-            sample_weight: non-negative factors (*, N) or (*, N, m) of the absolute residuals; 0 leaves a value out.
+            sample_weight: non-negative factors (*, N) or (*, N, m) of the absolute residuals; 0 excludes a value.
 
         Returns:
             The estimator, with ``coef_`` (*, n), ``weights_``, ``objective_``, ``n_iter_`` and ``converged_``.
@@ -77,7 +77,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
-        # conditioning near the optimum is beyond float32
+        # the conditioning near the optimum is too bad for float32
         rows = problem.basis.flatten(-3, -2).double()
         target = problem.Y.flatten(-2).double()
         weight = torch.ones_like(target)
@@ -87,9 +87,9 @@ class LeastAbsoluteDeviations(LinearEstimator):
             start = problem.weighted_fit(torch.ones_like(problem.Y)).double()
             scale = weight.amax(-1, keepdim=True)
             relative = weight / scale
-            # without weights one X that serves many Y stays one
+            # without weights, a shared X stays shared
             scaled_rows = rows if problem.sample_weight is None else rows * relative.unsqueeze(-1)
-            # around least squares, so that a large offset costs no digits
+            # residuals of least squares, so that a large offset costs no digits
             centred = relative * (target - _apply(rows, start))
             floor = 8 * torch.finfo(torch.float64).eps * (relative * target.abs()).sum(-1)
             step, bound, n_iter = _interior_point(scaled_rows, centred, floor, self.tol, self.max_iter)
@@ -120,7 +120,7 @@ def _moment(rows: Float[Tensor, "#B R n"], values: Float[Tensor, "B R"]) -> Floa
 
 @dataclass(frozen=True)
 class _Iterate:
-    """Point of the interior: ``beta``, the residual as ``above - below`` and the dual ``d = 1 - upper = lower - 1``.
+    """An interior point: ``beta``, the residual as ``above - below`` and the dual ``d = 1 - upper = lower - 1``.
 
     The dual is ``max target·d`` with ``rowsᵀ d = 0`` and ``|d| <= 1``. The last four are positive; at the optimum
     ``above * upper`` and ``below * lower`` are 0.
@@ -155,16 +155,16 @@ class _Iterate:
         residual = self.residual()
         size = residual.abs()
         gap = (residual.clamp(min=0) * self.upper + (-residual).clamp(min=0) * self.lower).sum(-1)
-        # a few vast outliers make the objective; the coefficients are as good as the gap is beside the other values
+        # a few huge outliers dominate the objective, so the gap is compared with a typical size of the residuals
         typical = torch.minimum(size.mean(-1), size.median(-1).values) * size.shape[-1]
         return gap <= torch.maximum(tol * typical, self.floor)
 
     def bound(self) -> Float[Tensor, " B"]:
-        """Lower bound of the objective; the residual in place of the target covers for rounding in ``rowsᵀ d = 0``."""
+        """Lower bound of the objective; using the residual, not the target, absorbs rounding in ``rowsᵀ d = 0``."""
         return ((self.lower - self.upper) / 2 * self.residual()).sum(-1)
 
     def advance(self) -> _Iterate:
-        """One predictor-corrector step (Portnoy and Koenker 1997, section 4)."""
+        """Make one predictor-corrector step (Portnoy and Koenker 1997, section 4)."""
         rows, above, below, upper, lower = self.rows, self.above, self.below, self.upper, self.lower
         stiffness = 1 / (above / upper + below / lower)
         weighted = rows * stiffness.unsqueeze(-1)
@@ -173,9 +173,9 @@ class _Iterate:
         drift = self.residual() - (above - below)
 
         def newton(to_above: Tensor, to_below: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            pull = drift - to_above / upper + to_below / lower
-            d_beta = solve_gram(gram, _moment(weighted, pull) + slip)
-            d_dual = stiffness * (pull - _apply(rows, d_beta))
+            right_side = drift - to_above / upper + to_below / lower
+            d_beta = solve_gram(gram, _moment(weighted, right_side) + slip)
+            d_dual = stiffness * (right_side - _apply(rows, d_beta))
             return d_beta, d_dual, (to_above + above * d_dual) / upper, (to_below - below * d_dual) / lower
 
         gap = (above * upper + below * lower).sum(-1, keepdim=True)
@@ -222,7 +222,7 @@ def _interior_point(
 
 
 def _longest(a: Tensor, d_a: Tensor, b: Tensor, d_b: Tensor) -> Float[Tensor, "B 1"]:
-    """The longest step, at most 1, that keeps ``a`` and ``b`` positive."""
+    """Longest step, at most 1, that keeps ``a`` and ``b`` positive."""
     fastest = torch.maximum((-d_a / a).amax(-1, keepdim=True), (-d_b / b).amax(-1, keepdim=True))
     return torch.where(fastest > 0.9995, 0.9995 / fastest, torch.ones_like(fastest))
 
@@ -230,9 +230,9 @@ def _longest(a: Tensor, d_a: Tensor, b: Tensor, d_b: Tensor) -> Float[Tensor, "B
 def _tight_rows(
     rows: Float[Tensor, "#B R n"], residual: Float[Tensor, "B R"], used: Bool[Tensor, "B R"]
 ) -> Int[Tensor, "B n"]:
-    """The n linearly independent rows of the smallest residuals: QR that pivots on ``row / |residual|``.
+    """The n linearly independent rows with the smallest residuals: QR that pivots on ``row / |residual|``.
 
-    Taking the n smallest alone would fail on repeated samples.
+    The n rows with the smallest residuals alone may be dependent, as for repeated samples.
     """
     eps = torch.finfo(residual.dtype).eps
     size = residual.abs()
@@ -253,7 +253,7 @@ def _tight_rows(
 def _solve_through(
     rows: Float[Tensor, "#B R n"], target: Float[Tensor, "B R"], chosen: Int[Tensor, "B n"]
 ) -> Float[Tensor, "B n"]:
-    """The coefficients that fit the chosen rows exactly."""
+    """Coefficients that fit the chosen rows exactly."""
     matrix = rows.expand(target.shape[0], -1, -1).gather(-2, chosen.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
     solution: Tensor = torch.linalg.solve(matrix, target.gather(-1, chosen))
     return solution

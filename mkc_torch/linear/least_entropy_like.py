@@ -1,4 +1,4 @@
-"""Least entropy-like regression: the coefficients whose relative squared residuals are spread least evenly."""
+"""Least entropy-like regression: coefficients whose relative squared residuals have the least entropy."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ if TYPE_CHECKING:
 
 
 _CHUNK = 1 << 22
-"""Values held at once: products of rows, and residuals of all descents."""
+"""Largest number of values held at once: products of rows, and residuals of all descents."""
 
 _RADIUS = 0.8
-"""Angle of the first steps at most, between residuals."""
+"""Largest angle of the first steps, in radians between residual vectors."""
 
 
 class LeastEntropyLike(LinearEstimator):
-    """Local minima of H, the normalised entropy of the relative squared residuals, and the one of least H.
+    """Local minima of H, the normalised entropy of the relative squared residuals, and the minimum of least H.
 
-    H does not change with the scale of the residuals, and a minimum is found from each of several starts: by default
-    least squares and n - 1 vectors of its length orthogonal to it, (50)-(51). The minima are equivariant; the starts,
-    as the paper defines them, are not: other units of the columns of X lead to other starts. Bad leverage points can
-    make a minimum of their own, often the one of least H (the paper's Table 5): look at all of them.
+    H is invariant to the scale of the residuals. A minimum is found from each of several starts: by default least
+    squares and n - 1 vectors of its length orthogonal to it, (50)-(51). The minima are equivariant. The starts, as the
+    paper defines them, are not: other units of the columns of X give other starts. Bad leverage points can cause a
+    further minimum, often with the least H (the paper's Table 5): inspect all minima.
 
-    The residual is a homogeneous function of (θ, 1), so that the descent runs over directions, by Newton's method with
-    the exact Hessian. It passes through infinite coefficients where H falls that way. With m channels the mean of the
+    The residual is a homogeneous function of (θ, 1), so the descent is over directions, by Newton's method with the
+    exact Hessian. It may pass through infinite coefficients. With m channels the mean of the
     channels' H is minimised.
 
     Args:
-        start: the initial guess θ̂0 of (50), (n,) or (*, n); default least squares.
-        starts: all starts instead, (S, n) or (*, S, n).
-        tol: foreseen gain in H at which a descent ends.
-        max_iter: steps tried at most.
+        start: initial guess θ̂0 of (50), (n,) or (*, n); default least squares.
+        starts: all starts, instead of ``start``, (S, n) or (*, S, n).
+        tol: predicted gain in H below which a descent ends.
+        max_iter: largest number of steps tried.
 
     Attributes, after ``fit``:
-        coef_: the coefficients of least H, (*, n).
-        entropy_: H of them, (*,); 0 for an exact fit.
+        coef_: coefficients of least H, (*, n).
+        entropy_: H at ``coef_``, (*,); 0 for an exact fit.
         starts_: (*, S, n).
-        minima_: where the descent from each start ended, (*, S, n).
-        minima_entropy_: H there, (*, S).
-        minima_converged_: whether that is a local minimum, (*, S).
-        converged_: the same of the best, (*,).
-        n_iter_: most steps tried of any start, (*,).
-        weights_: 1 where the gradient (52) draws a residual towards zero, 0 where it pushes it away: where
-            ``log q`` exceeds its mean under q.
+        minima_: end of the descent from each start, (*, S, n).
+        minima_entropy_: H at ``minima_``, (*, S).
+        minima_converged_: whether each is a local minimum, (*, S).
+        converged_: whether ``coef_`` is a local minimum, (*,).
+        n_iter_: largest number of steps tried from a start, (*,).
+        weights_: 1 where descent along the gradient (52) reduces a residual; 0 where ``log q`` exceeds its mean under
+            q, so that the residual grows.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         G. Indiveri, "An Entropy-Like Estimator for Robust Parameter Identification", Entropy 11 (2009) 560-585.
@@ -89,7 +89,7 @@ class LeastEntropyLike(LinearEstimator):
     ) -> None:
         super().__init__()
         if start is not None and starts is not None:
-            raise ValueError("Expected one of the arguments `start` and `starts` but got both; drop one.")
+            raise ValueError("Expected argument `start` or `starts` but got both; pass only one of them.")
         for name, value, least in (("start", start, 1), ("starts", starts, 2)):
             if value is None:
                 continue
@@ -102,7 +102,7 @@ class LeastEntropyLike(LinearEstimator):
                 )
         self.start = start
         self.starts = starts
-        self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 leaves the coefficients nine digits")
+        self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 gives the coefficients nine digits")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
@@ -112,15 +112,15 @@ class LeastEntropyLike(LinearEstimator):
         Args:
             X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
             Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); 0 leaves it out.
+            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
 
         Returns:
             The estimator.
 
         Raises:
             TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, there are fewer than n + 2 values (through n of n + 1
-                values H is 0, whichever they are), weights total at most 1, or a start has another shape.
+            ValueError: shapes do not fit, values are not finite, there are fewer than n + 2 values (with n + 1 values
+                any fit through n of them has H = 0), weights total at most 1, or a start has the wrong shape.
             RankDeficientError: columns of X are linearly dependent.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
@@ -156,8 +156,8 @@ class LeastEntropyLike(LinearEstimator):
         best = torch.where(converged | ~converged.any(1, keepdim=True), entropy, torch.inf).argmin(1)
         problems = torch.arange(best.shape[0], device=best.device)
         chosen = beta[problems, best]
-        drawn = torch.where(exact[:, None, None], 1.0, _drawn(problem, chosen).to(Y.dtype))
-        self._set_common(problem, chosen, drawn)
+        reduced = torch.where(exact[:, None, None], 1.0, _reduced(problem, chosen).to(Y.dtype))
+        self._set_common(problem, chosen, reduced)
         self.coef_ = self.coef_.to(Y.dtype)
         self.entropy_ = problem.restore(entropy[problems, best].to(Y.dtype))
         self.starts_ = problem.restore(_coefficients(problem, starts).to(Y.dtype))
@@ -183,7 +183,7 @@ class LeastEntropyLike(LinearEstimator):
         )
 
     def _starts(self, problem: LinearProblem, least_squares: Tensor) -> Float[Tensor, "B S n"]:
-        """Starts in the basis."""
+        """Return the starts in the basis."""
         n = problem.num_coefficients
         for name, value, least in (("start", self.start, 1), ("starts", self.starts, 2)):
             if value is None:
@@ -214,7 +214,7 @@ def _least_squares(problem: LinearProblem) -> Float[Tensor, "B n"]:
 def _remainder(
     problem: LinearProblem, least_squares: Float[Tensor, "B n"], eps: float
 ) -> tuple[Float[Tensor, "B N m"], Float[Tensor, " B"]]:
-    """Least-squares residuals and their length; 0 where a channel is fitted to rounding, or a value has weight 0."""
+    """Least-squares residuals and their length; 0 for a channel fitted to rounding and for values of weight 0."""
     residual, target = problem.residual(least_squares), problem.Y
     if problem.sample_weight is not None:
         used = problem.sample_weight > 0
@@ -252,7 +252,7 @@ def _unit(direction: Float[Tensor, "K p"]) -> Float[Tensor, "K p"]:
 
 
 class _Directions:
-    """H of the residuals ``[basis, remainder] c`` over directions c of p = n + 1 dimensions, S of them a problem."""
+    """H of the residuals ``[basis, remainder] c`` over directions c with p = n + 1 components, S a problem."""
 
     def __init__(self, problem: LinearProblem, remainder: Float[Tensor, "B N m"], descents: int) -> None:
         self.descents = descents
@@ -277,13 +277,13 @@ class _Directions:
         self.unit = 1.0 / (m * problem.total_weight().log())[:, :, None, None]
 
     def quadratic(self, c: Float[Tensor, "K p"], index: Int[Tensor, " K"]) -> Quadratic:
-        """H, its gradient and its Hessian in the directions of the descents ``index``."""
+        """H with gradient and Hessian at directions ``c`` of the descents ``index``."""
         if self.columns.shape[0] == 1:
             return self._of(c.unsqueeze(0), slice(None))
         problem = index // self.descents
         under_way, place = problem.unique(return_inverse=True)
         place = place * self.descents + index % self.descents
-        # descents that have ended get a copy of one that has not, and are left out again
+        # descents that have ended get a copy of an active descent, which is dropped again
         source = torch.zeros(under_way.shape[0] * self.descents, dtype=torch.long, device=c.device)
         source[place] = torch.arange(c.shape[0], device=c.device)
         stacks = c[source].unflatten(0, (-1, self.descents))
@@ -300,7 +300,7 @@ class _Directions:
         square = residual.square()
         counted = square if self.weight is None else square * self.weight[problem]
         size = counted.sum(-1, keepdim=True)
-        # a channel that is fitted exactly has H = 0, with no slope
+        # a channel that is fitted exactly has H = 0 and gradient 0
         unit, present = self.unit[problem], size > 0
         if not bool(present.all()):
             unit, size = unit * present, torch.where(present, size, 1.0)
@@ -311,19 +311,19 @@ class _Directions:
         sum_log = torch.linalg.vecdot(residual, counted).unsqueeze(-1) if self.weight is None else counted.sum(-1, True)
         entropy = log_size - sum_log / size
         if columns.shape[1] == 1:
-            pulled = torch.matmul(c.unsqueeze(1), self.gram[problem][..., self.place])
-        else:  # one channel of several may be fitted so well that the small residuals themselves are needed
-            pulled = torch.matmul(residual, rows)
-        pull = 2.0 / size * pulled
+            weighted_sum = torch.matmul(c.unsqueeze(1), self.gram[problem][..., self.place])
+        else:  # a channel may be fitted so well that the small residuals themselves are needed
+            weighted_sum = torch.matmul(residual, rows)
+        log_size_slope = 2.0 / size * weighted_sum
         logs = torch.matmul(counted if self.weight is None else residual * log_square, rows)
-        slope = -2.0 / size * logs - (entropy - log_size) * pull
+        slope = -2.0 / size * logs - (entropy - log_size) * log_size_slope
         gram = torch.matmul(log_square, self.outer[problem].mT)
         gram = 2.0 / size * ((log_size - entropy - 2.0) * self.gram[problem].unsqueeze(-2) - gram)
-        cross = pull.unsqueeze(-1) * (0.5 * pull - slope).unsqueeze(-2)
+        cross = log_size_slope.unsqueeze(-1) * (0.5 * log_size_slope - slope).unsqueeze(-2)
         value = (unit * entropy).sum((1, 3)).flatten()
         gradient = (unit * slope).sum(1).flatten(0, 1)
         hessian = (unit.unsqueeze(-1) * (gram[..., self.place] + cross + cross.mT)).sum(1).flatten(0, 1)
-        # hessian c is -gradient, as H does not change along c: project that out, and keep steps off c by a curvature
+        # hessian c is -gradient, as H does not change along c: project c out, and keep steps orthogonal to c
         along = c.flatten(0, 1)
         stiff = hessian.diagonal(dim1=-2, dim2=-1).abs().sum(-1, keepdim=True)
         cross = (gradient + 0.5 * stiff * along).unsqueeze(-1) * along.unsqueeze(-2)
@@ -331,8 +331,8 @@ class _Directions:
         return Quadratic(value, gradient, hessian)
 
 
-def _drawn(problem: LinearProblem, beta: Float[Tensor, "B n"]) -> Float[Tensor, "B N m"]:
-    """1 where ``log q + E`` is not positive."""
+def _reduced(problem: LinearProblem, beta: Float[Tensor, "B n"]) -> Float[Tensor, "B N m"]:
+    """1 where ``log q + E <= 0``, else 0."""
     square = problem.residual(beta).square()
     weight = torch.ones_like(square) if problem.sample_weight is None else problem.sample_weight
     size = (weight * square).sum(-2, keepdim=True)

@@ -1,4 +1,4 @@
-"""Least median of squares and any other quantile of the absolute residuals, the largest included."""
+"""Least median of squares, and least quantile regression for any other quantile up to the largest residual."""
 
 from __future__ import annotations
 
@@ -22,48 +22,49 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 EXHAUSTIVE_SETS = 30_000
-"""All sets of n + 1 values are tried where there are no more of them."""
+"""Largest number of sets of n + 1 values that are all tried."""
 
 _CANDIDATES = 30
+"""Number of best candidates that are refined."""
 
 _CHUNK = 1 << 22
-"""Values held at once."""
+"""Largest number of values held at once."""
 
 
 class LeastMedianOfSquares(LinearEstimator):
-    """Least h-th smallest absolute residual: least median of squares (22), another quantile, or the largest (23).
+    """Least h-th smallest absolute residual: the median (22), another quantile, or the largest residual (23).
 
-    The optimum of one channel is the Chebyshev fit of some n + 1 values (Stromberg 1993). All such sets are tried where
-    they are at most 30 000, else random ones; the best are then refined by Chebyshev fits of the h closest values until
-    the quantile no longer falls. ``h = N``, the Chebyshev (minimax) fit of all values, is solved to its optimum. With m
-    channels the product of the channels' quantiles is the objective: random sets of n values, refined until no
-    channel's quantile can fall without another's rising.
+    The optimum of one channel is the Chebyshev fit of some n + 1 values (Stromberg 1993). All such sets are tried if
+    there are at most 30 000, else random sets. The best are then refined by Chebyshev fits of the h closest values
+    until the quantile no longer falls. ``h = N``, the Chebyshev (minimax) fit of all values, is solved exactly. With m
+    channels the product of the channels' quantiles is the objective: random sets of n values are refined until no
+    channel's quantile can fall without another channel's rising.
 
-    It withstands up to half of the samples, and is the least precise of the robust estimators (its error falls with
-    the cube root of N): :class:`ReweightedLeastSquares` starts from it.
+    It withstands up to half of the samples as outliers, and is the least precise of the robust estimators (its error
+    falls with the cube root of N): :class:`ReweightedLeastSquares` starts from it.
 
     Args:
-        h: values of each channel that count, p < h <= N, p = ceil(n / m); default ``N // 2 + 1``.
-        starts: number of random sets, where not all are tried.
-        seed: of the random sets.
+        h: rank of the residual, p < h <= N, p = ceil(n / m); default ``N // 2 + 1``.
+        starts: number of random sets, if not all are tried.
+        seed: seed of the random sets.
 
     Attributes, after ``fit``:
         coef_: (*, n), without a gradient.
         objective_: (*, m): the h-th smallest absolute residual.
-        scale_: (*, m), m being 1 for one channel: ``objective_`` over the value it has for Gaussian residuals of
-            deviation 1, times 1 + 5 / (N - p).
-        weights_: 1 for the values that count, else 0, (*, N, m).
+        scale_: (*, m), m being 1 for one channel: ``objective_`` divided by its expected value for standard Gaussian
+            residuals, times 1 + 5 / (N - p).
+        weights_: 1 for the h smallest residuals, else 0, (*, N, m).
         exact_: whether the optimum is certain: one channel, with h = N or all sets tried.
-        n_iter_, converged_: refinements made, and whether they had come to rest, (*,).
+        n_iter_, converged_: number of refinements, and whether they converged, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Stromberg, "Computing the exact least median of squares estimate and stability diagnostics in multiple linear
         regression", SIAM Journal on Scientific Computing 14 (1993) 1289-1299.
-        Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202: the factor of the scale.
+        Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202, the factor of the scale.
 
     Example:
         >>> X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
@@ -138,9 +139,9 @@ class _Refined:
 
 
 def _expected_quantile(share: float, total: Tensor) -> Tensor:
-    """About the expected value that a share of ``total`` absolute standard Gaussian values stays below (Blom)."""
+    """Approximate expected quantile ``share`` of ``total`` absolute standard Gaussian values (Blom)."""
     level = (share * total - 0.375) / (total + 0.25)
-    # weights that add up to less than a sample
+    # for weights with a sum below 1
     level = level.clamp(min=0.5 * share)
     return torch.special.ndtri(0.5 * (1.0 + level))
 
@@ -154,7 +155,7 @@ def _number_of_sets(problem: LinearProblem, starts: int) -> int:
 
 
 def _level_starts(problem: LinearProblem, count: int, generator: torch.Generator) -> Float[Tensor, "B S n"]:
-    """Least squares, and the Chebyshev fits of sets of n + 1 values: all where they are few, else ``count`` random."""
+    """Least squares, and Chebyshev fits of sets of n + 1 values: all if they are few, else ``count`` random sets."""
     N, n = problem.num_samples, problem.num_coefficients
     least_squares = problem.weighted_fit(torch.ones_like(problem.Y)).unsqueeze(1)
     if n + 1 > N:
@@ -166,7 +167,7 @@ def _level_starts(problem: LinearProblem, count: int, generator: torch.Generator
         keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(device)
         index = keys.topk(n + 1, dim=-1).indices
         if problem.sample_weight is not None:
-            # a sample of weight 0 is none
+            # samples of weight 0 are excluded
             used = (problem.sample_weight > 0)[..., 0].unsqueeze(1)
             index = torch.where(used, keys, -1.0).topk(n + 1, dim=-1).indices
     rows, y = problem.basis[:, :, 0], problem.Y[..., 0]
@@ -183,7 +184,7 @@ def _log_product(scale: Tensor) -> Tensor:
 
 
 def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S n"]) -> Float[Tensor, "B K n"]:
-    """The candidates of the smallest objective, worked through in parts that memory holds."""
+    """The candidates with the smallest objective, evaluated in parts that fit in memory."""
     values = problem.Y[0].numel() * problem.Y.shape[0]
     parts = beta.split(max(1, _CHUNK // values), 1)
     objective = torch.cat([_log_product(rule.scale(problem, problem.residual(part))) for part in parts], 1)
@@ -192,7 +193,7 @@ def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S 
 
 
 def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B K n"], max_iter: int = 100) -> _Refined:
-    """Chebyshev fits of the values that count, each channel in units of its quantile, while the quantiles fall."""
+    """Refit by Chebyshev fits of the used values, each channel in units of its quantile, while the quantiles fall."""
     B, K = beta.shape[:2]
     rows, target = problem.basis.flatten(-3, -2), problem.Y.flatten(-2)
     residual = problem.residual(beta)
@@ -231,7 +232,7 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
 
 
 def _determined(rows: Float[Tensor, "#B R n"], used: Tensor) -> Tensor:
-    """Whether the rows in use, (B, K, R), are more than n and of full rank."""
+    """Whether more than n rows of (B, K, R) are in use and they have full rank."""
     count = used.to(rows.dtype)
     outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
     gram = torch.matmul(count, outer[0] if outer.shape[0] == 1 else outer).unflatten(-1, (rows.shape[-1],) * 2)

@@ -21,7 +21,7 @@ class LeastSquares(Inference):
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
@@ -40,13 +40,13 @@ class LeastSquares(Inference):
         Args:
             X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
             Y: targets.
-            sample_weight: weights (*, N) or (*, N, m), inverse variances up to a factor.
+            sample_weight: weights (*, N) or (*, N, m), proportional to inverse variances.
 
         Returns:
-            The estimator, with ``coef_`` (*, n), its ``covariance_`` (*, n, n) and ``weights_``, all ones.
+            The estimator, with ``coef_`` (*, n), its ``covariance_`` (*, n, n) and ``weights_``, all 1.
 
         Raises:
-            TypeError: X, Y or the weights are no real floating-point tensors, or their dtypes or devices differ.
+            TypeError: X, Y or the weights are not real floating-point tensors, or their dtypes or devices differ.
             ValueError: shapes do not fit, values are not finite or out of range, there are fewer values than
                 coefficients.
             RankDeficientError: columns of X are linearly dependent.
@@ -65,13 +65,13 @@ class LeastSquares(Inference):
 
 
 class Ridge(LinearEstimator):
-    """Least squares with the penalty ``alpha * |coef|^2`` on coefficients (all of them, an intercept column included).
+    """Least squares with the penalty ``alpha * |coef|^2`` on all coefficients, an intercept column included.
 
     Args:
         alpha: penalty >= 0, in units of ``X^2`` summed over samples (scikit-learn's convention).
 
     Raises:
-        TypeError, ValueError: ``alpha`` is no number, or out of range.
+        TypeError, ValueError: ``alpha`` is not a number, or out of range.
 
     References:
         Hoerl & Kennard, "Ridge regression: biased estimation for nonorthogonal problems", Technometrics 12 (1970).

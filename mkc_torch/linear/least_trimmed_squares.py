@@ -25,25 +25,25 @@ if TYPE_CHECKING:
 
 
 def stacked(weight: Tensor | None) -> Tensor | None:
-    """Sample weights (B, N, m) beside a stack of candidates, (B, 1, N, m)."""
+    """Sample weights (B, N, m) with a dimension for candidates, (B, 1, N, m)."""
     return None if weight is None else weight.unsqueeze(1)
 
 
 def checked_h(h: object) -> int | None:
-    """``h``, or a clear error; what it has to exceed is not known before the fit."""
+    """Return ``h`` if it is valid, else raise; its lower bound is checked in ``fit``."""
     if h is not None and (isinstance(h, bool) or not isinstance(h, numbers.Integral)):
-        raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}; it counts values.")
+        raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}; pass a number of values.")
     return None if h is None else checked_whole("h", h, 1, "it counts values; None takes the default")
 
 
 def default_coverage(problem: LinearProblem) -> int:
-    """``(N + p + 1) // 2``, the coverage of highest breakdown point, p being the coefficients of one channel."""
+    """``(N + p + 1) // 2``, the coverage with the highest breakdown point, for p coefficients per channel."""
     return min(problem.num_samples, (problem.num_samples + problem.coefficients_per_channel + 1) // 2)
 
 
 @dataclass(frozen=True)
 class TrimmedScale:
-    """Root mean square of the smallest ``fraction`` of each channel's residuals, and the indicator of those."""
+    """Root mean square of the smallest ``fraction`` of each channel's residuals, and the mask of these residuals."""
 
     fraction: float
 
@@ -51,9 +51,9 @@ class TrimmedScale:
         return max(1, round(self.fraction * problem.num_samples))
 
     def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
-        return self.weighed(problem, residual)[0]
+        return self.weighted(problem, residual)[0]
 
-    def weighed(
+    def weighted(
         self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         square = residual.square()
@@ -64,14 +64,14 @@ class TrimmedScale:
         total, w = square.new_tensor(float(h)), counts
         if weight is not None:
             total, w = h / problem.num_samples * problem.total_weight().unsqueeze(1), weight * counts
-        # ties beyond h enter once
+        # of tied values only as many as needed enter
         trimmed = (w * square).sum(-2) - (w.sum(-2) - total) * threshold
         return torch.sqrt(trimmed.clamp(min=0.0) / total), counts
 
 
 @dataclass(frozen=True)
 class QuantileScale:
-    """The absolute residual below which ``fraction`` of them lie: a cheap stand-in for ranking many starts."""
+    """Quantile ``fraction`` of the absolute residuals: a cheap scale for ranking many starts."""
 
     fraction: float
 
@@ -79,14 +79,14 @@ class QuantileScale:
         h = max(1, round(self.fraction * problem.num_samples))
         return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
 
-    def weighed(
+    def weighted(
         self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         scale = self.scale(problem, residual)
         return scale, self.weight(residual, scale)
 
     def weight(self, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
-        """1 for what lies within the quantile."""
+        """1 for residuals within the quantile, else 0."""
         return (residual.abs() <= scale.unsqueeze(-2)).to(residual.dtype)
 
 
@@ -102,7 +102,7 @@ def gaussian_consistency(fraction: float) -> float:
 def _gaussian_slope(fraction: Float[Tensor, "B m"]) -> Float[Tensor, "B m"]:
     """``1 - 2 q φ(q) / fraction`` with P(|Z| <= q) = fraction: mean square of the Gaussian values within q.
 
-    It is also the mean slope of a trimmed score, since moving the fit moves values across the edge.
+    It is also the mean slope of a trimmed score, since a change of the fit moves values across the edge.
     """
     q = torch.special.ndtri(0.5 + 0.5 * fraction.clamp(max=1.0 - 1e-12))
     density = torch.exp(-0.5 * q.square()) / math.sqrt(2.0 * math.pi)
@@ -110,16 +110,16 @@ def _gaussian_slope(fraction: Float[Tensor, "B m"]) -> Float[Tensor, "B m"]:
 
 
 _GOOD = 2.5
-"""Scales within which a good value lies, for the count of them; 98.8 % of Gaussian ones do."""
+"""Scales within which a value counts as an inlier; 98.8 % of Gaussian values are."""
 
 
 def trimmed_equation(
     problem: LinearProblem, beta: Float[Tensor, "B n"], weight: Float[Tensor, "B N m"], fraction: float
 ) -> Scores:
-    """The estimating equation of least trimmed squares, with the slope that Gaussian good values give it.
+    """Estimating equation of least trimmed squares, with the slope for Gaussian inliers.
 
-    Outliers are trimmed first, so that the values that count are a larger share of the good ones than of all. How many
-    are good follows from the scale, and that from how many are good.
+    Outliers are trimmed first, so the used values are a larger share of the inliers than of all values. The number of
+    inliers depends on the scale and the scale on that number, so both are iterated.
     """
     residual = problem.residual(beta)
     w = weight if problem.sample_weight is None else weight * problem.sample_weight
@@ -140,48 +140,48 @@ def trimmed_equation(
 
 
 _SMALL_SAMPLE = 26.0
-"""Standard errors grow by the square of this times the share trimmed times the coefficients a value.
+"""Standard errors grow by the square of this times the trimmed share times n / N.
 
-From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each and half of them trimmed, whose errors are
-2.8, 1.4, 1.0 and 0.9 times what large samples let expect, for the fit was chosen to make its residuals small.
+From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each and half of them trimmed. Their errors are
+2.8, 1.4, 1.0 and 0.9 times the large-sample values, since the fit was chosen to make its residuals small.
 """
 
 
 class LeastTrimmedSquares(RobustInference):
     """Least sum of the h smallest squared residuals, (24) of Indiveri (2009).
 
-    One channel of few samples is solved to its optimum: where h of N can be chosen in at most 20 000 ways (N = 16),
-    every choice is tried. Otherwise concentration steps run from many elemental starts; up to 400 samples of one
-    channel without weights, the best fit is then improved by exchanging a value that counts for one that does not, as
-    long as that lowers the sum. With m channels every channel keeps its h smallest residuals and the product of the
-    channels' trimmed scales is minimised, so that no channel's unit matters.
+    One channel of few samples is solved exactly: where there are at most 20 000 choices of h of N samples (N = 16), all
+    are tried. Otherwise concentration steps run from many elemental starts. Up to 400 samples of one channel without
+    weights, the best fit is then improved by exchanging a used value for an unused one as long as that lowers the sum.
+    With m channels every channel keeps its h smallest residuals and the product of the channels' trimmed scales is
+    minimised, so that no channel's unit matters.
 
-    Starts go through n values each, and one through clean values is enough: at a share ε of outliers ``starts`` of them
-    miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the default and
-    n = 6. Take more for more coefficients.
+    Each start is a fit through n values, and one start through clean values is enough. At a share ε of outliers all
+    ``starts`` miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the
+    default and n = 6. Take more starts for more coefficients.
 
     Args:
-        h: values of each channel that count, p < h <= N; default ``(N + p + 1) // 2`` with p = ceil(n / m), the
-            coverage of highest breakdown point.
+        h: number of values of each channel in the sum, p < h <= N; default ``(N + p + 1) // 2`` with p = ceil(n / m),
+            the coverage with the highest breakdown point.
         starts: number of elemental starts, each through n values.
-        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
-            at every X and no outlier lies far out in X. Good errors are taken for Gaussian at the edge of what
-            counts.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors have the
+            same distribution at every X and no outlier lies far out in X. Inliers are assumed Gaussian at the edge of
+            the used values.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the elemental starts.
+        seed: seed of the elemental starts.
 
     Attributes, after ``fit``:
-        coef_: (*, n); its gradient is that of least squares on the values that count.
+        coef_: (*, n); its gradient is that of least squares on the used values.
         covariance_, dof_: (*, n, n), (*,); the asymptotic covariance (Butler, "Nonparametric interval and point
             prediction using data trimmed by a Grubbs-type outlier rule", 1982), widened in small samples.
         scale_: (*, m), m being 1 for one channel: trimmed root mean square, made consistent for Gaussian residuals.
         objective_: (*, m): sum of the h smallest squared residuals.
-        weights_: 1 for the values that count, else 0, (*, N, m).
-        exact_: whether the optimum is certain: every choice was tried, or h = N in one channel.
-        n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+        weights_: 1 for the used values, else 0, (*, N, m).
+        exact_: whether the optimum is certain: all choices were tried, or h = N in one channel.
+        n_iter_, converged_: number of steps, and whether they converged, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
@@ -234,10 +234,10 @@ class LeastTrimmedSquares(RobustInference):
         with torch.no_grad():
             beta, n_iter, converged = self._minimise(problem, rule, h)
             residual = problem.residual(beta).unsqueeze(1)
-            trimmed, weight = rule.weighed(problem, residual)
+            trimmed, weight = rule.weighted(problem, residual)
             weight = weight.squeeze(1)
         if problem.basis.requires_grad or problem.Y.requires_grad:
-            # which values count is a constant
+            # the choice of the used values is a constant
             beta = problem.weighted_fit(weight * relative_precision(trimmed.squeeze(1)).unsqueeze(-2))
             trimmed = rule.scale(problem, problem.residual(beta).unsqueeze(1))
         self._set_common(problem, beta, weight)
@@ -264,7 +264,7 @@ class LeastTrimmedSquares(RobustInference):
             beta = _best_choice(problem, rule, h)
             return beta, 0, torch.ones(beta.shape[0], dtype=torch.bool, device=beta.device)
         N = problem.num_samples
-        # a small sample has more local minima than a rank after two steps tells apart
+        # a small sample has more local minima than a ranking after two steps distinguishes
         candidates = 200 if N <= _EXCHANGE_SAMPLES else 10
         search = ScaleSearch(rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
         found = minimise_scale(problem, search)
@@ -275,12 +275,13 @@ class LeastTrimmedSquares(RobustInference):
 
 
 EXHAUSTIVE_CHOICES = 20_000
-"""All choices of h samples are tried where there are no more of them."""
+"""Largest number of choices of h samples that are all tried."""
 
 _EXCHANGE_SAMPLES = 400
+"""Largest number of samples for which values are exchanged."""
 
 _CHUNK = 1 << 22
-"""Values held at once."""
+"""Largest number of values held at once."""
 
 
 def _plain(problem: LinearProblem) -> bool:
@@ -292,7 +293,7 @@ def _few_choices(problem: LinearProblem, h: int) -> bool:
 
 
 def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Tensor, "B n"]:
-    """Least squares on every choice of h samples of one channel: the one with the smallest sum of squares."""
+    """Least squares on every choice of h samples of one channel; the fit with the smallest sum of squares."""
     N, n = problem.num_samples, problem.num_coefficients
     choice = torch.tensor(list(itertools.combinations(range(N), h)), device=problem.Y.device)
     mask = torch.zeros(choice.shape[0], N, dtype=problem.Y.dtype, device=problem.Y.device).scatter_(1, choice, 1.0)
@@ -307,7 +308,7 @@ def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Te
 
 
 def _exchange(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -> Float[Tensor, "B n"]:
-    """Exchange a sample that counts for one that does not while the sum of squares after the refit falls."""
+    """Exchange a used sample for an unused one while the sum of squares after the refit falls."""
     N = problem.num_samples
     parts = torch.arange(beta.shape[0], device=beta.device).split(max(1, _CHUNK // (N * N)))
     return torch.cat([_exchange_part(problem.select(part), beta[part], h) for part in parts])
@@ -334,7 +335,7 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         out, into = (1.0 - own).clamp(min=0.0).unsqueeze(-1), (1.0 + own).unsqueeze(-2)
         change = error.square().unsqueeze(-2) * out - error.square().unsqueeze(-1) * into
         change = change + 2.0 * error.unsqueeze(-1) * error.unsqueeze(-2) * leverage
-        # a sample of leverage 1 cannot be spared
+        # a sample of leverage 1 cannot be removed
         change = change / (out * into + leverage.square()).clamp(min=eps)
         allowed = keep[active].unsqueeze(-1) & ~keep[active].unsqueeze(-2)
         gain, pair = torch.where(allowed, change, torch.inf).flatten(-2).min(-1)

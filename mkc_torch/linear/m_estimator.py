@@ -29,16 +29,17 @@ MScaleName = Literal["mad", "proposal2"]
 MStart = Literal["lad", "lts", "s", "least_squares"]
 
 MEDIAN_TO_SIGMA = 1.482602218505602
-"""1 / Φ⁻¹(3/4): the standard deviation of a Gaussian over the median of its absolute values."""
+"""1 / Φ⁻¹(3/4): ratio of standard deviation to median absolute value of a Gaussian."""
 
 _DAMPED_FROM = 30
+"""Step from which a new scale is averaged geometrically with the last."""
 
 
 def median_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
-    """Median absolute residual over that of a standard Gaussian; the mean of the two middle ones where N is even."""
+    """Median absolute residual, divided by that of a standard Gaussian; the mean of the middle two for even N."""
     size, half = residual.abs(), 0.5 * problem.num_samples
     low = order_statistic(size, problem.sample_weight, half)
-    # just past the middle, so that an even number has its upper one
+    # just above one half, so that the upper of the middle two is taken for even N
     high = order_statistic(size, problem.sample_weight, min(half * (1.0 + 1e-6), problem.num_samples))
     return MEDIAN_TO_SIGMA * 0.5 * (low + high)
 
@@ -46,7 +47,7 @@ def median_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Fl
 def proposal_2(
     problem: LinearProblem, residual: Float[Tensor, "B N m"], scale: Float[Tensor, "B m"], k: float
 ) -> Float[Tensor, "B m"]:
-    """One step towards the scale s with ``Σ min(r / s, k)² = (N - p) E min(Z, k)²``, Huber's proposal 2."""
+    """Make one step towards the scale s with ``Σ min(r / s, k)² = (N - p) E min(Z, k)²``, Huber's proposal 2."""
     square = torch.minimum(residual.square(), (k * scale).square().unsqueeze(-2))
     if problem.sample_weight is not None:
         square = square * problem.sample_weight
@@ -59,7 +60,7 @@ def proposal_2(
 
 @dataclass(frozen=True)
 class Reweighted:
-    """Coefficients in the basis at the last step, the scale and weights that belong to them, and the steps (B,)."""
+    """Coefficients in the basis after the last step, their scale and weights, and the number of steps (B,)."""
 
     beta: Float[Tensor, "B n"]
     scale: Float[Tensor, "B m"]
@@ -78,16 +79,16 @@ def reweight(
     max_iter: int,
     tol: float,
 ) -> Reweighted:
-    """Least squares with the weights of the last residuals, until the fitted values come to rest.
+    """Iterate weighted least squares with the weights of the last residuals until the fitted values converge.
 
     Args:
         problem: the regression.
-        beta: start.
-        scale: of the start's residuals; a scale of 0 is replaced by the rounding error of Y.
-        weight_of: weights of standardised residuals.
-        next_scale: scale from residuals and the last scale; None leaves the scale as it is.
-        max_iter: steps at most.
-        tol: a step is at rest when it moves no fitted value by more than this share of the scale, in root mean square.
+        beta: starting coefficients.
+        scale: scale of their residuals; a scale of 0 is replaced by the rounding error of Y.
+        weight_of: returns the weights of standardised residuals.
+        next_scale: returns the scale from residuals and the last scale; None keeps the scale fixed.
+        max_iter: largest number of steps.
+        tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
     """
     floor = rounding_scale(problem)
     scale = torch.maximum(scale, floor)
@@ -99,14 +100,14 @@ def reweight(
     for step in range(max_iter):
         if next_scale is not None:
             proposal = torch.maximum(next_scale(residual, scale), floor)
-            # a median may alternate between two values; their geometric mean leads between them
+            # a median may alternate between two values; their geometric mean ends the cycle
             proposal = proposal if step < _DAMPED_FROM else (proposal * scale).sqrt()
             scale = torch.where(moving.unsqueeze(-1), proposal, scale)
         weight = weight_of(residual / scale.unsqueeze(-2))
         updated = problem.weighted_fit(weight * relative_precision(scale).unsqueeze(-2))
         updated = torch.where(moving.unsqueeze(-1), updated, beta)
         change = torch.linalg.vector_norm(updated - beta, dim=-1)
-        # the basis is orthonormal, so that coefficients are as long as their fitted values
+        # the basis is orthonormal, so coefficients and fitted values have equal length
         rounding = 16 * eps * torch.linalg.vector_norm(updated, dim=-1)
         n_iter += moving
         beta = updated
@@ -125,11 +126,11 @@ def check_iterations(max_iter: int, tol: float) -> None:
 class MEstimator(RobustInference):
     """M-estimator of regression: the coefficients with ``Σ ψ(r / scale) x = 0``, (18) of Indiveri (2009).
 
-    Iteratively reweighted least squares, the scale taken anew from the residuals before every step. With m channels
-    each has its own scale. ψ of "huber" is monotone: outliers in Y have a bounded influence, those in X (leverage
-    points) do not. The other four redescend to 0 and have several solutions, of which the one near the start is found;
-    since the scale moves with the fit, leverage points can still draw it away from a robust start.
-    :class:`MMRegression` holds its scale, and its breakdown point with it.
+    Iteratively reweighted least squares; the scale is recomputed from the residuals before every step. With m channels
+    each has its own scale. ψ of "huber" is monotone: outliers in Y have a bounded influence, outliers in X (leverage
+    points) do not. The other four redescend to 0 and have several solutions; the solution near the start is found.
+    Since the scale changes with the fit, leverage points can still move it away from a robust start.
+    :class:`MMRegression` keeps its scale fixed, and thereby its breakdown point.
 
     Args:
         psi: "huber", "hampel", "tukey", "andrews" or "welsch", (13)-(16) of Indiveri (2009).
@@ -138,27 +139,27 @@ class MEstimator(RobustInference):
         scale: "mad", 1.4826 times the median absolute residual (about 0), which needs N >= 2 p, p = ceil(n / m); or
             "proposal2", Huber's, which is smoother and breaks down earlier.
         start: "lad", "lts", "s", "least_squares" or coefficients (*, n); default "lad" for "huber", else "lts".
-        max_iter: steps at most.
+        max_iter: largest number of steps.
         tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
-        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
-            at every X and no outlier lies far out in X. A "mad" is taken for known, which it may be where errors are
-            symmetric; "proposal2" enters with its own error.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors have the
+            same distribution at every X and no outlier lies far out in X. A "mad" scale is treated as known, which is
+            valid for symmetric errors; the error of a "proposal2" scale is included.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the starts "lts" and "s".
+        seed: seed of the starts "lts" and "s".
 
     Attributes, after ``fit``:
-        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); they and ``scale_`` have derivatives by X and Y.
-        scale_: (*, m), m being 1 for one channel; of an exact fit the rounding error of Y.
+        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); differentiable by X and Y, as is ``scale_``.
+        scale_: (*, m), m being 1 for one channel; for an exact fit the rounding error of Y.
         weights_: ψ(z) / z, 1 at z = 0, (*, N, m).
-        n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+        n_iter_, converged_: number of steps, and whether they converged, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (11)-(21).
         Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), proposal 2.
-        Holland & Welsch, "Robust regression using iteratively reweighted least-squares" (1977), the constants.
+        Holland & Welsch, "Robust regression using iteratively reweighted least-squares" (1977), tuning constants.
 
     Example:
         >>> X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
@@ -227,7 +228,7 @@ class MEstimator(RobustInference):
         def next_scale(residual: Tensor, scale: Tensor) -> Tensor:
             if self.scale == "proposal2":
                 return proposal_2(problem, residual, scale, clip)
-            # an exact fit of most values stays one, which rounding errors taken for a scale would undo
+            # an exact fit of most values is kept; a scale of rounding errors would lose it
             return torch.where(exact, 0.0, median_scale(problem, residual))
 
         found = reweight(
@@ -261,7 +262,7 @@ class MEstimator(RobustInference):
 
 
 def _fewest_samples(problem: LinearProblem) -> int:
-    """Samples of positive weight in the channel that has fewest."""
+    """Smallest number of samples of positive weight in a channel."""
     if problem.sample_weight is None:
         return problem.num_samples
     return int((problem.sample_weight > 0).sum(-2).min())

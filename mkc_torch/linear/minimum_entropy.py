@@ -1,4 +1,4 @@
-"""Minimum-entropy regression: the coefficients whose residuals have the least entropy by a kernel estimate."""
+"""Minimum-entropy regression: coefficients whose residuals have the least entropy by a kernel estimate."""
 
 from __future__ import annotations
 
@@ -24,47 +24,47 @@ Entropy = Literal["shannon", "renyi"]
 Location = Literal["median", "symmetric"]
 
 _WIDTHS = (4.0, 2.0, 1.0)
-"""Bandwidths in turn, in units of the last: wide ones have few local minima."""
+"""Successive bandwidths in units of the last: wide kernels have few local minima."""
 
 _ROOT = (2.0 * math.pi) ** 0.5
 
 _PAIRS = 1 << 18
-"""Pairs of residuals held at once."""
+"""Largest number of pairs of residuals held at once."""
 
 
 class MinimumEntropy(LinearEstimator):
-    """The coefficients of least entropy of a Gaussian kernel estimate of the density of their residuals.
+    """Coefficients with the least entropy of the residuals, by a Gaussian kernel estimate of their density.
 
     The Shannon entropy is estimated as the mean of ``-log p̂(r_i)``; Rényi's of order 2 is ``-log ∫ p̂²``, in closed
-    form. The entropies of channels are summed. The bandwidth stays fixed while the coefficients move, and the descent
-    is local, from a robust start through wider bandwidths.
+    form. The entropies of channels are added. The bandwidth stays fixed while the coefficients change. The descent is
+    local, from a robust start through wider bandwidths.
 
-    Entropy does not change if the density is shifted. With ``location="median"`` whatever combination of columns is
-    constant within each channel is therefore set so that the residuals have median 0; without such a combination the
-    location of the residuals stays free and other coefficients are fitted as if there were one. With
-    ``location="symmetric"`` the density of the residuals and their negatives is taken instead, whose location is 0: for
+    Entropy does not change if the density is shifted. With ``location="median"`` a combination of columns that is
+    constant within each channel is therefore set so that the residuals have median 0. Without such a combination the
+    location of the residuals stays free, and the other coefficients are fitted as if there were an intercept.
+    ``location="symmetric"`` takes the density of the residuals and their negatives, whose location is 0: for
     symmetric noise, with or without an intercept.
 
-    Each step takes all pairs of residuals: meant for thousands of samples.
+    Each step uses all pairs of residuals: suited to thousands of samples.
 
     Args:
         entropy: "shannon", or "renyi" of order 2.
-        bandwidth: of the kernel, in the unit of Y, a number or (m,); default 1.06 N^(-1/5) times the robust scale of
+        bandwidth: bandwidth of the kernel, in the unit of Y, a number or (m,); default 1.06 N^(-1/5) times the scale of
             the start's residuals (Silverman's rule).
         location: "median" or "symmetric".
         start: "lts", "s", "least_squares", or coefficients (n,).
-        max_iter: steps tried at each bandwidth at most.
-        seed: of the robust start.
+        max_iter: largest number of steps tried at each bandwidth.
+        seed: seed of the robust start.
 
     Attributes, after ``fit``:
         coef_: (*, n).
-        entropy_: in nats, in the unit of Y, summed over channels, (*,); -inf where most values are fitted exactly.
+        entropy_: in nats, for Y in its unit, summed over channels, (*,); -inf where most values are fitted exactly.
         bandwidth_: (*, m).
-        weights_: density of each residual over the greatest, (*, N, m).
-        n_iter_, converged_: steps tried, and whether a local minimum was reached, (*,).
+        weights_: density of each residual divided by the largest, (*, N, m).
+        n_iter_, converged_: number of steps tried, and whether a local minimum was reached, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         E. Wolsztynski, E. Thierry, L. Pronzato, "Minimum-entropy estimation in semi-parametric models", Signal
@@ -114,7 +114,7 @@ class MinimumEntropy(LinearEstimator):
         Args:
             X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
             Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); 0 leaves it out.
+            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
 
         Returns:
             The estimator.
@@ -161,7 +161,7 @@ class MinimumEntropy(LinearEstimator):
         return self
 
     def _identified(self, problem: LinearProblem) -> Float[Tensor, "#B n n"]:
-        """Projector of coefficients in the basis onto what the entropy depends on."""
+        """Projector of coefficients in the basis onto the directions that change the entropy."""
         n = problem.num_coefficients
         rows = problem.basis
         if self.location == "symmetric":
@@ -174,12 +174,12 @@ class MinimumEntropy(LinearEstimator):
             rows = rows - rows.mean(-3, keepdim=True)
         gram = torch.matmul(rows.flatten(-3, -2).mT, rows.flatten(-3, -2))
         values, vectors = torch.linalg.eigh(gram)
-        # the basis is orthonormal, so that 1 is the size of a direction without a constant in it
+        # the basis is orthonormal, so a direction without a constant part has eigenvalue 1
         seen = (values > 1e3 * torch.finfo(torch.float32).eps ** 2).to(rows)
         return torch.matmul(vectors * seen.unsqueeze(-2), vectors.mT)
 
     def _shift(self, problem: LinearProblem, beta: Tensor, free: Tensor) -> Float[Tensor, "B n"]:
-        """The combination of constant columns that gives the residuals median 0, nearly so where channels share it."""
+        """Change of the constant combination that gives the residuals median 0, or nearly so if channels share it."""
         residual, weight = problem.residual(beta), problem.sample_weight
         half = 0.5 * problem.num_samples
         median = 0.5 * (order_statistic(residual, weight, half) - order_statistic(-residual, weight, half))
@@ -196,18 +196,18 @@ class MinimumEntropy(LinearEstimator):
 
 
 class _Kernel:
-    """Entropy over coefficients in the basis, for bandwidths (B, m)."""
+    """Entropy as a function of coefficients in the basis, for bandwidths (B, m)."""
 
     def __init__(self, problem: LinearProblem, h: Tensor, free: Tensor, entropy: Entropy, symmetric: bool) -> None:
         self.problem = problem
-        # the integral of p̂² is the mean of the density at a bandwidth that is √2 times as wide
+        # the integral of p̂² is the mean of the density at √2 times the bandwidth
         self.h = h * 2.0**0.5 if entropy == "renyi" else h
         self.free = free
         self.shannon = entropy == "shannon"
         self.signs = (1.0, -1.0) if symmetric else (1.0,)
 
     def at(self, beta: Float[Tensor, "B n"]) -> tuple[Float[Tensor, " B"], Float[Tensor, "B N m"]]:
-        """Entropy, and the density of each residual."""
+        """Return the entropy, and the density of each residual."""
         index = torch.arange(beta.shape[0], device=beta.device)
         value, density = beta.new_zeros(beta.shape[0]), []
         for channel in range(self.problem.num_channels):
@@ -237,7 +237,7 @@ class _Kernel:
         return -(w * density).sum(-1).log()
 
     def quadratic(self, beta: Float[Tensor, "K n"], index: Int[Tensor, " K"]) -> Quadratic:
-        """Entropy, gradient and Hessian; what the entropy does not depend on is kept still."""
+        """Entropy, gradient and Hessian; directions that do not change the entropy get a zero gradient."""
         N = self.problem.num_samples
         step = max(1, _PAIRS // (N * N))
         parts = [
@@ -258,22 +258,22 @@ class _Kernel:
         value, gradient, hessian = beta.new_zeros(k), beta.new_zeros(k, n), beta.new_zeros(k, n, n)
         for channel in range(problem.num_channels):
             r, w, x = self._channel(problem, beta, channel)
-            density, slope, bend = [], beta.new_zeros(k, n), beta.new_zeros(k, n, n)
+            density, slope, second_derivative = [], beta.new_zeros(k, n), beta.new_zeros(k, n, n)
             for rows in _chunks(r):
                 p, first, second = self._rows(r, w, x, rows, h[:, channel])
                 density.append(p)
-                slope, bend = slope + first, bend + second
+                slope, second_derivative = slope + first, second_derivative + second
             p = torch.cat(density, dim=-1)
             if not self.shannon:
                 mean = (w * p).sum(-1)
-                slope, bend = slope / mean[:, None], bend / mean[:, None, None]
-                bend = bend - slope.unsqueeze(-1) * slope.unsqueeze(-2)
+                slope, second_derivative = slope / mean[:, None], second_derivative / mean[:, None, None]
+                second_derivative = second_derivative - slope.unsqueeze(-1) * slope.unsqueeze(-2)
             value = value + self._entropy(p, w)
-            gradient, hessian = gradient - slope, hessian - bend
+            gradient, hessian = gradient - slope, hessian - second_derivative
         return Quadratic(value, gradient, hessian)
 
     def _rows(self, r: Tensor, w: Tensor, x: Tensor, rows: slice, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Density at some residuals; the sums of their (log) densities' gradients and Hessians, by weight."""
+        """Density at some residuals; weighted sums of the gradients and Hessians of their (log) densities."""
         here, own, h = x[:, rows], w[:, rows], h.unsqueeze(-1)
         mass = (w / (len(self.signs) * _ROOT * h)).unsqueeze(1)
         scaled = r / h
@@ -286,22 +286,22 @@ class _Kernel:
             kernels.append((sign, u, square, g))
             p = p + g.sum(-1)
         share = own / p if self.shannon else own
-        slopes, bend = torch.zeros_like(here), torch.zeros_like(torch.matmul(here.mT, here))
-        # rows that carry the factors of the second derivatives, so that no pass over all pairs does
+        slopes, second_derivative = torch.zeros_like(here), torch.zeros_like(torch.matmul(here.mT, here))
+        # the factors of the second derivatives are applied to the rows, not to all pairs
         heavy = (share / h.square()).unsqueeze(-1) * here
         for sign, u, square, g in kernels:
             first = u.mul_(g)
             slopes = slopes + (first.sum(-1, keepdim=True) * here - sign * torch.matmul(first, x)) / h.unsqueeze(-1)
             second = square.sub_(1.0).mul_(g)
             mixed = torch.matmul(heavy.mT, torch.matmul(second, x))
-            bend = bend + torch.matmul(heavy.mT * second.sum(-1).unsqueeze(-2), here)
+            second_derivative = second_derivative + torch.matmul(heavy.mT * second.sum(-1).unsqueeze(-2), here)
             received = torch.matmul((share / h.square()).unsqueeze(-2), second)
-            bend = bend + torch.matmul(x.mT * received, x) - sign * (mixed + mixed.mT)
+            second_derivative = second_derivative + torch.matmul(x.mT * received, x) - sign * (mixed + mixed.mT)
         slope = (share.unsqueeze(-1) * slopes).sum(-2)
         if self.shannon:
             relative = slopes / p.unsqueeze(-1)
-            bend = bend - torch.matmul(relative.mT * own.unsqueeze(-2), relative)
-        return p, slope, bend
+            second_derivative = second_derivative - torch.matmul(relative.mT * own.unsqueeze(-2), relative)
+        return p, slope, second_derivative
 
 
 def _gauss(u: Tensor) -> Tensor:

@@ -21,31 +21,31 @@ if TYPE_CHECKING:
 
 
 class MMRegression(RobustInference):
-    """MM-estimator of regression with Tukey's bisquare: an M-estimate near an S-estimate, at the scale of that.
+    """MM-estimator of regression with Tukey's bisquare: an M-estimate near an S-estimate, at the scale of the latter.
 
-    From the coefficients of :class:`SRegression` iteratively reweighted least squares descends to the next minimum of
-    ``Σ ρ(r / (c scale))``, with the wider c that the efficiency asks for and the scale left as it is. The breakdown
-    point is that of the scale.
+    Iteratively reweighted least squares starts from the coefficients of :class:`SRegression` and descends to a local
+    minimum of ``Σ ρ(r / (c scale))``. The scale stays fixed, and c is the wider constant that gives the efficiency.
+    The breakdown point is that of the S-estimate.
 
     Args:
-        efficiency: at Gaussian residuals, 0.3 to 0.99; c is 4.685 for 0.95.
-        breakdown: of the S-estimate, 0.01 to 0.5.
-        starts: number of elemental starts of the S-estimate at most; see :class:`SRegression` for how many it takes.
-        max_iter: steps at most after the S-estimate.
+        efficiency: efficiency at Gaussian residuals, 0.3 to 0.99; c is 4.685 for 0.95.
+        breakdown: breakdown point of the S-estimate, 0.01 to 0.5.
+        starts: largest number of elemental starts of the S-estimate; :class:`SRegression` states how many are used.
+        max_iter: largest number of steps after the S-estimate.
         tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
-        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
-            at every X and no outlier lies far out in X.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors have the
+            same distribution at every X and no outlier lies far out in X.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the elemental starts.
+        seed: seed of the elemental starts.
 
     Attributes, after ``fit``:
-        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); they and ``scale_`` have derivatives by X and Y.
-        scale_: (*, m), m being 1 for one channel: that of the S-estimate; of an exact fit the rounding error of Y.
+        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); differentiable by X and Y, as is ``scale_``.
+        scale_: scale of the S-estimate, (*, m), m being 1 for one channel; for an exact fit the rounding error of Y.
         weights_: bisquare weights in [0, 1], (*, N, m).
-        n_iter_, converged_: steps made after the S-estimate, and whether they had come to rest, (*,).
+        n_iter_, converged_: number of steps after the S-estimate, and whether they converged, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Yohai, "High breakdown-point and high efficiency robust estimates for regression", Annals of Statistics 15

@@ -33,36 +33,36 @@ _STARTS: dict[str, Callable[..., LinearEstimator]] = {
 
 
 class ReweightedLeastSquares(RobustInference):
-    """Least squares with the weights 0 and 1 that two looks at the residuals of a robust fit give, (26)-(29).
+    """Least squares with weights 0 and 1 from the residuals of a robust fit, rejected in two rounds, (26)-(29).
 
-    Values beyond ``threshold`` times a first scale are left out of the second, and those beyond ``threshold`` times
-    the second are left out of the fit. It rejects what its robust start rejects and is as precise as least squares on
-    the rest. With m channels each has its own scale and is weighted by it.
+    Values beyond ``threshold`` times a first scale are excluded from the second scale, and values beyond ``threshold``
+    times the second scale are excluded from the fit. The breakdown point is that of the start, and the precision is
+    that of least squares on the values kept. With m channels each has its own scale and is weighted by it.
 
     The first scale is that of the h-th smallest residual, h = (N + p + 1) // 2, with small-sample factors (p. 202 of
-    Rousseeuw & Leroy); the plain median absolute deviation, which the paper gives as an example, is so small after a
-    fit that has minimised it that good values are lost at N = 21.
+    Rousseeuw & Leroy). The paper's example is the median absolute deviation. After a fit that has minimised it, it is
+    so small that inliers are rejected at N = 21.
 
     Args:
         start: robust fit of the first residuals: "lts", "lms", "s", or an estimator of this package.
-        threshold: residuals above so many scales are rejected, at least 1.
-        starts: number of random starts of "lts", "lms" and "s"; default theirs.
-        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
-            at every X and no outlier lies far out in X.
+        threshold: number of scales beyond which a residual is rejected, at least 1.
+        starts: number of random starts of "lts", "lms" and "s"; None takes their defaults.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors have the
+            same distribution at every X and no outlier lies far out in X.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of those.
+        seed: seed of the random starts.
 
     Attributes, after ``fit``:
-        coef_: (*, n); its gradient is that of least squares on the values that count.
-        scale_: (*, m), m being 1 for one channel: (27) of the values that count, degrees of freedom taken off.
-        covariance_, dof_: (*, n, n), (*,); what "lts" or "s" passes on of its own error is in it (He & Portnoy,
-            "Reweighted LS estimators converge at the same rate as the initial estimator", Annals of Statistics 20
-            (1992), for Gaussian good errors); of other starts, which have none that is known, it is not.
-        weights_: 1 for the values that count, 0 for those rejected, (*, N, m).
+        coef_: (*, n); its gradient is that of least squares on the values kept.
+        scale_: (*, m), m being 1 for one channel: (27) of the values kept, corrected for degrees of freedom.
+        covariance_, dof_: (*, n, n), (*,); includes the error that "lts" or "s" passes on (He & Portnoy, "Reweighted
+            LS estimators converge at the same rate as the initial estimator", Annals of Statistics 20 (1992), for
+            Gaussian inliers); the error of other starts is unknown and not included.
+        weights_: 1 for the values kept, 0 for the values rejected, (*, N, m).
         start_: the robust fit.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), pp. 44-45 and 202 (the first scale).
@@ -92,11 +92,12 @@ class ReweightedLeastSquares(RobustInference):
     ) -> None:
         super().__init__()
         if not (isinstance(start, LinearEstimator) or (isinstance(start, str) and start in _STARTS)):
-            mend = f"; make one, {start.__name__}()" if isinstance(start, type) else ""
+            remedy = f"; pass an instance, {start.__name__}()" if isinstance(start, type) else ""
             raise ValueError(
-                f"Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got {format_value(start)}{mend}."
+                "Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got "
+                f"{format_value(start)}{remedy}."
             )
-        checked_number("threshold", threshold, 1.0, math.inf, "[)", "it counts scales, and 2.5 is usual")
+        checked_number("threshold", threshold, 1.0, math.inf, "[)", "it is a number of scales; 2.5 is usual")
         if starts is not None:
             check_starts(starts)
         self.start = start
@@ -139,7 +140,7 @@ class ReweightedLeastSquares(RobustInference):
         self._infer(problem, beta, weight, equation, ratio, of_start=of_start, widening=wider)
 
     def _start_influence(self, problem: LinearProblem, share: Tensor | None) -> Tensor | None:
-        """What each sample moves the start's coefficients by, in the basis, where that is known."""
+        """Influence of each sample on the start's coefficients, in the basis; None if unknown."""
         start = self.start_
         beta = problem.in_basis(start.coef_)
         if isinstance(start, LeastTrimmedSquares):
@@ -163,21 +164,21 @@ class ReweightedLeastSquares(RobustInference):
 
 
 _SMALL_SAMPLE = 4.0
-"""Standard errors grow by this times the coefficients a value, for which values count was chosen by the same values.
+"""Standard errors grow by this times n / N, since the same values decide which of them are kept.
 
-From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each, whose errors are 1.4, 1.2, 1.1 and 1.0 times
-what large samples let expect.
+From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each. Their errors are 1.4, 1.2, 1.1 and 1.0 times
+the large-sample values.
 """
 
 
 def _gaussian_edge(threshold: float) -> tuple[float, float]:
-    """The share of a Gaussian within ±threshold, and 2 c φ(c): what its mean within moves by, a unit of the edges'."""
+    """Share of a Gaussian within ±c, and 2 c φ(c), the derivative of the mean within the edges by their shift."""
     density = math.exp(-0.5 * threshold * threshold) / math.sqrt(2.0 * math.pi)
     return math.erf(threshold / math.sqrt(2.0)), 2.0 * threshold * density
 
 
 def _kept_scale(problem: LinearProblem, residual: Tensor, weight: Tensor) -> Float[Tensor, "B m"]:
-    """(27): the root mean square of the kept residuals with the degrees of freedom of the fit taken off."""
+    """Root mean square of the kept residuals, corrected for the degrees of freedom of the fit, (27)."""
     if problem.sample_weight is not None:
         weight = weight * problem.sample_weight
     left = (weight.sum(-2) - problem.coefficients_per_channel).clamp(min=1.0)

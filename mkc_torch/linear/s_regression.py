@@ -1,4 +1,4 @@
-"""S-regression: the coefficients whose residuals have the smallest M-scale."""
+"""S-regression: coefficients whose residuals have the smallest M-scale."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mkc_torch.linear._influence import (
     coefficients_a_value,
     m_scale_influence,
     scores,
-    weighed,
+    weighted,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MScale:
-    """The scale s with mean ρ(r / (c s)) = b (1 - p/N), by at most ``steps`` Newton iterations, and its weights.
+    """Scale s with mean ρ(r / (c s)) = b (1 - p/N), by at most ``steps`` Newton iterations, and its weights.
 
     b is the breakdown point and c the constant that makes s consistent for Gaussian residuals.
     """
@@ -44,23 +44,23 @@ class MScale:
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self._solved(problem, residual, residual.square() if self.steps else residual, near)
 
-    def weighed(
+    def weighted(
         self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         square = residual.square()
         scale = self._solved(problem, residual, square, near)
-        return scale, self._rest(square, scale).square()
+        return scale, self._inner(square, scale).square()
 
     def _first(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
-        """A scale to begin at, from the quantile that is 0 just where s is: a fit through p values has none of 0."""
+        """First guess of the scale: a quantile that is 0 exactly where s is 0; it is not for a fit through p values."""
         w = None if problem.sample_weight is None else problem.sample_weight.unsqueeze(1)
         N, p = problem.num_samples, problem.coefficients_per_channel
         rank = min(N, math.ceil(N - self.breakdown * max(N - p, 0) - 1e-9))
         return 1.4826 * order_statistic(residual.abs(), w, rank)
 
-    def _rest(self, square: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
-        """``1 - (r / (c s))²``, 0 from where that is 1: its square is the weight, its cube 1 - ρ."""
-        # the square of the least size still has an inverse
+    def _inner(self, square: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
+        """``max(1 - (r / (c s))², 0)``: its square is the weight, its cube 1 - ρ."""
+        # the square of the smallest size still has an inverse
         size = self.c * scale.clamp(min=torch.finfo(scale.dtype).tiny ** 0.5)
         return torch.mul(square, -size.pow(-2).unsqueeze(-2)).add_(1.0).clamp_(min=0.0)
 
@@ -73,47 +73,53 @@ class MScale:
         tiny = torch.finfo(residual.dtype).tiny
         scale = self._first(problem, residual) if near is None else near
         for _ in range(self.steps):
-            rest = self._rest(square, scale)
-            second = rest.square()
-            third = rest * second
+            inner = self._inner(square, scale)
+            second = inner.square()
+            third = inner * second
             if w is not None:
                 second, third = w * second, w * third
             outside = third.sum(-2)
             slope = 6.0 * (second.sum(-2) - outside)
-            # Newton's method in log(scale), kept within a factor of two
+            # Newton's method in log(scale), limited to a factor of two
             step = ((total - outside - target) / slope.clamp(min=tiny)).clamp(min=-0.7, max=0.7)
             scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
             # the next error is about the square of this step
             if bool((step.abs() < 0.5 * torch.finfo(step.dtype).eps ** 0.5).all()):
                 return scale
-        # a scale that fell to nothing is not near to where it was
+        # a scale that collapsed is solved again without the first guess
         return scale if near is None or self.steps < _EXACT else self._solved(problem, residual, square, None)
 
 
 _EXACT = 30
-"""Newton's steps that solve for the scale to rounding."""
+"""Newton steps that solve for the scale to rounding."""
 
 _RANKED = 3
-"""Fits through up to so many values are good enough to be ranked as they are, by the quantile that s begins at."""
+"""Largest number of coefficients at which the starts are ranked without a step, by the first guess of the scale."""
 
-_SCREENING, _SCREENING_RANKED = 2, 1
-"""Newton's steps for the scale of one of many fits."""
+_SCREENING = 2
+"""Newton steps for the scale of each start in the screening."""
+
+_SCREENING_RANKED = 1
+"""The same if the starts were ranked before."""
 
 _CANDIDATES = 10
-"""Fits that go on after the screening."""
+"""Number of candidates after the screening."""
 
-_NARROWING, _NARROWING_RANKED = ((4, 5), (8, 2)), ((3, 4), (5, 2))
-"""After so many steps more, only so many candidates go on."""
+_NARROWING = ((4, 5), (8, 2))
+"""Pairs of a number of further steps and the number of candidates kept after them."""
+
+_NARROWING_RANKED = ((3, 4), (5, 2))
+"""The same if the starts were ranked before."""
 
 _NEAR = 1e-7
-"""Steps end where the logarithm of the scale falls by less, and Newton's take over."""
+"""Decrease of the log scale below which concentration steps end and Newton steps follow."""
 
 _MISSED = 1e-9
-"""No more starts are drawn than all miss with this probability where half of the values are outliers."""
+"""Probability that all starts miss at 50 % outliers; no more starts are drawn than reach it."""
 
 
 def starts_worth_drawing(starts: int, num_coefficients: int) -> int:
-    """``starts``, or as many as make :data:`_MISSED` where that is fewer."""
+    """Smaller of ``starts`` and the number of starts that reach :data:`_MISSED`."""
     return min(starts, math.ceil(math.log(_MISSED) / math.log1p(-(0.5**num_coefficients))))
 
 
@@ -136,22 +142,22 @@ def minimise_m_scale(
         seed=seed,
     )
     with torch.no_grad():
-        found = _brought_to_rest(problem, minimise_scale(problem, search), search)
+        found = _polish_until_converged(problem, minimise_scale(problem, search), search)
     if not (problem.basis.requires_grad or problem.Y.requires_grad):
         return found
-    # one step from the solution has its derivative
+    # a Newton step from the solution has the derivative of the solution
     along = final.scale(problem, problem.residual(found.beta).unsqueeze(1), found.scale.unsqueeze(1)).squeeze(1)
     beta = found.beta - _newton_step(problem, found.beta, along, c)
-    scale, weight = final.weighed(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
+    scale, weight = final.weighted(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
     return replace(found, beta=beta, scale=scale.squeeze(1), weight=weight.squeeze(1))
 
 
-def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: ScaleSearch) -> ScaleMinimum:
-    """Newton's steps, and where they do not end at rest, more of the search to the last digit and Newton's again."""
+def _polish_until_converged(problem: LinearProblem, found: ScaleMinimum, search: ScaleSearch) -> ScaleMinimum:
+    """Polish by Newton steps; where they do not converge, alternate with concentration steps and Newton steps."""
     rule = search.final
     assert isinstance(rule, MScale)
     found, moved = _polished(problem, found, rule)
-    # a minimum moves by less than rounding does to the gradient
+    # a minimum moves by less than rounding changes the gradient
     at_most = 1e2 * torch.finfo(moved.dtype).eps ** 0.5
     index = (~(moved < at_most)).nonzero().squeeze(-1)
     left = search.max_iter
@@ -159,38 +165,38 @@ def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: ScaleS
         some = problem.select(index)
         more = descend(some, found.beta[index], replace(search, tolerance=0.0, max_iter=min(_BETWEEN, left)))
         more, moved = _polished(some, more, rule)
-        rest = more.converged | (moved < at_most)
+        converged = more.converged | (moved < at_most)
         found = ScaleMinimum(
             found.beta.index_copy(0, index, more.beta),
             found.scale.index_copy(0, index, more.scale),
             found.weight.index_copy(0, index, more.weight),
             found.n_iter + more.n_iter,
-            found.converged.index_copy(0, index, rest),
+            found.converged.index_copy(0, index, converged),
         )
-        index, left = index[~rest], left - _BETWEEN
+        index, left = index[~converged], left - _BETWEEN
     return found
 
 
 _BETWEEN = 40
-"""Steps of the search before Newton's are tried again."""
+"""Concentration steps before Newton steps are tried again."""
 
 
 def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> tuple[ScaleMinimum, Float[Tensor, " B"]]:
-    """Newton's steps from near the minimum, each of which halves the digits that are wrong, and the last one's length.
+    """Newton steps from near the minimum, each of which doubles the correct digits, and the length of the last step.
 
-    The length is the root mean square of what it moves the fitted values by, in scales; infinite where it is too long.
+    The length is the root mean square change of the fitted values in scales; infinite where it is too long.
     """
     moved = found.beta.new_full(found.beta.shape[:1], math.inf)
     for _ in range(_POLISH):
         step = _newton_step(problem, found.beta, found.scale, rule.c)
         beta = found.beta - step
-        scale, weight = rule.weighed(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
+        scale, weight = rule.weighted(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
         scale, weight = scale.squeeze(1), weight.squeeze(1)
         tiny = torch.finfo(beta.dtype).tiny
         rise = (scale.clamp(min=tiny) / found.scale.clamp(min=tiny)).log().sum(-1)
         length = torch.linalg.vector_norm(step, dim=-1) / (problem.num_samples**0.5 * found.scale.amin(-1))
         short = length < _LONGEST
-        # of a step to rest, what the scale rises by is rounding
+        # near convergence a rise of the scale is rounding
         moved = torch.where(short, length, torch.inf)
         better = ((rise <= 16 * torch.finfo(beta.dtype).eps) & short).unsqueeze(-1)
         found = replace(
@@ -203,36 +209,40 @@ def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> tupl
 
 
 _POLISH = 3
-"""Newton's steps after the search, which ends at a quarter of the digits."""
+"""Newton steps after the search, which ends with a quarter of the digits."""
 
 _LONGEST = 1e-2
-"""Of Newton's steps, in scales: from further away they may lead to a saddle."""
+"""Longest Newton step, in scales: from further away it may lead to a saddle point."""
 
 
 def bisquare_of(breakdown: float) -> float:
-    """The constant of the bisquare whose scale has this breakdown point."""
+    """Tuning constant of the bisquare whose scale has this breakdown point."""
     return BISQUARE_50 if breakdown == 0.5 else bisquare_for_breakdown(breakdown)
 
 
 def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) -> Float[Tensor, "B n"]:
-    """Newton's step of the summed logarithms of the scales, whose Hessian is a constant to derivatives.
+    """Newton step for the sum of the log scales; its Hessian is a constant to derivatives.
 
-    At the minimum it is 0, and its derivative by the data is minus that of the minimum.
+    At the minimum the step is 0, and its derivative by the data is minus that of the minimum.
     """
     at = scores(problem, beta, torch.maximum(scale, rounding_scale(problem)), Psi("tukey", (c,)))
-    w = weighed(problem, torch.ones_like(at.z))
+    w = weighted(problem, torch.ones_like(at.z))
     basis = problem.basis.expand(beta.shape[0], -1, -1, -1)
 
     def summed(values: Tensor) -> Float[Tensor, "B m n"]:
         return torch.einsum("bkc,bkcn->bcn", w * values / at.scale.unsqueeze(-2), basis)
 
-    pull = (w * at.psi * at.z).sum(-2).clamp(min=torch.finfo(beta.dtype).eps)
-    first = summed(at.psi) / pull.unsqueeze(-1)
+    slope_sum = (w * at.psi * at.z).sum(-2).clamp(min=torch.finfo(beta.dtype).eps)
+    first = summed(at.psi) / slope_sum.unsqueeze(-1)
     with torch.no_grad():
-        bend = at.slope * at.z + at.psi
-        cross = summed(bend).unsqueeze(-1) * (first / pull.unsqueeze(-1)).unsqueeze(-2)
-        own = ((w * bend * at.z).sum(-2) / pull)[..., None, None] * first.unsqueeze(-1) * first.unsqueeze(-2)
-        curved = problem.normal_equations(at.slope / (at.scale.square() * pull).unsqueeze(-2))[0]
+        product_slope = at.slope * at.z + at.psi
+        cross = summed(product_slope).unsqueeze(-1) * (first / slope_sum.unsqueeze(-1)).unsqueeze(-2)
+        own = (
+            ((w * product_slope * at.z).sum(-2) / slope_sum)[..., None, None]
+            * first.unsqueeze(-1)
+            * first.unsqueeze(-2)
+        )
+        curved = problem.normal_equations(at.slope / (at.scale.square() * slope_sum).unsqueeze(-2))[0]
         inverse = torch.linalg.pinv(curved + (own - cross - cross.mT).sum(1), hermitian=True)
     return -torch.matmul(inverse, first.sum(1).unsqueeze(-1)).squeeze(-1)
 
@@ -240,7 +250,7 @@ def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) 
 def m_scale_equation(
     problem: LinearProblem, beta: Float[Tensor, "B n"], scale: Float[Tensor, "B m"], breakdown: float
 ) -> tuple[Scores, ScaleInfluence]:
-    """The estimating equation of an S-estimate, and what moves its scales, which are at their least."""
+    """Estimating equation of an S-estimate, and the influence on its scales, which are at their minimum."""
     c = bisquare_of(breakdown)
     at = scores(problem, beta, torch.maximum(scale, rounding_scale(problem)), Psi("tukey", (c,)))
     u = at.z / c
@@ -248,7 +258,7 @@ def m_scale_equation(
 
 
 def check_breakdown(breakdown: float) -> None:
-    checked_number("breakdown", breakdown, 0.01, 0.5, "[]", "0.5 withstands most")
+    checked_number("breakdown", breakdown, 0.01, 0.5, "[]", "0.5 withstands most outliers")
 
 
 def check_starts(starts: int) -> None:
@@ -256,10 +266,10 @@ def check_starts(starts: int) -> None:
 
 
 _SMALL_SAMPLE = 12.0
-"""Standard errors grow by this times the breakdown point times the coefficients a value.
+"""Standard errors grow by this times the breakdown point times n / N.
 
 The fit was chosen to make its residuals small. From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples
-each at a breakdown point of 1/2, whose errors are 2.2, 1.5, 1.2 and 1.07 times what large samples let expect.
+each at a breakdown point of 1/2. Their errors are 2.2, 1.5, 1.2 and 1.07 times the large-sample values.
 """
 
 
@@ -269,28 +279,28 @@ class SRegression(RobustInference):
     The scale s solves mean ρ(r / (c s)) = breakdown with N - p in the denominator, p = ceil(n / m); with m channels the
     product of the channels' scales is minimised.
 
-    Starts go through n values each, and one through clean values is enough: at a share ε of outliers ``starts`` of them
-    miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the default and
-    n = 6. Take more for more coefficients. Of few coefficients no more are drawn than miss with probability
-    1e-9 at ε = 0.5: 73 for n = 2 and 156 for n = 3.
+    Each start is a fit through n values, and one start through clean values is enough. At a share ε of outliers all
+    ``starts`` miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the
+    default and n = 6. Take more starts for more coefficients. For few coefficients only so many are drawn that the
+    probability of missing is 1e-9 at ε = 0.5: 73 for n = 2 and 156 for n = 3.
 
     Args:
-        breakdown: share of outliers the estimator withstands, 0.01 to 0.5. At Gaussian residuals 0.5 has efficiency
-            0.287, 0.25 has 0.759; :class:`MMRegression` has both.
-        starts: number of elemental starts at most.
-        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
-            at every X and no outlier lies far out in X.
+        breakdown: share of outliers that the estimator withstands, 0.01 to 0.5. Efficiency at Gaussian residuals is
+            0.287 for 0.5 and 0.759 for 0.25; :class:`MMRegression` has both high breakdown and high efficiency.
+        starts: largest number of elemental starts.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors have the
+            same distribution at every X and no outlier lies far out in X.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        seed: of the elemental starts.
+        seed: seed of the elemental starts.
 
     Attributes, after ``fit``:
-        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); they and ``scale_`` have derivatives by X and Y.
+        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); differentiable by X and Y, as is ``scale_``.
         scale_: (*, m), m being 1 for one channel: the M-scale, consistent for Gaussian residuals.
         weights_: bisquare weights in [0, 1], (*, N, m).
-        n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+        n_iter_, converged_: number of steps, and whether they converged, (*,).
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of the wrong type, or out of range.
 
     References:
         Rousseeuw & Yohai, "Robust regression by means of S-estimators" (1984).

@@ -1,4 +1,4 @@
-"""Any linear estimator for one channel as a regressor of scikit-learn; needs the extra ``sklearn``."""
+"""Any linear estimator for one channel as a scikit-learn regressor; needs the extra ``sklearn``."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ __all__ = ["ScikitLearnRegressor"]
 
 
 class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
-    """Robust linear regression as scikit-learn knows it: in pipelines, searches and cross-validation.
+    """Robust linear regression with scikit-learn's interface, for pipelines, searches and cross-validation.
 
-    X is (n_samples, n_features) and y (n_samples,), of whatever scikit-learn takes; results are NumPy arrays.
+    X is (n_samples, n_features) and y (n_samples,), of any type that scikit-learn takes; results are NumPy arrays.
 
     Args:
-        estimator: any estimator of ``mkc_torch.linear``; None is ``MMRegression()``. Its parameters are reached as
+        estimator: any estimator of ``mkc_torch.linear``; None is ``MMRegression()``. Its parameters have names such as
             ``estimator__efficiency``.
-        fit_intercept: add a column of ones, whose coefficient is ``intercept_``. It is a column like the others: what
-            shrinks or bounds coefficients, such as ``Ridge``, does so to the intercept too.
+        fit_intercept: add a constant column, whose coefficient is ``intercept_``. It is treated as any other column:
+            a penalty or bound on coefficients, as in ``Ridge``, applies to the intercept too.
 
     Attributes, after ``fit``:
         coef_: (n_features,), without the intercept.
-        intercept_: a number; 0 where none is fitted.
-        scale_: the robust scale of the residuals, in the unit of y; of estimators that have one.
-        weights_: the weight in [0, 1] with which each sample entered the fit, (n_samples,): small ones are outliers.
+        intercept_: the intercept; 0 without ``fit_intercept``.
+        scale_: robust scale of the residuals, in the unit of y, for estimators that have a scale.
+        weights_: weight of each sample in the fit, in [0, 1], (n_samples,); outliers have small weights.
         estimator_: the fitted estimator with all its results, as tensors; the intercept is its last coefficient.
-        n_features_in_, feature_names_in_: as everywhere in scikit-learn.
+        n_features_in_, feature_names_in_: as in scikit-learn.
 
     References:
         Buitinck et al., "API design for machine learning software: experiences from the scikit-learn project" (2013).
@@ -80,9 +80,9 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             sample_weight: non-negative weights (n_samples,).
 
         Raises:
-            TypeError: ``estimator`` is none of ``mkc_torch.linear``.
-            ValueError: bad input, as scikit-learn and the estimator say it.
-            RankDeficientError: features are linearly dependent, or one is constant beside the intercept.
+            TypeError: ``estimator`` is not an estimator of ``mkc_torch.linear``.
+            ValueError: bad input, reported by scikit-learn or by the estimator.
+            RankDeficientError: features are linearly dependent, or a feature is constant and an intercept is fitted.
         """
         inner = MMRegression() if self.estimator is None else self.estimator
         what = "an estimator of mkc_torch.linear"
@@ -97,7 +97,7 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         try:
             self.estimator_ = clone(inner).fit(*given, weight)
         except RankDeficientError as error:
-            where = f" Column {X.shape[1]} is the intercept's, of ones." if self.fit_intercept else ""
+            where = f" Column {X.shape[1]} is the constant column of the intercept." if self.fit_intercept else ""
             raise RankDeficientError(f"{error}{where}") from None
         self._keep_results()
         return self
@@ -107,7 +107,7 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
         Raises:
             sklearn.exceptions.NotFittedError: before ``fit``.
-            ValueError: X has other features than those of the fit, or values that are no finite numbers.
+            ValueError: X has other features than those of the fit, or values that are NaN or infinite.
         """
         check_is_fitted(self)
         X = validate_data(self, X, dtype=_FLOATS, reset=False)
@@ -123,7 +123,7 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 
 _FLOATS = [np.float64, np.float32]
-"""What X is fitted in: the second if X is of it, else the first."""
+"""Dtypes in which X is fitted: float32 if X is float32, else float64."""
 
 
 def _as_numpy(values: Tensor) -> np.ndarray:

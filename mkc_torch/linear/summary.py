@@ -1,4 +1,4 @@
-"""Table of a regression's coefficients, for a terminal, a notebook and a program."""
+"""Table of a regression's coefficients as text, for a terminal and as HTML for a notebook."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 LIGHT = 0.1
-"""A weight below this is told of: the fit all but leaves the value out. Nothing decides by it."""
+"""Values with a weight below this are counted in the heading as nearly excluded. It has no other effect."""
 
 _KINDS = {
     "sandwich": "the sandwich",
@@ -27,7 +27,7 @@ _FACTS = ("scale", "robust R²")
 
 @dataclass(frozen=True)
 class Coefficient:
-    """One row: the estimate, its standard error, the p-value of 0, and the interval."""
+    """A row of the table: the estimate, its standard error, the p-value of the coefficient being 0, the interval."""
 
     name: str
     value: float
@@ -39,16 +39,16 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a robust regression found.
+    """Coefficients of a robust regression with standard errors, p-values and intervals.
 
     Attributes:
-        title: the estimator.
+        title: name of the estimator.
         coefficients: rows of the table.
-        level: of the intervals.
-        num_values, num_light: values given, and how many of them have a weight below 0.1.
+        level: confidence level of the intervals.
+        num_values, num_light: number of values, and how many of them have a weight below 0.1.
         scale, r_squared: of each channel; empty where the estimator has none.
-        dof: degrees of freedom left.
-        kind: of the covariance.
+        dof: degrees of freedom.
+        kind: kind of the covariance.
     """
 
     title: str
@@ -75,12 +75,12 @@ class Summary:
         dof: float,
         kind: str,
     ) -> Summary:
-        """From the columns of the table: coefficients, standard errors, p-values (n,) and intervals (n, 2)."""
+        """Build from the columns of the table: coefficients, standard errors, p-values (n,) and intervals (n, 2)."""
         value, error, p_value, interval = (c.detach().cpu().double().tolist() for c in columns)
         names = [f"x{k}" for k in range(len(value))] if names is None else list(names)
         if len(names) != len(value):
             raise ValueError(
-                f"Expected argument `names` to hold {len(value)} names but got {len(names)}; one for each coefficient."
+                f"Expected argument `names` to hold {len(value)} names but got {len(names)}; pass one per coefficient."
             )
         rows = zip(names, value, error, p_value, interval, strict=True)
         coefficients = tuple(Coefficient(str(n), v, e, p, *ends) for n, v, e, p, ends in rows)
@@ -106,7 +106,7 @@ class Summary:
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
-        """The cells as text, coefficients and intervals to the decimals that the standard error makes sense of."""
+        """The cells as text; coefficients and intervals have the decimals that the standard error justifies."""
         return [_cells(c) for c in self.coefficients]
 
     def __str__(self) -> str:
@@ -129,7 +129,7 @@ class Summary:
         for column in self.columns[1:]:
             table.add_column(column, justify="right", no_wrap=True)
         for name, *cells in self.rows:
-            # a name may hold brackets, which are no markup
+            # brackets in a name are not markup
             table.add_row(Text(name), *cells)
         return Group(Text(self.heading), table, Text(self.footing))
 
@@ -157,7 +157,7 @@ def _cells(c: Coefficient) -> tuple[str, ...]:
 
 
 def _decimals(error: float) -> int | None:
-    """Decimals that show three digits of a standard error; None where a plain number is too long for them."""
+    """Decimals that show three digits of a standard error; None where the number would be too long."""
     if not 0.0 < error < math.inf:
         return None
     decimals = 2 - math.floor(math.log10(error))
@@ -169,15 +169,15 @@ def _fixed(value: float, decimals: int | None) -> str:
 
 
 def one_problem(problem: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int, ...]:
-    """The index of one problem of a batch.
+    """Return the index of one problem of a batch.
 
     Raises:
-        IndexError: none is chosen, or there is no such one.
+        IndexError: no problem is chosen, or there is no such problem.
     """
     fits = len(problem) == len(batch) and all(-size <= k < size for k, size in zip(problem, batch, strict=True))
     if not fits:
         raise IndexError(
             f"Expected argument `problem` to be the index of one problem of the batch {batch} but got {problem}; "
-            "a summary is of one."
+            "a summary shows one problem."
         )
     return problem

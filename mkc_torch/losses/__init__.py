@@ -1,4 +1,4 @@
-"""Losses for networks, one a file, and what a trained one says of a sample."""
+"""Robust losses for networks, and inlier weights, outliers and intervals from a trained loss."""
 
 from mkc_torch.losses.entropy_like import LELoss, entropy_like, least_entropy_like
 from mkc_torch.losses.generalized_cross_entropy import GeneralizedCrossEntropyLoss, graduated_sigma

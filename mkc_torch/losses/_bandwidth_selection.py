@@ -1,10 +1,10 @@
-"""Selection of the bandwidth by which a network learns: estimated variance and shrinkage of the predictions.
+"""Selection of the bandwidth that trains a network, by estimated variance and shrinkage of the predictions.
 
-The variance alone does not separate wrong targets from wide noise. A wrong target that is independent of its input
-pulls the prediction toward the middle. Least squares yields, the residuals of right and wrong targets then look alike,
-and a wide bandwidth looks best. The initial loss, which gives far residuals little weight, would stretch such
-predictions again: its influence correlates with the prediction. So each bandwidth is judged by its variance and by the
-square of the shrinkage that it adds to the initial loss's, as far as that exceeds chance.
+The variance alone does not distinguish wrong targets from wide noise. Wrong targets that are independent of their input
+shrink the predictions toward the mean. Under least squares the residuals of right and wrong targets then look alike,
+and a wide bandwidth seems best. The initial loss, which gives far residuals little weight, would stretch such
+predictions again: its influence correlates with the prediction. The risk of a bandwidth is therefore its variance plus
+the square of its shrinkage beyond that of the initial loss, as far as it exceeds chance.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 __all__ = ["BandwidthSelection", "select_bandwidth"]
 
 BANDWIDTHS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 16.0, 64.0)
-"""Candidates, in scales."""
+"""Candidate bandwidths, in scales."""
 
 TOLERANCE = 1.1
-"""Times the smallest risk up to which a wider bandwidth is taken."""
+"""Factor on the smallest risk up to which a wider bandwidth is preferred."""
 
 CHANCE = 9.0
-"""Squared standard errors of shrinkage that are put down to chance: three standard errors. Set on Friedman's second and
-third function and the Carseats and Hitters tables."""
+"""Square of the shrinkage attributed to chance, in squared standard errors: three standard errors. Tuned on Friedman's
+second and third function and the Carseats and Hitters tables."""
 
 LEAST_SLOPE = 1e-3
-"""Least mean derivative of an influence function."""
+"""Lower limit of the mean derivative of an influence function."""
 
 TINY = 1e-30
-"""Stands for 0 in a denominator."""
+"""Lower limit of denominators."""
 
 _FAR = 1e4
-"""Square of a residual over its bandwidth at which its kernel is 0 already."""
+"""Square of a residual over its bandwidth from which the kernel is 0."""
 
 
 class BandwidthSelection(NamedTuple):
-    """The widest bandwidth of nearly the smallest risk, in scales, and whether it is better than the initial loss."""
+    """Widest bandwidth of nearly the smallest risk, in scales, and whether it beats the initial loss; (m,) each."""
 
     bandwidth: Any
     better: Any
@@ -50,14 +50,14 @@ class BandwidthSelection(NamedTuple):
 def select_bandwidth(
     xp: Any, z: Float[Tensor, "m L"], prediction: Float[Tensor, "m L"], weight: Float[Tensor, "m L"]
 ) -> BandwidthSelection:
-    """Judge all bandwidths, and the initial loss, on residuals.
+    """Select the bandwidth of each channel by estimated risk, and compare it with the initial loss.
 
     The variance of an M-estimate with influence ψ is E ψ² / (E ψ')² (Huber, "Robust Statistics" (1981), 3.2). Its
     shrinkage is one step of Newton's method for the slope on the standardised prediction, E ψ q / E ψ'.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are.
-        z: residuals, prediction less target, over their scale.
+        xp: ``numpy`` or ``torch``, the library of the other arrays.
+        z: residuals (prediction - target) over their scale.
         prediction: the prediction of each residual.
         weight: the weight of each residual.
 
@@ -75,7 +75,7 @@ def select_bandwidth(
     influence, slope = _influences(xp, z)
     slope = at_least(xp, mean(slope), LEAST_SLOPE)
     risk = mean(influence * influence) / (slope * slope)
-    # contribution of each sample to the slope, less its contribution under the initial loss, which is last
+    # contribution of each sample to the slope, minus its contribution under the initial loss (the last entry)
     step = (influence - mean(influence)[..., None]) * (_standardised(xp, prediction, share)[..., None, :])
     step = step / slope[..., None]
     step = step - step[..., -1:, :]
@@ -92,22 +92,22 @@ def select_bandwidth(
 def _widths(xp: Any, like: Any) -> Any:
     if xp.__name__ == "numpy":
         return xp.asarray(BANDWIDTHS, dtype=like.dtype)
-    return xp.stack([like.new_full((), width) for width in BANDWIDTHS])  # a list would be copied to a GPU, which waits
+    return xp.stack([like.new_full((), width) for width in BANDWIDTHS])  # copying a list to a GPU would wait for it
 
 
 def _influences(xp: Any, z: Any) -> tuple[Any, Any]:
     """Influence and its derivative under each bandwidth and, last, under the initial loss: (m, K + 1, L)."""
     each = z[..., None, :]
     ratio = each / _widths(xp, z)[:, None]
-    square = at_most(xp, ratio * ratio, _FAR)  # beyond, a product of infinity and 0
+    square = at_most(xp, ratio * ratio, _FAR)  # beyond it, the product would be infinity times 0
     inlier = xp.exp(-0.5 * square)
     initial, slope = initial_influence(xp, each)
     return xp.concatenate([each * inlier, initial], -2), xp.concatenate([(1.0 - square) * inlier, slope], -2)
 
 
 def _standardised(xp: Any, values: Any, share: Any) -> Any:
-    """Of mean 0 and variance 1; 0 where all values are equal."""
+    """Values shifted and scaled to mean 0 and variance 1; 0 where all values are equal."""
     centred = xp.where(share > 0, values - (values * share).sum(-1)[..., None], 0.0)
-    # over their largest, whose square neither overflows nor is 0
+    # divided by the largest, so that squares neither overflow nor underflow
     centred = centred / at_least(xp, xp.amax(xp.abs(centred), -1), TINY)[..., None]
     return centred / at_least(xp, xp.sqrt((centred * centred * share).sum(-1)), TINY)[..., None]

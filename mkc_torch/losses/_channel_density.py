@@ -1,4 +1,4 @@
-"""The parameters and the running state of a loss: σ and d of each channel, learned, fixed or taken from residuals."""
+"""Parameters and running state of a loss: σ and d of each channel, learned, fixed or taken from residuals."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ __all__ = ["DEFAULT_BOUND_IN_D", "DEFAULT_D_MIN_IN_D", "ChannelDensity", "Object
 Objective = Literal["robust", "likelihood"]
 
 DEFAULT_BOUND_IN_D = 100.0
-"""Half-width of the domain, in units of the initial d, where no bound is given."""
+"""Default half-width of the domain, in units of the initial d."""
 
 DEFAULT_D_MIN_IN_D = 1e-3
-"""Floor under d, in units of the initial d, where none is given."""
+"""Default floor of d, in units of the initial d."""
 
 DEFAULT_LEARNING_RATE = 1e-2
-"""Learning rate of σ and d in :meth:`ChannelDensity.param_groups`."""
+"""Default learning rate of σ and d in :meth:`ChannelDensity.param_groups`."""
 
 
 class ChannelDensity(nn.Module):
-    """The density of each channel: parameters and running state of a loss, without its computation.
+    """Density of each channel: parameters and running state of a loss, without its computation.
 
     Args:
         num_channels: m.
         sigma, d, bound, d_min, learn_sigma, learn_d: as for :class:`mkc_torch.MKCLoss`.
-        robust: whether there is a schedule by which the network learns.
+        robust: whether a :class:`BandwidthSchedule` trains the network.
     """
 
     num_channels: int
@@ -70,7 +70,7 @@ class ChannelDensity(nn.Module):
         self._follows = follows = is_auto(d)
         self.residual_scale = ResidualScale(num_channels) if follows or robust else None
         self.schedule = BandwidthSchedule(num_channels) if robust else None
-        self.__dict__["_guide"] = None  # no part of the state_dict
+        self.__dict__["_guide"] = None  # not saved in the state_dict
         kappa = inverse_square(self._sigma_in_range(sigma))
         own_bound = not (bound is None or is_auto(bound))
         self._bound_was_given = own_bound or not follows
@@ -140,7 +140,7 @@ class ChannelDensity(nn.Module):
 
     @property
     def objective(self) -> Objective:
-        """By what the network learns: "robust" or "likelihood"."""
+        """The loss that trains the network: "robust" or "likelihood"."""
         return "likelihood" if self.schedule is None else "robust"
 
     @property
@@ -155,7 +155,7 @@ class ChannelDensity(nn.Module):
 
     @property
     def d(self) -> Float[Tensor, " m"]:
-        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set them, where given."""
+        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set a given d."""
         if not self._follows and self.raw_d is None:
             assert self.fixed_d is not None
             return self.fixed_d
@@ -165,14 +165,14 @@ class ChannelDensity(nn.Module):
     def d(self, value: float | Tensor) -> None:
         if self._follows:
             raise ValueError(
-                f"Expected a loss with a given `d` to set it but got one that takes d from the residuals, d={value}; "
+                f"Expected a loss with a given `d` but got d={value} for a loss that takes d from the residuals; "
                 "call freeze_scale() first, or make the loss with `d=` and `bound=`."
             )
         bound, d_min = self.bound, self.d_min
         d = self._per_channel("d", as_numbers("d", value, self._dtype), low=0.0).to(bound)
         if self.raw_d is not None and not bool(((d > d_min) & (d < bound)).all()):
             raise ValueError(
-                f"Expected `d` input_hold `d_min` {d_min.tolist()} and `bound` {bound.tolist()} but got {value}."
+                f"Expected `d` between `d_min` {d_min.tolist()} and `bound` {bound.tolist()} but got {value}."
             )
         self._set_d(d)
 
@@ -186,14 +186,14 @@ class ChannelDensity(nn.Module):
     @property
     def _dtype(self) -> torch.dtype:
         given = (*self._parameters.values(), *self._buffers.values())
-        wide = any(one is not None and one.dtype == torch.float64 for one in given)
+        wide = any(value is not None and value.dtype == torch.float64 for value in given)
         return torch.float64 if wide else torch.float32
 
     @torch.no_grad()
     def freeze_scale(self) -> None:
-        """Stop following the residuals: d and bound stay as they are and the objective becomes the likelihood.
+        """Fix d and bound at their current values and make the likelihood the objective.
 
-        For an optimiser that needs the same function at every call, L-BFGS say, and to compare likelihoods.
+        Needed for optimisers that require the same function at every call, such as L-BFGS, and to compare likelihoods.
 
         Example:
             >>> from mkc_torch import MKCLoss
@@ -215,11 +215,11 @@ class ChannelDensity(nn.Module):
         self.residual_scale, self.schedule = None, None
 
     def guide(self, residual_scale: ResidualScale | None, schedule: BandwidthSchedule | None) -> None:
-        """Let the network learn by a schedule, as under ``objective="robust"``, that is no part of the loss.
+        """Train the network by an external schedule, as with ``objective="robust"``; None and None end it.
 
-        For trainers that own σ and d: the loss stays the likelihood of given numbers, its ``state_dict`` has nothing of
-        the schedule, and in training the network learns by the likelihood's energy at a bandwidth no wider than the
-        selected bandwidth. None and None end it.
+        For trainers that own σ and d. The loss stays the likelihood of given numbers, and its ``state_dict`` does not
+        contain the schedule. In training the network learns by the likelihood's energy at a bandwidth no wider than the
+        selected bandwidth.
         """
         self.__dict__["_guide"] = None if residual_scale is None or schedule is None else (residual_scale, schedule)
 
@@ -232,9 +232,9 @@ class ChannelDensity(nn.Module):
         return modules.get("residual_scale"), modules.get("schedule")
 
     def _state(self, batch: Batch | None = None, *, robust: bool = False) -> ChannelState:
-        """The buffers as one forward pass takes them: copies, for the next batch changes the buffers.
+        """Copies of the buffers for a forward pass, because the next batch changes the buffers.
 
-        With a batch, channels that have had none take their scale from it.
+        With a batch, channels without a batch so far take their scale from it.
         """
         running, schedule = self._running() if robust else (self.residual_scale, None)
         bound, floor, scale = self.fixed_bound, self.fixed_d_min, None
@@ -253,11 +253,11 @@ class ChannelDensity(nn.Module):
             state = ChannelState(bound, floor, scale, schedule.log_bandwidth.clone(), schedule.share.clone())
         if running is None or not (self.training and torch.compiler.is_compiling()):
             return state
-        kept = iter(snapshot([one for one in state if one is not None]))
-        return ChannelState(*(None if one is None else next(kept) for one in state))
+        kept = iter(snapshot([value for value in state if value is not None]))
+        return ChannelState(*(None if value is None else next(kept) for value in state))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Parameters and buffers stay in float32 at least: half would round them, or overflow."""
+        """Keep parameters and buffers in float32 at least: half precision would round them, or overflow."""
 
         def keep(t: Tensor) -> Tensor:
             out = fn(t)
@@ -284,22 +284,22 @@ class ChannelDensity(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _take_given_numbers(self) -> None:
-        """Become a loss of given numbers, which a state_dict of a frozen loss is loaded into."""
+        """Turn into a loss with given d and bound, before the state_dict of a frozen loss is loaded."""
         like = self.residual_scale.log_scale if self.residual_scale is not None else torch.zeros(self.num_channels)
         self._follows, self.residual_scale, self.schedule = False, None, None
         self.fixed_bound, self.fixed_d_min = torch.ones_like(like), torch.full_like(like, DEFAULT_D_MIN_IN_D)
         self.fixed_d = torch.full_like(like, 0.1) if self.raw_d is None else None
 
     def log_normalizer(self) -> Float[Tensor, " m"]:
-        """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""
+        """``log(d Z)`` of each channel, (m,): the difference of the negative log-likelihood and the energy."""
         d, bound = self.d, self.bound
         return torch.log(d) + log_partition(self.kappa, bound / d)
 
     def param_groups(self, *, lr: float = DEFAULT_LEARNING_RATE, **options: Any) -> list[dict[str, Any]]:
-        """Optimiser groups of the learned σ and d, without weight decay, which would pull them to arbitrary values.
+        """Optimiser groups of the learned σ and d, without weight decay, which would bias them.
 
         Args:
-            lr: their learning rate, for Adam and its like, whatever that of the network is.
+            lr: learning rate of σ and d for Adam and similar optimisers, independent of the network's.
             options: further options of the group.
 
         Example:
@@ -313,5 +313,5 @@ class ChannelDensity(nn.Module):
 
 
 def is_auto(value: object) -> bool:
-    """Whether an argument asks for what the residuals say."""
+    """Whether an argument is "auto": taken from the residuals."""
     return isinstance(value, str) and value == "auto"

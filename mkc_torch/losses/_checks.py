@@ -1,4 +1,4 @@
-"""Arguments that the losses share, checked."""
+"""Checks of arguments that several losses have."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 Reduction = Literal["none", "mean", "sum"]
 
 _SHOWN = 6
-"""Channels whose numbers are shown."""
+"""Channels shown in a text, at most."""
 
 
 def refuse_other_reduction(reduction: str) -> None:
@@ -38,15 +38,15 @@ def refuse_no_dimension(channel_dim: int) -> None:
 
 
 def refuse_other_shapes(input: Tensor, target: Tensor) -> None:
-    """Refuse what are no real tensors of one shape, with an element."""
+    """Raise unless both are real tensors of the same shape with at least one element."""
     for name, value in (("input", input), ("target", target)):
         refuse_not_real(name, value)
     if input.shape != target.shape:
         short = "target" if input.dim() > target.dim() else "input"
-        mend = f"unsqueeze(-1) the {short}" if input.numel() == target.numel() else "reshape one"
+        fix = f"unsqueeze(-1) the {short}" if input.numel() == target.numel() else "reshape either"
         raise ValueError(
-            f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}; "
-            f"{mend}: torch would broadcast them."
+            f"Expected `input` and `target` of the same shape but got {tuple(input.shape)} and {tuple(target.shape)}; "
+            f"{fix}: torch would broadcast them."
         )
     if input.numel() == 0:
         raise ValueError(f"Expected at least one element but got shape {tuple(input.shape)}; skip empty batches.")
@@ -60,9 +60,9 @@ def checked_axis(input: Tensor, channel_dim: int) -> int:
 
 
 def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = True) -> tuple[Tensor, Tensor]:
-    """Weights of the shape of the input, in its dtype unless ``cast`` is False, and which of them count.
+    """Weights expanded to the shape of the input, in its dtype unless ``cast`` is False, and the mask of weights not 0.
 
-    A weight of each sample has no dimension for the channels; one of each element may have size 1 where it is the same.
+    A weight per sample lacks the channel dimension. A weight per element may have size 1 along any dimension.
     """
     refuse_bad_weight(weight)
     samples = input.shape[:axis] + input.shape[axis + 1 :]
@@ -72,7 +72,7 @@ def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = Tru
         size not in (1, whole) for size, whole in zip(weight.shape, input.shape, strict=True)
     ):
         raise ValueError(
-            f"Expected argument `weight` of shape {tuple(input.shape)}, with 1 where it is the same for all, or "
+            f"Expected argument `weight` of shape {tuple(input.shape)}, with size 1 where it is constant, or "
             f"{tuple(samples)} but got {tuple(weight.shape)}."
         )
     weight = weight.expand(input.shape)
@@ -83,7 +83,7 @@ def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = Tru
 
 
 def format_channels(values: Tensor) -> str:
-    """A number where all are alike, or the first few."""
+    """The values as text: one number if all are equal, else a list of the first few."""
     numbers = [f"{value:.4g}" for value in values.tolist()]
     if len(set(numbers)) == 1:
         return numbers[0]

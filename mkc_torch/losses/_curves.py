@@ -1,7 +1,7 @@
-"""What a loss does with a residual: its value, its pull, and the weight of the residual.
+"""Curves of a loss over a residual: value, influence and weight.
 
-Every loss has ``rho``, ``influence``, the derivative of it, ``weight``, the influence over that of the loss it takes
-the place of, and ``plot``; what they are functions of differs and stands with each.
+Every loss has ``rho``, the value; ``influence``, its derivative; ``weight``, the influence relative to that of the
+non-robust loss; and ``plot``. Their arguments differ and are documented in each class.
 """
 
 from __future__ import annotations
@@ -21,20 +21,29 @@ if TYPE_CHECKING:
 
 __all__ = ["ChannelCurves", "Curves", "SampleCurves"]
 
-_REACH, _LEAST_REACH, _LONGEST_REACH, _POINTS = 3.0, 6.0, 20.0, 401
-"""Of a picture: bandwidths to each side, where the weight is 1 %, and the fewest and most scales; points."""
+_REACH = 3.0
+"""Half-width of a picture in bandwidths: the weight there is 1 %."""
+
+_LEAST_REACH = 6.0
+"""Half-width of a picture in scales, at least."""
+
+_LONGEST_REACH = 20.0
+"""Half-width of a picture in scales, at most."""
+
+_POINTS = 401
+"""Points per curve of a picture."""
 
 _OF_ERRORS = "error, in the unit of the target"
 
 
 class Curves:
-    """The picture of a loss's curves."""
+    """Base class that draws the curves of a loss."""
 
     @staticmethod
     def _drawn(
         axes: Any, x: Float[Tensor, " P"], curves: dict[str, Float[Tensor, " P"]], xlabel: str, title: str
     ) -> Any:
-        """Each curve over x in a colour of its own, on axes or those of a new figure; needs matplotlib."""
+        """Draw each curve over x in its own colour, on given axes or a new figure; needs matplotlib."""
         if axes is None:
             from matplotlib.figure import Figure
 
@@ -49,14 +58,14 @@ class Curves:
 
 
 class ChannelCurves(Curves):
-    """Of a loss with ``kappa`` and ``d`` of each channel, over errors whose last dimension is the channels'."""
+    """Curves of a loss with ``kappa`` and ``d`` per channel, over errors (*, m)."""
 
     kappa: Any
     d: Any
     num_channels: Any
 
     def rho(self, error: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """The energy ``σ² (1 - exp(-e² / (2 d² σ²)))`` of errors, the last dimension being the channels.
+        """Energy ``σ² (1 - exp(-e² / (2 d² σ²)))`` of errors (*, m).
 
         Example:
             >>> from mkc_torch import MKCLoss
@@ -67,12 +76,12 @@ class ChannelCurves(Curves):
         return energy(z, kappa)
 
     def influence(self, error: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """The derivative of :meth:`rho` by the error: how hard an error pulls, in one over the unit of the target."""
+        """Derivative of :meth:`rho` by the error, in 1 over the unit of the target."""
         z, kappa, d = self._standardised(error)
         return energy_dz(z, kappa) / d
 
     def weight(self, error: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """The pull beside that of least squares of the same d, in [0, 1]: ``exp(-e² / (2 d² σ²))``, (15) of the paper.
+        """Influence over that of least squares with the same d, ``exp(-e² / (2 d² σ²))`` in [0, 1]: (15) of the paper.
 
         Example:
             >>> from mkc_torch import MKCLoss
@@ -84,16 +93,16 @@ class ChannelCurves(Curves):
         return torch.exp(-0.5 * kappa * z.square())
 
     def plot(self, channel: int = 0, axes: Any = None) -> Any:
-        """Draw value, pull and weight of a channel over the error, and give the axes back; needs matplotlib.
+        """Draw value, influence and weight of a channel over the error, and return the axes; needs matplotlib.
 
-        The value is drawn as a share of σ², which it tends to, and for σ = ∞ as it is.
+        The value is drawn over σ², its limit, and undivided for σ = ∞.
 
         Args:
-            channel: which, from 0.
-            axes: matplotlib's, or None for a new figure.
+            channel: index of the channel, from 0.
+            axes: axes of matplotlib, or None for a new figure.
 
         Raises:
-            ValueError: there is no such channel.
+            ValueError: the channel does not exist.
             ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
         """
         if isinstance(channel, bool) or not isinstance(channel, int) or not 0 <= channel < self.num_channels:
@@ -104,18 +113,19 @@ class ChannelCurves(Curves):
             kappa, d = self.kappa[channel], self.d[channel]
             sigma = float(kappa) ** -0.5 if kappa > 0 else math.inf
             error = _errors(sigma, d).unsqueeze(-1).expand(-1, self.num_channels)
-            values, pulls, weights = (
-                one[:, channel] for one in (self.rho(error), self.influence(error), self.weight(error))
+            values, influences, weights = (
+                value[:, channel] for value in (self.rho(error), self.influence(error), self.weight(error))
             )
             title = f"{type(self).__name__}, channel {channel}: σ = {sigma:.3g}, d = {float(d):.3g}"
-            return self._drawn(axes, error[:, channel], _shown(values, pulls, weights, sigma, d), _OF_ERRORS, title)
+            curves = _shown(values, influences, weights, sigma, d)
+            return self._drawn(axes, error[:, channel], curves, _OF_ERRORS, title)
 
     def _standardised(self, error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         refuse_not_real("error", error)
         if error.dim() == 0 or error.shape[-1] != self.num_channels:
             raise ValueError(
                 f"Expected argument `error` with {self.num_channels} channels in its last dimension but got "
-                f"{tuple(error.shape)}; one channel is error.unsqueeze(-1)."
+                f"{tuple(error.shape)}; for a single channel pass error.unsqueeze(-1)."
             )
         kappa, d = self.kappa, self.d
         dtype = torch.promote_types(error.dtype, d.dtype)
@@ -124,20 +134,20 @@ class ChannelCurves(Curves):
 
 
 class SampleCurves(Curves):
-    """Of a loss whose σ and d come with each error; all three broadcast."""
+    """Curves of a loss with σ and d per error; all three broadcast."""
 
     def rho(
         self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """The energy ``σ² (1 - exp(-e² / (2 d² σ²)))`` of errors.
+        """Energy ``σ² (1 - exp(-e² / (2 d² σ²)))`` of errors, without the normaliser, which does not depend on them.
 
         Args:
-            error: less the normaliser, which no error has a part in.
+            error: errors, in the unit of the target.
             sigma: bandwidths in [0.05, inf].
             d: scales, in the unit of the errors.
 
         Raises:
-            TypeError, ValueError: an argument of another kind, or out of range.
+            TypeError, ValueError: an argument of another type, or out of range.
 
         Example:
             >>> from mkc_torch import HeteroscedasticMKCLoss
@@ -150,36 +160,36 @@ class SampleCurves(Curves):
     def influence(
         self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """The derivative of :meth:`rho` by the error, in one over the unit of the target; arguments as there."""
+        """Derivative of :meth:`rho` by the error, in 1 over the unit of the target; same arguments."""
         error, sigma, d = _sampled(error, sigma, d)
         return error / d * mkc_weight(error, sigma, d) / d
 
     def weight(
         self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """The pull beside that of least squares of the same d, in [0, 1]; arguments as for :meth:`rho`."""
+        """Influence relative to that of least squares with the same d, in [0, 1]; arguments of :meth:`rho`."""
         return mkc_weight(*_sampled(error, sigma, d))
 
     def plot(self, sigma: float = 3.0, d: float = 1.0, axes: Any = None) -> Any:
-        """Draw value, pull and weight over the error of a sample, and give the axes back; needs matplotlib.
+        """Draw value, influence and weight over the error of a sample, and return the axes; needs matplotlib.
 
-        The value is drawn as a share of σ², which it tends to, and for σ = ∞ as it is.
+        The value is drawn over σ², its limit, and undivided for σ = ∞.
 
         Args:
-            sigma, d: of the sample.
-            axes: matplotlib's, or None for a new figure.
+            sigma, d: bandwidth and scale of the sample.
+            axes: axes of matplotlib, or None for a new figure.
 
         Raises:
-            TypeError, ValueError: σ or d is no number, or out of range.
+            TypeError, ValueError: σ or d is not a number, or out of range.
             ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
         """
         checked_number("sigma", sigma, SIGMA_LEAST, math.inf, "[]", "3 is usual")
         checked_number("d", d, advice="1 draws errors in scales")
         scale = torch.tensor(d, dtype=torch.float64)
         error = _errors(sigma, scale)
-        value, pull, weight = (one(error, sigma, d) for one in (self.rho, self.influence, self.weight))
+        value, influence, weight = (curve(error, sigma, d) for curve in (self.rho, self.influence, self.weight))
         title = f"{type(self).__name__}: σ = {sigma:.3g}, d = {d:.3g}"
-        return self._drawn(axes, error, _shown(value, pull, weight, sigma, scale), _OF_ERRORS, title)
+        return self._drawn(axes, error, _shown(value, influence, weight, sigma, scale), _OF_ERRORS, title)
 
 
 def _errors(sigma: float, d: Float[Tensor, ""]) -> Float[Tensor, " P"]:
@@ -193,11 +203,11 @@ def _sampled(error: Tensor, sigma: float | Tensor, d: float | Tensor) -> tuple[T
     return error.to(like), torch.as_tensor(sigma, dtype=like), torch.as_tensor(d, dtype=like)
 
 
-def _shown(value: Tensor, pull: Tensor, weight: Tensor, sigma: float, d: Tensor) -> dict[str, Tensor]:
-    """What a picture shows, all of about one size."""
+def _shown(value: Tensor, influence: Tensor, weight: Tensor, sigma: float, d: Tensor) -> dict[str, Tensor]:
+    """Curves by label, scaled to similar size."""
     bounded = sigma < math.inf
     return {
         "value / σ²" if bounded else "value": value / sigma**2 if bounded else value,
-        "pull · d": pull * d,
+        "influence · d": influence * d,
         "weight": weight,
     }

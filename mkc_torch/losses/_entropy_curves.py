@@ -1,4 +1,4 @@
-"""What the entropy of relative squares does with an error among others, whose number and sizes it depends on."""
+"""Curves of the entropy of relative squares over an error that is added to a batch."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ if TYPE_CHECKING:
 
 __all__ = ["EntropyCurves"]
 
-_REACH, _POINTS, _NORMAL = 6.0, 400, 200
-"""Of a picture: robust scales to each side; points, an even number, for at an error of 0 the weight is infinite; and
-errors of a normal batch."""
+_REACH = 6.0
+"""Half-width of a picture, in robust scales."""
+
+_POINTS = 400
+"""Points per curve of a picture: an even number, because the weight is infinite at an error of 0."""
+
+_NORMAL = 200
+"""Errors of the default normal batch."""
 
 
 class EntropyCurves(Curves):
-    """H has no curve of one error alone: it is that of an error which joins the errors of a batch."""
+    """Curves of H over an error that is added to a batch, because H depends on all errors together."""
 
     def rho(self, error: Float[Tensor, "*shape"], batch: Float[Tensor, "*others"]) -> Float[Tensor, "*shape"]:
-        """H of a batch of errors that one more error joins.
+        """H of a batch with an error added to it, for each error.
 
         Args:
-            error: that one, any shape.
-            batch: the others, not all 0; they are one population.
+            error: added errors, any shape.
+            batch: errors of the batch, a single population, not all 0.
 
         Raises:
-            TypeError, ValueError: no real tensors, no error in the batch that is not 0, or one that is not finite.
+            TypeError, ValueError: an argument that is not a real tensor; a batch of zeros, or not finite.
 
         Example:
             >>> from mkc_torch import LELoss
@@ -46,25 +51,25 @@ class EntropyCurves(Curves):
         return entropy / math.log(count)
 
     def influence(self, error: Float[Tensor, "*shape"], batch: Float[Tensor, "*others"]) -> Float[Tensor, "*shape"]:
-        """The derivative of :meth:`rho` by the error: of an error beyond the typical it points outwards."""
+        """Derivative of :meth:`rho` by the error; beyond the typical error it has the opposite sign of the error."""
         square, total, moment, count = _sums(error, batch)
         pull = moment * error.sign() * square.sqrt() - total * _times_log(error, square)
         return 2.0 * pull / ((total + square).square() * math.log(count)) / _unit(batch)
 
     def weight(self, error: Float[Tensor, "*shape"], batch: Float[Tensor, "*others"]) -> Float[Tensor, "*shape"]:
-        """The pull over the error: infinite at 0, negative where an error is pushed away."""
+        """Influence over the error: infinite at 0, negative where descent increases the error."""
         square, total, moment, count = _sums(error, batch)
         return 2.0 * (moment - total * square.log()) / ((total + square).square() * math.log(count)) / _unit(batch) ** 2
 
     def plot(self, batch: Float[Tensor, "*others"] | None = None, axes: Any = None) -> Any:
-        """Draw value, pull and weight of an error that joins a batch, and give the axes back; needs matplotlib.
+        """Draw value, influence and weight over an error added to a batch, and return the axes; needs matplotlib.
 
-        All are drawn times the number of errors and in units of the batch's robust scale; of the value, the change
-        from that with an error of 0.
+        All curves are multiplied by the number of errors and drawn in units of the batch's robust scale. The value is
+        drawn as its change from the value at an error of 0.
 
         Args:
             batch: errors; None takes 200 quantiles of a standard normal distribution.
-            axes: matplotlib's, or None for a new figure.
+            axes: axes of matplotlib, or None for a new figure.
 
         Raises:
             TypeError, ValueError: as :meth:`rho`, or more than half of the errors are 0.
@@ -79,21 +84,21 @@ class EntropyCurves(Curves):
             if not bool(scale > 0):
                 raise ValueError(
                     "Expected argument `batch` with a robust scale but got errors of which more than half are 0; give "
-                    "the errors of a batch, or none for normal ones."
+                    "the errors of a batch, or None for a normal batch."
                 )
             error = scale * torch.linspace(-_REACH, _REACH, _POINTS, dtype=scale.dtype, device=scale.device)
             count = others.numel() + 1
             curves = {
                 f"change of value · {count}": (self.rho(error, others) - self.rho(error.new_zeros(()), others)) * count,
-                f"pull · {count} s": self.influence(error, others) * count * scale,
+                f"influence · {count} s": self.influence(error, others) * count * scale,
                 f"weight · {count} s²": self.weight(error, others) * count * scale.square(),
             }
-            title = f"{type(self).__name__}: one error among {others.numel()} of robust scale s = {float(scale):.3g}"
+            title = f"{type(self).__name__}: an error among {others.numel()} of robust scale s = {float(scale):.3g}"
             return self._drawn(axes, error, curves, "error, in the unit of the target", title)
 
 
 def _unit(batch: Tensor) -> Tensor:
-    """Of a checked batch: its largest error, so that no square leaves the range."""
+    """Largest absolute error of a batch: the unit in which squares neither overflow nor underflow."""
     refuse_not_real("batch", batch)
     refuse_not_finite("batch", batch, "Leave them out")
     largest = batch.detach().abs().amax() if batch.numel() else torch.zeros(())
@@ -106,7 +111,7 @@ def _unit(batch: Tensor) -> Tensor:
 
 
 def _sums(error: Tensor, batch: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Of errors in units of the batch's largest: its square; of the others the sum of squares, and of r² log r²."""
+    """In units of the largest error of the batch: e², Σ r² and Σ r² log r² of the batch; and the total count."""
     refuse_no_tensor("error", error, "a real tensor")
     refuse_not_real("error", error)
     unit = _unit(batch)
@@ -117,5 +122,5 @@ def _sums(error: Tensor, batch: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
 
 
 def _times_log(error: Tensor, square: Tensor) -> Tensor:
-    """``e log e²`` in those units, 0 at 0."""
+    """``e log e²``, 0 at 0."""
     return error.sign() * torch.special.xlogy(square.sqrt(), square)

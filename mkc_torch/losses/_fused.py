@@ -1,8 +1,8 @@
-"""The reduced loss with its gradients made in the forward pass, in NumPy, torch or a kernel.
+"""The reduced loss, with gradients computed in the forward pass by NumPy or torch.
 
-A step by autograd on the formulas of :mod:`mkc_torch.losses._terms` keeps a dozen arrays of the size of the batch.
-Here the forward pass keeps one, the gradient by the input, and hands it out in the first backward pass. A second
-backward pass of one graph makes it anew; a second derivative goes through the formulas.
+Autograd on the formulas of :mod:`mkc_torch.losses._terms` keeps a dozen arrays of the size of the batch. This forward
+pass keeps a single array, the gradient by the input, and returns it in the first backward pass. A second backward pass
+of the same graph computes it again. Second derivatives use the formulas.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 __all__ = ["fused_loss"]
 
 SMALL_BATCH = 1 << 14
-"""Elements up to which NumPy, which costs less a call than torch, computes a batch on the CPU."""
+"""Elements up to which NumPy computes a batch on the CPU: its overhead per call is smaller than torch's."""
 
 LARGE_BATCH = 1 << 19
-"""Elements from which a batch on the CPU is worked through in pieces that stay in the cache."""
+"""Elements from which a batch on the CPU is processed in pieces that fit the cache."""
 
 SMALL_KAPPA = 0.05
-"""Below it the derivative by kappa is summed element by element: a difference of two sums would lose its digits."""
+"""Kappa below which its derivative is summed over elements: a difference of two sums would lose digits."""
 
 PIECE = 1 << 17
-"""Elements of a piece."""
+"""Elements per piece."""
 
 ROW = 256
-"""About how many channels, repeated, make a row of a piece: operations on short rows take twice as long."""
+"""Approximate length of a piece's rows, made of repeated channels: operations on short rows take twice as long."""
 
 
 class ReducedLoss(NamedTuple):
-    """Value and gradients of a reduced loss; a gradient that is not wanted is None."""
+    """Value and gradients of a reduced loss; None for gradients that are not needed."""
 
     value: Tensor
     by_input: Tensor | None
@@ -52,7 +52,7 @@ class ReducedLoss(NamedTuple):
 
 
 class ChannelSums(NamedTuple):
-    """Sums over the elements of each channel, (m,): both terms, and the derivatives of the density's energy."""
+    """Sums over the elements of each channel, (m,): both terms, and derivatives of the density's energy."""
 
     network: Any
     energy: Any
@@ -61,7 +61,7 @@ class ChannelSums(NamedTuple):
 
 
 def fused_loss(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> Tensor:
-    """The sum of the terms, reduced to a number, of plain tensors: no transforms, no gradient by the weight."""
+    """The reduced sum of the terms, (), for plain tensors: no function transforms, no gradient by the weight."""
     value: Tensor = _Fused.apply(batch.input, batch.target, raw_kappa, raw_d, batch, settings)  # type: ignore[no-untyped-call]
     return value
 
@@ -109,16 +109,16 @@ class _Fused(torch.autograd.Function):
 
 
 def _is_one(grad: Tensor) -> bool:
-    """Whether the upstream gradient is 1, where looking at it does not wait for an accelerator."""
+    """Whether the upstream gradient is known to be 1; only read on the CPU, where reading does not wait."""
     return type(grad) is Tensor and grad.device.type == "cpu" and not is_wrapped(grad) and grad.item() == 1.0
 
 
 def _by_formulas(ctx: Any, grad: Tensor) -> list[Tensor | None]:
-    """Gradients that are functions of the inputs, for a second derivative."""
+    """Differentiable gradients, for second derivatives."""
     input, target, raw_kappa, raw_d = ctx.saved_tensors
     value = loss_value(Batch(input, target, *ctx.rest), raw_kappa, raw_d, ctx.settings)
     given = (input, target, raw_kappa, raw_d)
-    wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
+    wanted = [entry for entry, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
     slopes = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
     return [next(slopes) if wants else None for wants in ctx.needs_input_grad[:4]]
 
@@ -129,7 +129,7 @@ def reduced_loss(
     """Value and gradients of the reduced loss in closed form."""
     dtype = batch.input.dtype
     raw = (raw_kappa, settings.fixed_kappa, raw_d, settings.fixed_d)
-    given = [one for one in (*raw, settings.state.bound) if one is not None]
+    given = [entry for entry in (*raw, settings.state.bound) if entry is not None]
     xp: Any = np if batch.input.shape[batch.axis] <= SMALL_STATE and numpy_may_read(*given) else torch
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         table = channel_table(
@@ -138,12 +138,12 @@ def reduced_loss(
             _array(xp, settings.fixed_kappa),
             _array(xp, raw_d),
             _array(xp, settings.fixed_d),
-            ChannelState(*(_array(xp, one) for one in settings.state)),
+            ChannelState(*(_array(xp, entry) for entry in settings.state)),
             follows=settings.follows,
             normalize=settings.normalize,
         )
         if xp is np and not (batch.input.numel() <= SMALL_BATCH and numpy_may_read(batch.input, batch.target)):
-            xp, table = torch, ChannelTable(*(None if one is None else torch.from_numpy(one) for one in table))
+            xp, table = torch, ChannelTable(*(None if entry is None else torch.from_numpy(entry) for entry in table))
         work = Elements(
             _array(xp, batch.input),
             _array(xp, batch.target),
@@ -171,7 +171,7 @@ def _tensor(xp: Any, values: Any, dtype: torch.dtype) -> Tensor:
 
 
 class Elements(NamedTuple):
-    """A batch as arrays of NumPy or torch; ``looks`` says whether a look at a value does not have to wait."""
+    """A batch as arrays of NumPy or torch; ``looks``: whether values can be read without waiting for a device."""
 
     input: Any
     target: Any
@@ -193,7 +193,7 @@ def _array(xp: Any, value: Tensor | None) -> Any:
 
 
 def _divisor(xp: Any, batch: Elements, settings: LossSettings) -> Any:
-    """What the sums are divided by: the weight of all elements for a mean, else 1."""
+    """Divisor of the sums: the total weight for a mean, else 1."""
     if settings.reduction == "sum":
         return 1.0
     if batch.weight is None:
@@ -203,7 +203,7 @@ def _divisor(xp: Any, batch: Elements, settings: LossSettings) -> Any:
 
 
 def _summed(xp: Any, values: Any, dims: tuple[int, ...] | None) -> Any:
-    """Sums over dimensions, None for all; in float64 by NumPy, which adds up row after row."""
+    """Sums over dimensions, None for all; NumPy sums in float64, because it adds row by row."""
     if dims == ():
         return values
     if xp is np:
@@ -225,9 +225,9 @@ def _at_once(
             return None
         return (values.astype(dtype) if xp is np else values.to(dtype)).reshape(shape)
 
-    shaped = ChannelTable(*(along(one) for one in table))
+    shaped = ChannelTable(*(along(value) for value in table))
     values, by_input = _element_values(xp, error, batch.weight, shaped, divisor, looks=batch.looks)
-    sums = ChannelSums(*(None if one is None else _summed(xp, one, batch.others) for one in values))
+    sums = ChannelSums(*(None if value is None else _summed(xp, value, batch.others) for value in values))
     if not wants_input:
         return sums, None
     return sums, torch.from_numpy(by_input) if xp is np else by_input
@@ -236,7 +236,7 @@ def _at_once(
 def _element_values(
     xp: Any, error: Any, weight: Any, table: ChannelTable, divisor: Any, *, looks: bool
 ) -> tuple[ChannelSums, Any]:
-    """What is to be summed of each element, and the gradient by the input; the table's numbers broadcast."""
+    """Summands of each element, and the gradient by the input; the table must broadcast with ``error``."""
     z = error / table.d
     learns_kappa, learns_d = table.kappa_by_raw is not None, table.d_by_raw is not None
     has_gaussian = not looks or bool((table.kappa == 0).any())
@@ -250,11 +250,12 @@ def _element_values(
     if weight is not None:
         by_input = by_input * weight
     values = (network, density.value, density.by_kappa, by_d)
-    return ChannelSums(*(None if one is None else one if weight is None else one * weight for one in values)), by_input
+    sums = (None if value is None else value if weight is None else value * weight for value in values)
+    return ChannelSums(*sums), by_input
 
 
 def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, looks: bool) -> tuple[Any, Any]:
-    """The term that moves the network, and its derivative by the error over the divisor."""
+    """The network term of each element, and its derivative by the error over the divisor."""
     share = table.share
     parts = []
     if not looks or bool((share > 0).any()):
@@ -269,51 +270,51 @@ def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, looks: b
 
 
 def _is_large(batch: Batch) -> bool:
-    """Whether this is a batch in the memory of the CPU, rows of channels, too large for the cache."""
-    given = [one for one in batch[:3] if one is not None]
+    """Whether the batch is on the CPU, contiguous with channels last, and too large for the cache."""
+    given = [value for value in batch[:3] if value is not None]
     return (
         numpy_may_read(*given)
         and batch.input.numel() >= LARGE_BATCH
         and batch.axis == batch.input.dim() - 1
-        and all(one.is_contiguous() for one in given)
+        and all(value.is_contiguous() for value in given)
     )
 
 
 def _in_pieces(
     batch: Elements, table: ChannelTable, divisor: Any, *, wants_input: bool
 ) -> tuple[ChannelSums, Tensor | None]:
-    """The sums and the gradient, piece by piece; the gradient is the only array of the size of the batch."""
+    """Sums and gradient computed piece by piece; the gradient is the only array of the size of the batch."""
     m = batch.input.shape[-1]
-    flat: list[Any] = [None if one is None else one.reshape(-1, m) for one in batch[:4]]
+    flat: list[Any] = [None if value is None else value.reshape(-1, m) for value in batch[:4]]
     rows, dtype = len(flat[0]), batch.input.dtype
     repeats = max(ROW // m, 1)
     by_input = torch.empty_like(flat[0]) if wants_input else None
     sums: list[Any] = [None] * 4
     whole = rows // repeats * repeats
     for r, start, end in ((repeats, 0, whole), (1, whole, rows)):
-        tiled = ChannelTable(*(None if one is None else one.to(dtype).repeat(r) for one in table))
+        tiled = ChannelTable(*(None if value is None else value.to(dtype).repeat(r) for value in table))
         size = max(PIECE // (r * m), 1) * r
         for first in range(start, end, size):
             last = min(first + size, end)
-            given: list[Any] = [None if one is None else one[first:last].view(-1, r * m) for one in flat]
+            given: list[Any] = [None if value is None else value[first:last].view(-1, r * m) for value in flat]
             error = given[0] - given[1]
             if given[3] is not None:
                 error = torch.where(given[3], error, 0.0)
             values, slope = _element_values(torch, error, given[2], tiled, divisor, looks=True)
             if by_input is not None:
                 by_input[first:last].view(-1, r * m).copy_(slope)
-            for i, one in enumerate(values):
-                if one is not None:
-                    added = one.sum(0).double().view(r, m).sum(0)
+            for i, value in enumerate(values):
+                if value is not None:
+                    added = value.sum(0).double().view(r, m).sum(0)
                     sums[i] = added if sums[i] is None else sums[i] + added
     return ChannelSums(*sums), None if by_input is None else by_input.view_as(batch.input)
 
 
 def _assembled(xp: Any, batch: Elements, sums: ChannelSums, table: ChannelTable, divisor: Any) -> tuple[Any, Any, Any]:
-    """Value and gradients by the raw parameters from the sums of each channel."""
+    """Value and gradients by the raw parameters, from the sums of each channel."""
     total = sums.energy if sums.network is None else sums.energy + sums.network
     by_kappa = sums.by_kappa
-    if by_kappa is None and table.kappa_by_raw is not None:  # the sum of z² exp(-x) / 2 less the energy, over kappa
+    if by_kappa is None and table.kappa_by_raw is not None:  # (sum of z² exp(-x) / 2 - energy) / kappa
         by_kappa = (-0.5 * sums.by_d - sums.energy) / table.kappa
     by_d = None if table.d_by_raw is None else sums.by_d / table.d
     if table.log_normalizer is not None:

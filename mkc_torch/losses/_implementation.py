@@ -1,4 +1,4 @@
-"""Which implementation computes a loss: torch's operations, its compiler, or Triton kernels."""
+"""Selection of the implementation of a loss: torch's operations, its compiler, or Triton kernels."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Implementation = Literal["auto", "eager", "compile", "triton"]
 
 
 def checked_implementation(impl: str) -> Implementation:
-    """``impl`` itself.
+    """Return ``impl`` after a check.
 
     Raises:
-        ValueError: there is no such implementation, or Triton is not installed.
+        ValueError: the implementation does not exist, or Triton is not installed.
     """
     if impl not in get_args(Implementation):
         known = ", ".join(map(repr, get_args(Implementation)))
@@ -33,12 +33,12 @@ def checked_implementation(impl: str) -> Implementation:
 
 @functools.cache
 def kernels_are_available() -> bool:
-    """Whether Triton can compile for a GPU of this process."""
+    """Whether Triton and a GPU are available."""
     return find_spec("triton") is not None and torch.cuda.is_available()
 
 
 def runs_kernels(loss: nn.Module, input: object) -> bool:
-    """Whether a batch goes through the kernels."""
+    """Whether the Triton kernels compute this batch."""
     impl = loss.impl
     if impl == "triton":
         return True

@@ -1,4 +1,4 @@
-"""The loss that a network begins with where nothing is known of its residuals: sharper than the absolute value."""
+"""The loss at the start of a training, when the residuals are unknown: sharper than the absolute value."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 __all__ = ["SHARPNESS", "initial_influence", "initial_loss"]
 
 SHARPNESS = 0.2
-"""Residual, in scales, at which the loss bends from a square to a root."""
+"""Residual, in scales, of the transition from a quadratic to a square-root loss."""
 
 
 def initial_loss(xp: Any, z: Any) -> Any:
-    """``2 c² ((1 + (z / c)²)^(1/4) - 1)``: z² / 2 near 0, and the root of the residual far away.
+    """``2 c² ((1 + (z / c)²)^(1/4) - 1)``: z² / 2 near 0, proportional to √|z| far away.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose array ``z`` is.
+        xp: ``numpy`` or ``torch``, the library of ``z``.
         z: residuals over their scale.
     """
     ratio = z / SHARPNESS
@@ -22,9 +22,9 @@ def initial_loss(xp: Any, z: Any) -> Any:
 
 
 def initial_influence(xp: Any, z: Any) -> tuple[Any, Any]:
-    """The first derivative of :func:`initial_loss`, and the second."""
+    """First and second derivative of :func:`initial_loss`."""
     ratio = z / SHARPNESS
     square = ratio * ratio
     root = xp.sqrt(1.0 + square)
-    bent = 1.0 / (root * xp.sqrt(root))
-    return z * bent, bent * (1.0 - 1.5 * square / (1.0 + square))
+    weight = 1.0 / (root * xp.sqrt(root))
+    return z * weight, weight * (1.0 - 1.5 * square / (1.0 + square))

@@ -1,4 +1,4 @@
-"""What a trained loss says of its training and of the noise: a check of what goes wrong, and the test of its tails."""
+"""Inspection of a loss: warnings about its training, and the test of its residuals' tails."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from mkc_torch.losses._checks import checked_weight, format_channels
 __all__ = ["tails_of", "what_goes_wrong"]
 
 NEAR_FLOOR = 2.0
-"""Times the floor below which a scale counts as collapsed."""
+"""Factor on the floor of d below which a scale is reported as collapsed."""
 
 MOST_BEYOND = 0.01
-"""Share of the errors beyond a given bound that is mentioned."""
+"""Share of errors beyond a given bound above which it is reported."""
 
 
 @torch.no_grad()
 def what_goes_wrong(
     loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None, optimizer: Optimizer | None
 ) -> tuple[str, ...]:
-    """Sentences for :meth:`mkc_torch.MKCLoss.check`."""
+    """Warnings of :meth:`mkc_torch.MKCLoss.check`."""
     found = []
     d, d_min, bound = loss.d.detach(), loss.d_min, loss.bound
     low = [int(k) for k in (d < NEAR_FLOOR * d_min).nonzero().flatten()] if loss.raw_d is not None else []
     if low:
         found.append(
-            f"The scale d of channel {_listed(low)} is {format_channels(d[low])}, next to its floor {format_channels(d_min[low])}. The "
-            "network may fit every point, noise included, and the likelihood grows without limit as d -> 0: watch a "
-            "validation set, regularise, or raise `d_min` to the precision of the targets."
+            f"The scale d of channel {_listed(low)} is {format_channels(d[low])}, close to its floor "
+            f"{format_channels(d_min[low])}. The network may fit every point, noise included; the likelihood grows "
+            "without limit as d -> 0. Watch a validation set, regularise, or raise `d_min` to the precision of the "
+            "targets."
         )
     if loss._bound_was_given and (input is not None or loss.residual_scale is not None):
         residual, share = _residuals(loss, input, target, weight)
@@ -41,9 +42,9 @@ def what_goes_wrong(
         if far:
             shares = ", ".join(f"{100.0 * float(beyond[k]):.2g} %" for k in far)
             found.append(
-                f"{shares} of the errors of channel {_listed(far)} lie beyond the bound {format_channels(bound[far])}: the "
-                "likelihood does not allow them. Give the largest possible error as `bound`, in the unit of the "
-                "targets, or leave `d` and `bound` out: they are then taken from the residuals."
+                f"{shares} of the errors of channel {_listed(far)} lie beyond the bound "
+                f"{format_channels(bound[far])}, where the density is 0. Pass the largest possible error as `bound`, "
+                "in the unit of the targets, or omit `d` and `bound` to take them from the residuals."
             )
     learned = [name for name in ("raw_kappa", "raw_d") if getattr(loss, name) is not None]
     if optimizer is not None and learned:
@@ -59,7 +60,7 @@ def what_goes_wrong(
 
 
 def tails_of(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> Tails:
-    """The test for :meth:`mkc_torch.MKCLoss.tails`."""
+    """Test of :meth:`mkc_torch.MKCLoss.tails`."""
     residual, share = _residuals(loss, input, target, weight)
     if not bool((share.sum(0) > 0).all()):
         raise ValueError(
@@ -70,18 +71,18 @@ def tails_of(loss: Any, input: Tensor | None, target: Tensor | None, weight: Ten
 
 
 def _residuals(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Residuals and weights (N, m), of what was given or of the most recent batches."""
+    """Residuals and weights, (N, m) each, of the given batch or of the most recent batches."""
     if input is None or target is None:
         if loss.residual_scale is None:
             raise ValueError(
                 "Expected arguments `input` and `target` but got None: a loss with a given `d` keeps no residuals; "
-                "pass predictions and targets, of a validation set say."
+                "pass predictions and targets, for example of a validation set."
             )
         recent = loss.residual_scale.recent
         return recent[0].T, recent[2].T
     batch = loss._batch(input.detach(), target.detach(), weight)
     shares = torch.ones_like(batch.input) if weight is None else checked_weight(weight, batch.input, batch.axis)[0]
-    rows = (one.movedim(batch.axis, -1).reshape(-1, loss.num_channels) for one in (batch.error(), shares))
+    rows = (value.movedim(batch.axis, -1).reshape(-1, loss.num_channels) for value in (batch.error(), shares))
     residual, share = rows
     return residual, share
 

@@ -1,4 +1,4 @@
-"""What generalized cross-entropy does with a label, over the probability that the network gives it."""
+"""Curves of generalized cross-entropy over the predicted probability of the label."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ if TYPE_CHECKING:
 __all__ = ["LabelCurves"]
 
 _POINTS = 401
+"""Points per curve of a picture."""
 
 
 class LabelCurves(Curves):
-    """Of a loss with one ``kappa`` = 1/σ²."""
+    """Curves of a loss with a scalar ``kappa`` = 1/σ²."""
 
     kappa: Tensor
 
     def rho(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """The loss of a label that the network gives this probability: ``σ² (1 - p^(1/σ²))``.
+        """Loss of a label with predicted probability p: ``σ² (1 - p^(1/σ²))``.
 
         Args:
-            probability: p in [0, 1] of the label, any shape.
+            probability: predicted probability p in [0, 1] of the label, any shape.
 
         Raises:
-            TypeError, ValueError: no real tensor, or out of range.
+            TypeError, ValueError: not a real tensor, or out of range.
 
         Example:
             >>> from mkc_torch import GeneralizedCrossEntropyLoss
@@ -43,14 +44,14 @@ class LabelCurves(Curves):
         return torch.where(kappa > 0, -torch.expm1(-own * deviance) / own, deviance)
 
     def influence(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """The derivative of :meth:`rho` by the probability, ``-p^(1/σ² - 1)``: -∞ at p = 0 where σ > 1."""
+        """Derivative of :meth:`rho` by the probability, ``-p^(1/σ² - 1)``: -∞ at p = 0 where σ > 1."""
         p, kappa = self._given(probability)
         return -p.pow(kappa - 1.0)
 
     def weight_at(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """The pull on a label beside that of cross-entropy, ``p^(1/σ²)``, in [0, 1].
+        """Influence of a label relative to that of cross-entropy, ``p^(1/σ²)`` in [0, 1].
 
-        ``weight`` holds the weights of the classes, as in torch; ``inlier_weight`` is this of logits and labels.
+        The attribute ``weight`` holds the class weights, as in torch; ``inlier_weight`` takes logits and labels.
 
         Example:
             >>> from mkc_torch import GeneralizedCrossEntropyLoss
@@ -61,24 +62,24 @@ class LabelCurves(Curves):
         return p.pow(kappa)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw value, pull and weight over the probability of the label, and give the axes back; needs matplotlib.
+        """Draw value, influence and weight over the probability of the label, and return the axes; needs matplotlib.
 
-        The pull is that on the label's logit, ``p^(1/σ²) (1 - p)``; cross-entropy's, ``1 - p``, stands beside it.
+        The influence is that on the label's logit, ``p^(1/σ²) (1 - p)``; cross-entropy's, ``1 - p``, is drawn too.
 
         Args:
-            axes: matplotlib's, or None for a new figure.
+            axes: axes of matplotlib, or None for a new figure.
 
         Raises:
             ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
         """
         with torch.no_grad():
             p = torch.linspace(0.0, 1.0, _POINTS, dtype=torch.float64, device=self.kappa.device)
-            # cross-entropy's value has no end at 0
+            # cross-entropy's value is infinite at 0
             value = self.rho(p) if bool(self.kappa > 0) else self.rho(p.clamp(min=1.0 / _POINTS))
             curves = {
                 "value": value,
-                "pull on the logit": self.weight_at(p) * (1.0 - p),
-                "pull of cross-entropy": 1.0 - p,
+                "influence on the logit": self.weight_at(p) * (1.0 - p),
+                "influence of cross-entropy": 1.0 - p,
                 "weight": self.weight_at(p),
             }
             title = f"{type(self).__name__}: σ = {float(self.kappa) ** -0.5 if self.kappa > 0 else torch.inf:.3g}"

@@ -1,4 +1,4 @@
-"""From the raw parameters of a loss and its running state to the numbers of each channel, with their derivatives."""
+"""Numbers of each channel and their derivatives, from a loss's raw parameters and running state."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 __all__ = ["ChannelState", "ChannelTable", "annealed_kappa", "channel_table", "logistic", "scale_ratio", "to_d"]
 
 _LEAST_LOGIT = -80.0
-"""Below it the exponential leaves float32, and the logistic function is less than 1e-34."""
+"""Lower limit of the logistic function's argument: below it exp overflows float32, and the value is below 1e-34."""
 
 
 class ChannelState(NamedTuple):
-    """What one forward pass takes from the buffers, (m,) each; no gradient reaches it.
+    """Values of the buffers in a forward pass, (m,) each; they have no gradient.
 
-    ``scale`` is None where d is given and the objective is the likelihood; ``log_bandwidth`` and ``share`` are None
-    where the network learns by the likelihood.
+    ``scale`` is None if d is given and the objective is the likelihood; ``log_bandwidth`` and ``share`` are None
+    if the likelihood trains the network.
     """
 
     bound: Any
@@ -40,7 +40,7 @@ class ChannelState(NamedTuple):
 
 
 class ChannelTable(NamedTuple):
-    """Numbers of each channel that the sums over elements need, (m,) each; None where they are not needed."""
+    """Numbers of each channel for the sums over elements, (m,) each; None if not needed."""
 
     kappa: Any
     d: Any
@@ -56,10 +56,10 @@ class ChannelTable(NamedTuple):
 
 
 def logistic(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """``1 / (1 + exp(-raw))`` with all digits of what is near 0.
+    """``1 / (1 + exp(-raw))``, accurate near 0.
 
-    A large σ is made of a tiny value of it, and so is a d that is small relative to its bound. torch has all their
-    digits; runtimes of exported models have seven behind the point alone, so that in exported code it is written out.
+    A large σ, and a d small relative to its bound, correspond to tiny values. ``sigmoid`` is accurate there in torch,
+    but runtimes of exported models compute it to seven decimals only. Exported code therefore uses the formula.
 
     Example:
         >>> logistic(torch.tensor([0.0, -20.0]))
@@ -71,12 +71,12 @@ def logistic(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def scale_ratio(xp: Any, raw: Any) -> Any:
-    """d over the scale of the residuals, within a factor of e²."""
+    """Ratio of d to the scale of the residuals, in (e⁻², e²)."""
     return xp.exp(2.0 * xp.tanh(0.5 * raw))
 
 
 def to_d(raw: Tensor | None, state: ChannelState, *, follows: bool) -> Float[Tensor, " m"]:
-    """d of a raw parameter, differentiable; where d follows the residuals, None stands for the scale itself."""
+    """d as a differentiable function of its raw parameter; if d follows the residuals, None gives the scale itself."""
     if not follows:
         assert raw is not None
         return state.floor + (state.bound - state.floor) * logistic(raw)
@@ -85,9 +85,9 @@ def to_d(raw: Tensor | None, state: ChannelState, *, follows: bool) -> Float[Ten
 
 
 def annealed_kappa(xp: Any, kappa: Any, d: Any, state: ChannelState, *, follows: bool) -> Any:
-    """1/σ² of the annealed loss: that of the selected bandwidth, or the likelihood's where that is no wider.
+    """1/σ² of the annealed loss: from the selected bandwidth, or the likelihood's 1/σ² if its bandwidth is no wider.
 
-    Where d follows the residuals the annealed loss has the scale for its d, else the likelihood's d.
+    The annealed loss's d is the scale if d follows the residuals, else the likelihood's d.
     """
     if follows:
         return xp.exp(-2.0 * state.log_bandwidth)
@@ -107,25 +107,24 @@ def channel_table(
     follows: bool,
     normalize: bool,
 ) -> ChannelTable:
-    """All numbers of each channel, in float64 where ``xp`` is NumPy.
+    """All numbers of each channel, in float64 if ``xp`` is NumPy.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are.
+        xp: ``numpy`` or ``torch``, the library of the other arrays.
         raw_kappa, fixed_kappa: raw parameter of 1/σ², or None and 1/σ² itself.
-        raw_d, fixed_d: raw parameter of d, or None and d itself; both None where d is the scale.
-        state: buffers.
+        raw_d, fixed_d: raw parameter of d, or None and d itself; both None if d is the scale.
+        state: values of the buffers.
         follows: whether d follows the residuals.
         normalize: whether the log-normaliser is needed.
     """
+    given = (raw_kappa, fixed_kappa, raw_d, fixed_d)
     if xp is np:
-        wide = [None if one is None else one.astype(np.float64) for one in (raw_kappa, fixed_kappa, raw_d, fixed_d)]
-        state = ChannelState(*(None if one is None else one.astype(np.float64) for one in state))
+        wide = [None if value is None else value.astype(np.float64) for value in given]
+        state = ChannelState(*(None if value is None else value.astype(np.float64) for value in state))
     else:
-        dtype = as_computed(*(one for one in (raw_kappa, fixed_kappa, raw_d, fixed_d, *state) if one is not None))[
-            0
-        ].dtype
-        wide = [None if one is None else one.to(dtype) for one in (raw_kappa, fixed_kappa, raw_d, fixed_d)]
-        state = ChannelState(*(None if one is None else one.to(dtype) for one in state))
+        dtype = as_computed(*(value for value in (*given, *state) if value is not None))[0].dtype
+        wide = [None if value is None else value.to(dtype) for value in given]
+        state = ChannelState(*(None if value is None else value.to(dtype) for value in state))
     raw_kappa, fixed_kappa, raw_d, fixed_d = wide
     kappa, kappa_by_raw = fixed_kappa, None
     if raw_kappa is not None:

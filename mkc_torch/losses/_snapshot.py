@@ -1,4 +1,4 @@
-"""Copies of the running state that compiled code may use in its backward pass."""
+"""Copies of the running state for the backward pass of compiled code."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ __all__ = ["snapshot"]
 
 @torch.library.custom_op("mkc_torch::snapshot", mutates_args=())
 def snapshot(values: Sequence[Tensor]) -> list[Tensor]:
-    """Copies that are kept for the backward pass.
+    """Copies that the compiler keeps for the backward pass.
 
-    torch's compiler computes cheap values in the backward pass again rather than keep them, also from buffers that the
-    forward pass has changed since (pytorch#197039): the gradients would be wrong, silently. It does not compute the
-    result of an operator of a library again.
+    torch's compiler recomputes cheap values in the backward pass instead of keeping them, even from buffers that the
+    forward pass has changed (pytorch#197039): the gradients would be wrong without a warning. It does not recompute the
+    results of library operators.
     """
     return [value.clone() for value in values]
 

@@ -1,4 +1,4 @@
-"""A state_dict of a loss that learns read by one that does not, and the other way round."""
+"""Conversion of a state_dict between losses that learn σ and d and losses that do not."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["logit_of_kappa", "logit_of_scale", "translate"]
 
 
 def logit_of_kappa(kappa: Tensor) -> Tensor:
-    # a hair inside the range, where the gradient is not 0
+    # slightly inside the range, where the gradient is not 0
     return torch.logit((kappa.double() / KAPPA_MAX).clamp(max=1.0 - 1e-6)).to(kappa)
 
 
@@ -27,13 +27,14 @@ def logit_of_scale(d: Tensor, low: Tensor, high: Tensor) -> Tensor:
 def translate(
     state: MutableMapping[str, Any], prefix: str, *, learns_kappa: bool, learns_d: bool, follows: bool, robust: bool
 ) -> None:
-    """Change what is stored into what a loss has: σ and d as they are, learned or fixed, in place.
+    """Convert a stored state in place: the same σ and d, learned or fixed as in the loss that loads it.
 
     Args:
-        state: what is loaded.
-        prefix: of the names of the loss.
-        learns_kappa, learns_d, follows: as the loss does that it is loaded into.
-        robust: whether that loss has a running scale and a schedule.
+        state: the state_dict to load.
+        prefix: prefix of the loss's names.
+        learns_kappa, learns_d: whether the loading loss learns σ and d.
+        follows: whether its d follows the residuals.
+        robust: whether it has a running scale and a schedule.
     """
 
     def stored(name: str) -> Tensor | None:
@@ -48,12 +49,13 @@ def translate(
     if follows:
         return
     if stored("residual_scale.log_scale") is not None:
-        # a loss of a given d has both, and the numbers of a loss that follows are those of its scale
+        # a loss with a given d stores both; a loss whose d follows the residuals takes them from its scale
         given = stored("fixed_bound") is not None and stored("fixed_d_min") is not None
         if stored("fixed_d") is None and not given:
             _freeze(state, prefix)
         if not robust:
-            for name in [one for one in state if one.startswith((f"{prefix}residual_scale.", f"{prefix}schedule."))]:
+            running = (f"{prefix}residual_scale.", f"{prefix}schedule.")
+            for name in [entry for entry in state if entry.startswith(running)]:
                 del state[name]
     raw, fixed, bound, floor = (stored(name) for name in ("raw_d", "fixed_d", "fixed_bound", "fixed_d_min"))
     if bound is None or floor is None:
@@ -65,7 +67,7 @@ def translate(
 
 
 def _freeze(state: MutableMapping[str, Any], prefix: str) -> None:
-    """Add the numbers that a running scale stands for, in place."""
+    """Add bound, floor and d that a running scale implies, in place."""
     like = state[prefix + "residual_scale.log_scale"]
     scale = ResidualScale(len(like)).to(like)
     scale.load_state_dict({name: state[f"{prefix}residual_scale.{name}"] for name in scale.state_dict()})

@@ -1,7 +1,7 @@
-"""The terms of the loss in differentiable torch operations: the reference of every faster implementation.
+"""The terms of the loss in differentiable torch operations: the reference for every faster implementation.
 
-In training a robust loss is the sum of two terms. ``network`` moves the network and reaches no parameter of the
-density; ``density`` is the negative log-likelihood at detached residuals and moves σ and d. The likelihood is one term.
+In training a robust loss is the sum of two terms. ``network`` trains the network and has no gradient by σ and d.
+``density`` is the negative log-likelihood at detached residuals and trains σ and d. The likelihood is a single term.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["Batch", "LossSettings", "LossTerms", "loss_terms", "loss_value"]
 
 
 class Batch(NamedTuple):
-    """A checked batch in the dtype of the computation; ``weight`` and ``counts`` have the shape of the input."""
+    """A checked batch in the dtype of the computation; ``weight`` and the mask ``counts`` have the input's shape."""
 
     input: Float[Tensor, "*shape"]
     target: Float[Tensor, "*shape"]
@@ -34,14 +34,14 @@ class Batch(NamedTuple):
     axis: int
 
     def error(self) -> Float[Tensor, "*shape"]:
-        """Input less target, 0 where an element does not count."""
+        """Input - target, 0 where masked."""
         error = self.input - self.target
         return error if self.counts is None else torch.where(self.counts, error, 0.0)
 
 
 @dataclass(frozen=True)
 class LossSettings:
-    """The fixed numbers, the state and the options that a loss is computed with."""
+    """Fixed numbers, state and options of a loss."""
 
     fixed_kappa: Tensor | None
     fixed_d: Tensor | None
@@ -52,20 +52,20 @@ class LossSettings:
 
 
 class LossTerms(NamedTuple):
-    """The two terms whose sum a robust loss is in training; ``network`` is 0 where the likelihood is the objective."""
+    """The two terms of a robust loss in training; ``network`` is 0 if the likelihood is the objective."""
 
     network: Tensor
     density: Tensor
 
 
 def loss_terms(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> LossTerms:
-    """Both terms, reduced, differentiable to any order, under forward mode, ``vmap`` and ``torch.compile``."""
+    """Both reduced terms; differentiable to any order, and under forward mode, ``vmap`` and ``torch.compile``."""
     state, dtype = settings.state, batch.input.dtype
     kappa = settings.fixed_kappa if raw_kappa is None else KAPPA_MAX * logistic(raw_kappa)
     d = to_d(raw_d, state, follows=settings.follows) if settings.fixed_d is None else settings.fixed_d
     assert kappa is not None
     kappa, d = kappa.to(dtype), d.to(dtype)
-    state = ChannelState(*(None if one is None else one.to(dtype) for one in state))
+    state = ChannelState(*(None if value is None else value.to(dtype) for value in state))
     shape = [-1 if i == batch.axis else 1 for i in range(batch.input.dim())]
 
     def along(values: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
-"""The schedule of the loss by which a network learns: from a sharp initial loss to Welsch's of a selected bandwidth.
+"""Schedule of the training loss: from a sharp initial loss to Welsch's loss at a selected bandwidth.
 
-The likelihood of σ and d describes the noise. It does not say by which bandwidth a network gets there: with half of the
-targets wrong a wide Gaussian is as likely as a narrow head, and a network that least squares has pulled away stays
-there. So the network begins with a loss sharper than the absolute value, and is annealed to Welsch's of the bandwidth
-that the recent residuals and predictions support, as long as they do.
+The likelihood of σ and d describes the noise. It does not determine the bandwidth at which a network should train: with
+half of the targets wrong, a wide Gaussian is as likely as a narrow head, and a network that least squares has biased
+stays biased. So the network starts with a loss sharper than the absolute value. It is annealed to Welsch's loss at the
+bandwidth that the recent residuals and predictions support, and back if they no longer support it.
 """
 
 from __future__ import annotations
@@ -26,32 +26,33 @@ if TYPE_CHECKING:
 __all__ = ["BandwidthSchedule"]
 
 WARMUP_STEPS = 100
-"""Batches for which the initial loss is used alone."""
+"""Batches in which the initial loss is used alone."""
 
 ANNEAL_STEP = 0.005
-"""Change of the share of the annealed loss with each batch after the warm-up."""
+"""Change of the annealed loss's share per batch after the warm-up."""
 
 SELECTION_INTERVAL = 4
-"""Batches between two selections of the bandwidth: a selection costs more than a small batch."""
+"""Batches per selection of the bandwidth: a selection costs more than a small batch."""
 
 UNLIMITED = 32.0
-"""Bandwidth in scales from which it does not limit a likelihood: half the widest candidate."""
+"""Bandwidth, in scales, from which it does not limit the likelihood's: half the widest candidate."""
 
 
 class BandwidthSchedule(nn.Module):
-    """From the initial loss to Welsch's of the selected bandwidth, for each channel; all state in buffers.
+    """Annealing of each channel from the initial loss to Welsch's loss at the selected bandwidth; all state in buffers.
 
     In the first ``warmup_steps`` batches the initial loss is used alone. At every fourth batch the bandwidth is
-    selected by the estimated risk of the predictions; the share of the annealed loss grows where its risk is smaller
-    than that of the initial loss, and falls where it is larger.
+    selected by the estimated risk of the predictions. The share of the annealed loss grows while its risk is smaller
+    than that of the initial loss, and falls while it is larger.
 
     Args:
         num_channels: m.
-        warmup_steps: batches for which the initial loss is used alone.
-        anneal_step: change of the share with each later batch.
+        warmup_steps: batches in which the initial loss is used alone.
+        anneal_step: change of the share per later batch.
 
     Attributes:
-        steps: how many batches were seen; equal for all channels, (m,), because a kernel has one program a channel.
+        steps: number of batches, (m,); equal for all channels, stored per channel because a kernel has one program per
+            channel.
         log_bandwidth: logarithm of the selected bandwidth in scales, a running mean, (m,).
         share: share of the annealed loss in [0, 1], (m,).
 
@@ -84,18 +85,18 @@ class BandwidthSchedule(nn.Module):
         return self.log_bandwidth.exp()
 
     def energy(self, z: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """The loss by which a network learns, of residuals over their scale, the channels last."""
+        """The training loss of each residual over its scale, (*, m)."""
         share = self.share.to(z.dtype)
         kappa = torch.exp(-2.0 * self.log_bandwidth).to(z.dtype)
         return share * energy(z, kappa) + (1.0 - share) * initial_loss(torch, z)
 
     @torch.no_grad()
     def update(self, residual_scale: ResidualScale) -> None:
-        """Take a batch into the schedule that ``residual_scale`` has been updated with."""
+        """Update the schedule by the batch that ``residual_scale`` has just been updated with."""
         state = ScheduleState(self.steps, self.log_bandwidth, self.share)
         recent, log_scale = residual_scale.recent, residual_scale.log_scale
         on_cpu = self.share.device.type == "cpu" and not torch.compiler.is_compiling()
-        if on_cpu and self.steps[0].item() % SELECTION_INTERVAL:  # elsewhere a look would wait
+        if on_cpu and self.steps[0].item() % SELECTION_INTERVAL:  # reading a value would wait for another device
             self.steps += 1
             return
         if len(self.share) <= SMALL_STATE and numpy_may_read(self.share, recent):
@@ -110,14 +111,14 @@ class BandwidthSchedule(nn.Module):
             old.copy_(value)
 
     def _next(self, xp: Any, old: ScheduleState, recent: Any, log_scale: Any) -> ScheduleState:
-        """The state after a batch; ``xp`` is ``numpy`` or ``torch``, whose arrays the others are."""
+        """The state after a batch; ``xp`` is ``numpy`` or ``torch``, the library of the other arrays."""
         residual, prediction, weight = recent[0], recent[1], recent[2]
         selected = select_bandwidth(xp, residual / xp.exp(log_scale)[..., None], prediction, weight)
         steps = old.steps.astype(old.share.dtype) if xp is np else old.steps.to(old.share.dtype)
         least_rate = 1.0 - (1.0 - RATE) ** SELECTION_INTERVAL
         rate = at_most(xp, at_least(xp, SELECTION_INTERVAL / (steps + 1.0), least_rate), 1.0)
-        one = xp.ones_like(old.share)
-        step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, one, -one)
+        up = xp.ones_like(old.share)
+        step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, up, -up)
         annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
         due = old.steps % SELECTION_INTERVAL == 0
         log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)

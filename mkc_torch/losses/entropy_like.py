@@ -1,4 +1,4 @@
-"""The entropy of relative squared residuals: small where most residuals are small beside a few large ones.
+"""The entropy of relative squared residuals: small if most residuals are small and a few are large.
 
 H is (40)-(42) of G. Indiveri, "An Entropy-Like Estimator for Robust Parameter Identification", Entropy 11 (2009)
 560-585::
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["EntropyLikeMinima", "LELoss", "entropy_like", "least_entropy_like", "orthogonal_starts"]
 
 LEAST_TOTAL = 1.001
-"""Total weight that several residuals must exceed: log N divides, and weights that are meant to total 1 round."""
+"""Total weight of several residuals, at least: log N is a divisor, and weights normalised to 1 are refused."""
 
 
 def entropy_like(
@@ -50,28 +50,28 @@ def entropy_like(
     dim: int | tuple[int, ...] | None = None,
     weight: Float[Tensor, "*#shape"] | Bool[Tensor, "*#shape"] | None = None,
 ) -> Tensor:
-    """H of residuals, (42): 0 where one residual alone differs from 0, 1 where all have one magnitude.
+    """H of residuals, (42): 0 if a single residual differs from 0, 1 if all have the same magnitude.
 
-    H does not change with the scale of the residuals. It is 0, with gradient 0, where there is only one residual and
-    where all of them are 0, or smaller than the smallest normal number. Value and gradient are continuous elsewhere,
-    zero residuals included; the second derivative grows like ``-log r²`` as one residual r goes to 0, and at 0 itself
-    it is taken with the smallest normal number for ``q``. Half and bfloat16 are computed in float32.
+    H does not depend on the scale of the residuals. H and its gradient are 0 for a single residual, and if all
+    residuals are 0 or smaller than the smallest normal number. Elsewhere value and gradient are continuous, zero
+    residuals included. The second derivative grows like ``-log r²`` as a residual r goes to 0; at 0 it is computed with
+    the smallest normal number for ``q``. Half and bfloat16 are computed in float32.
 
     Args:
         residual: any shape.
-        dim: dimensions of one population of residuals; None takes them all.
-        weight: how often each residual counts, or a mask; broadcast against the residuals. Whatever a residual of
-            weight 0 holds has no influence. N is the total weight.
+        dim: dimensions of one population of residuals; None means all dimensions.
+        weight: number of repetitions of each residual, or a mask; broadcast against the residuals. A residual of weight
+            0 is ignored, NaN included. N is the total weight.
 
     Returns:
-        H, in [0, 1] for weights that are counts, of the dimensions that are left.
+        H with the dimensions ``dim`` removed; in [0, 1] if the weights are counts.
 
     Raises:
-        TypeError: complex residuals, or what is no tensor.
-        ValueError: no residuals, residuals that count and are not finite, a dimension that they have not, weights that
-            are negative or not finite or do not broadcast, or weights of several residuals that total at most 1, for
-            which log N is not positive. On an accelerator, under vmap and in compiled code values go unseen: there H is
-            0 for such weights, and NaN for NaN.
+        TypeError: complex residuals, or an argument that is not a tensor.
+        ValueError: no residuals; unmasked residuals that are not finite; a dimension that does not exist; weights that
+            are negative, not finite, or do not broadcast; weights of several residuals that total at most 1, so that
+            log N is not positive. Values are not checked on an accelerator, under vmap and in compiled code: there H is
+            0 for such weights, and NaN for a NaN.
 
     References:
         G. Indiveri, Entropy 11 (2009), (40)-(45).
@@ -96,13 +96,13 @@ def _entropy(
     dim: int | tuple[int, ...] | None,
     weight: Float[Tensor, "*#shape"] | Bool[Tensor, "*#shape"] | None,
 ) -> Tensor:
-    """H of residuals that are 0 where they do not count."""
+    """H of residuals that are 0 where they are masked."""
     if residual.numel() == 0:
         raise ValueError(f"Expected at least one residual but got shape {tuple(residual.shape)}.")
     dims = _dimensions(residual, dim)
     count: Tensor | float
     if weight is None and torch.compiler.is_compiling():
-        # a number would fix the size of the batch
+        # a Python number would fix the batch size of the compiled code
         count = torch.ones_like(residual).sum(dims)
     elif weight is None:
         count = float(math.prod([residual.shape[d] for d in dims]))
@@ -112,9 +112,9 @@ def _entropy(
         weight = weight.to(residual.dtype)
         count = weight.expand(residual.shape).sum(dims)
     tiny = torch.finfo(residual.dtype).tiny
-    # H does not depend on the unit, so that the unit needs no gradient
+    # H does not depend on the unit, so the unit needs no gradient
     unit = residual.detach().abs().amax(dims, keepdim=True)
-    # below it the gradient, which grows as residuals shrink, would overflow
+    # the gradient grows as residuals shrink, and would overflow below this limit
     unit = torch.where(unit >= tiny, unit, torch.inf)
     square = (residual / unit).square()
     total = (square if weight is None else weight * square).sum(dims, keepdim=True)
@@ -131,7 +131,8 @@ def _refuse_no_dimension(dim: object) -> None:
     dims = dim if isinstance(dim, (tuple, list)) else () if dim is None else (dim,)
     if not all(isinstance(d, int) for d in dims):
         raise TypeError(
-            f"Expected argument `dim` to be a dimension, several, or None but got {format_value(dim)}; 0 is that of samples."
+            f"Expected argument `dim` to be a dimension, several, or None but got {format_value(dim)}; "
+            "0 is the dimension of the samples."
         )
 
 
@@ -158,15 +159,15 @@ def _refuse_other_weight(weight: Tensor, shape: torch.Size) -> None:
     refuse_bad_weight(weight)
     pairs = zip(reversed(weight.shape), reversed(shape), strict=False)
     if weight.dim() > len(shape) or any(a not in (1, b) for a, b in pairs):
-        mend = "; give one weight a sample all dimensions, unsqueeze(-1)" if weight.dim() < len(shape) else ""
+        fix = "; add the missing dimensions, weight.unsqueeze(-1)" if weight.dim() < len(shape) else ""
         raise ValueError(
             f"Expected argument `weight` to broadcast to the residuals {tuple(shape)} but got {tuple(weight.shape)}"
-            f"{mend}."
+            f"{fix}."
         )
 
 
 def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> None:
-    """Refuse weights that total at most 1, where looking does not have to wait for an accelerator."""
+    """Raise ValueError for weights that total at most 1; checked on the CPU only, where no read waits."""
     if weight.dtype == torch.bool or weight.device.type != "cpu":
         return
     with torch.no_grad():
@@ -174,7 +175,7 @@ def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> 
         total, used = w.sum(dims), (w != 0).sum(dims)
         try:
             bad = bool(((used > 1) & ~(total > LEAST_TOTAL)).any())
-        except RuntimeError:  # under vmap there is no one value
+        except RuntimeError:  # under vmap values cannot be read
             return
     if bad:
         raise ValueError(
@@ -184,19 +185,19 @@ def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> 
 
 
 class LELoss(EntropyCurves, nn.Module):
-    """H of the errors of a batch, (40)-(42) of Indiveri (2009): least where few errors are large and most are small.
+    """H of the errors of a batch, (40)-(42) of Indiveri (2009): smallest if few errors are large and most are small.
 
-    It knows no scale, so a network that is trained on it alone is determined up to what leaves the relative errors as
-    they are, and it has local minima: begin from a fit by another loss. Use batches of many samples, since H
-    describes their errors together.
+    H does not depend on the scale of the errors: it cannot distinguish networks with the same relative errors. It has
+    local minima: start from a network trained with another loss. Use large batches, because H describes all errors of
+    a batch together.
 
     Args:
-        dim: dimensions of one population of errors; None takes all elements. With channels in different units let it
-            be the other dimensions: ``dim=0`` for (N, m).
-        reduction: of what is left, "mean", "sum" or "none".
+        dim: dimensions of one population of errors; None means all elements. If channels have different units, pass
+            the other dimensions: ``dim=0`` for (N, m).
+        reduction: reduction over the populations: "mean", "sum" or "none".
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of another type, or out of range.
 
     References:
         G. Indiveri, Entropy 11 (2009), (40)-(45).
@@ -207,7 +208,7 @@ class LELoss(EntropyCurves, nn.Module):
         >>> target = torch.cat([torch.full((45,), 0.1), torch.full((5,), 10.0)])
         >>> value = loss(output, target)
         >>> value.backward()
-        >>> round(value.item(), 3), bool(output.grad[0] < 0 < output.grad[-1])  # outliers are pushed away
+        >>> round(value.item(), 3), bool(output.grad[0] < 0 < output.grad[-1])  # descent moves outliers further away
         (0.414, True)
     """
 
@@ -234,12 +235,12 @@ class LELoss(EntropyCurves, nn.Module):
             weight: counts or a mask, broadcast against the input, as in :func:`entropy_like`.
 
         Returns:
-            A scalar, or for reduction "none" H of each population; float32 at least.
+            A scalar, or with reduction "none" H of each population; float32 at least.
 
         Raises:
-            TypeError: integer or complex input or target, or what is no tensor.
-            ValueError: shapes differ or are empty, weights are negative or not finite or total at most 1, or an input
-                or a target that counts is not finite; :func:`entropy_like` says where values go unseen.
+            TypeError: integer or complex input or target, or an argument that is not a tensor.
+            ValueError: shapes that differ or are empty; weights that are negative, not finite, or total at most 1; an
+                unmasked input or target that is not finite. See :func:`entropy_like` for where values are checked.
         """
         refuse_other_shapes(input, target)
         input, target = as_computed(input, target)
@@ -259,9 +260,9 @@ class LELoss(EntropyCurves, nn.Module):
 
 
 def orthogonal_starts(theta: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p p"]:
-    """``theta`` and p - 1 vectors of its length, all orthogonal to each other, as rows: (50)-(51) of Indiveri (2009).
+    """``theta`` and p - 1 vectors of the same length, orthogonal to each other, as rows: (50)-(51) of Indiveri (2009).
 
-    By Gram and Schmidt's process on ``theta`` and the axes in their order, less the axis nearest to ``theta``.
+    Computed by the Gram-Schmidt process on ``theta`` and the axes in order, without the axis nearest to ``theta``.
 
     Example:
         >>> orthogonal_starts(torch.tensor([3.0, 4.0]))
@@ -287,10 +288,10 @@ class EntropyLikeMinima:
 
     Attributes:
         starts: (S, p).
-        theta: where the descent from each start came to rest, (S, p).
+        theta: end of the descent from each start, (S, p).
         entropy: H there, (S,).
-        converged: whether that is a local minimum, (S,).
-        n_iter: steps tried, (S,).
+        converged: whether ``theta`` is a local minimum, (S,).
+        n_iter: number of steps tried, (S,).
     """
 
     starts: Float[Tensor, "S p"]
@@ -301,7 +302,7 @@ class EntropyLikeMinima:
 
     @property
     def best(self) -> Float[Tensor, " p"]:
-        """The parameters of least H."""
+        """The parameters with the smallest H."""
         return self.theta[self.entropy.argmin()]
 
 
@@ -315,17 +316,17 @@ def least_entropy_like(
 ) -> EntropyLikeMinima:
     """Minimise H of any differentiable residual from several starts at once, by Newton's method.
 
-    Each step takes the exact Hessian, at the cost of p gradients: meant for up to some hundred parameters. A larger
-    network is trained on :class:`LELoss`.
+    Each step computes the exact Hessian at the cost of p gradients, which suits up to a few hundred parameters. Train
+    larger networks with :class:`LELoss`.
 
     Args:
-        residual: takes parameters (p,) to residuals of any shape, all of one population; differentiable twice and
-            fit for ``torch.func.vmap``.
-        starts: (S, p), one descent each; or (p,), an initial guess that is completed to p starts by
-            :func:`orthogonal_starts`.
+        residual: function of the parameters (p,) that returns residuals of any shape, all of one population; twice
+            differentiable and compatible with ``torch.func.vmap``.
+        starts: (S, p), one descent each; or (p,), an initial guess that :func:`orthogonal_starts` completes to p
+            starts.
         weight: counts or a mask, of the shape of the residuals.
-        tol: foreseen gain in H at which a descent ends; default 64 times the rounding error of the dtype.
-        max_iter: steps tried at most.
+        tol: predicted gain in H at which a descent ends; default 64 times the rounding error of the dtype.
+        max_iter: maximum number of steps tried.
 
     Raises:
         TypeError: ``starts`` is not a floating tensor of at least float32, or ``residual`` cannot be called.
@@ -370,7 +371,7 @@ def least_entropy_like(
         gradient, value = torch.func.grad(entropy, has_aux=True)(theta)
         return gradient, (gradient, value)
 
-    # reverse mode twice, which every model has that can be trained
+    # reverse mode twice: every trainable model supports it
     derivatives = torch.func.vmap(torch.func.jacrev(slope, has_aux=True))
 
     def function(theta: Tensor, index: Tensor) -> Quadratic:  # noqa: ARG001

@@ -5,8 +5,8 @@ A label that a network gives the probability p has the cross-entropy ``-log p`` 
 
     σ² (1 - exp(-e² / (2 σ²))) = σ² (1 - p^(1/σ²))
 
-σ = ∞ is cross-entropy, σ = 1 half the mean absolute error of the probabilities; the pull on a label that the network
-disbelieves fades as ``p^(1/σ²)``.
+σ = ∞ is cross-entropy, σ = 1 half the mean absolute error of the probabilities. The gradient of a label of small
+probability p falls like ``p^(1/σ²)``.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ if TYPE_CHECKING:
 __all__ = ["SIGMA_LEAST", "GeneralizedCrossEntropyLoss", "generalized_cross_entropy", "graduated_sigma"]
 
 SIGMA_LEAST = 0.5
-"""Least σ that is taken: there the pull on a label is p⁴ of that of cross-entropy, and nothing learns from it."""
+"""Smallest σ accepted: its gradient is p⁴ times that of cross-entropy, too small for learning."""
 
 _PROBABILITY_SLACK = 0.02
-"""How far probabilities may sum to something else than 1: those of bfloat16 do, by rounding."""
+"""Tolerance on the sum of probabilities, which is 1: bfloat16 rounds."""
 
 
 class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
-    """Cross-entropy that wrong labels cannot pull at: ``σ² (1 - p^(1/σ²))``, p being the probability of the label.
+    """Cross-entropy that is robust to wrong labels: ``σ² (1 - p^(1/σ²))`` with the probability p of the label.
 
-    It takes the place of :class:`torch.nn.CrossEntropyLoss` and at σ = ∞ is the same in value and gradient. The default
-    σ = 1.2 is the authors' q = 0.7. From random weights a network learns poorly at 1 and below, but once it has
-    learned, a smaller σ keeps it from memorising wrong labels: see :func:`graduated_sigma`.
+    It replaces :class:`torch.nn.CrossEntropyLoss`; at σ = ∞ value and gradient are the same. The default σ = 1.2 is the
+    authors' q = 0.7. From random weights a network learns poorly at σ = 1 and below. Later in training, a smaller σ
+    keeps it from memorising wrong labels: see :func:`graduated_sigma`.
 
-    σ is not learned. The energy is smallest at the least σ, whatever the data. The likelihood
-    ``exp(-energy) / Σ_c exp(-energy_c)`` has its greatest value near σ² = the log-odds of a right label against one
-    given wrong one, on labels that the network has not seen; on those it learns from, it goes to cross-entropy as the
+    σ is not learned. The energy is smallest at the smallest σ, whatever the data. The likelihood
+    ``exp(-energy) / Σ_c exp(-energy_c)`` of labels that the network has not seen is largest near σ² = the log-odds of
+    the right label against a given wrong label. For training labels its maximum moves to cross-entropy (σ = ∞) as the
     network memorises them.
 
     Args:
         sigma: bandwidth σ in [0.5, inf], without unit; 1/σ² is the q of generalized cross-entropy.
         weight: non-negative weights of the classes (C,).
-        ignore_index: the integer label that does not count; what its logits hold, NaN included, reaches nothing.
-        reduction: "none", "mean" or "sum"; as in torch, the mean is over the weights of the labels, or over samples
-            where the targets are probabilities.
+        ignore_index: integer label that is masked; its logits, NaN included, affect neither value nor gradient.
+        reduction: "none", "mean" or "sum"; as in torch, the mean is weighted by the class weights of the labels, or is
+            over samples if the targets are probabilities.
         impl: "auto" runs Triton kernels for labels of logits (N, C) on a GPU that has them, and torch elsewhere;
-            "eager", "compile" and "triton" name one. All compute the same.
+            "eager", "compile" or "triton" select an implementation. All compute the same.
 
     Attributes:
         sigma: current value (); assign to set it, also under torch.compile.
@@ -74,7 +74,7 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
         >>> loss = GeneralizedCrossEntropyLoss(sigma=1.2)
         >>> logits = torch.tensor([[9.0, 0.0, 0.0], [9.0, 0.0, 0.0]], requires_grad=True)
         >>> loss(logits, torch.tensor([0, 2])).backward()  # the second label is wrong
-        >>> bool(logits.grad[1].norm() < 2e-3)  # cross-entropy would pull with 0.7
+        >>> bool(logits.grad[1].norm() < 2e-3)  # with cross-entropy it is 0.7
         True
     """
 
@@ -119,14 +119,14 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
                 the input, for which the loss is the mean over labels drawn from them.
 
         Returns:
-            A scalar, or for reduction "none" (N, *) with 0 where ignored; float32 at least. The mean is 0, with
-            gradients 0, if no label counts or all that do have weight 0; torch would give NaN.
+            A scalar, or with reduction "none" (N, *) with 0 where ignored; float32 at least. The mean and its gradients
+            are 0 if all labels are ignored or have weight 0; torch returns NaN.
 
         Raises:
             TypeError: integer or complex logits, boolean or complex targets.
             ValueError: shapes that do not fit, no element, another number of classes than weights; a label out of
-                range, logits that are NaN or +inf where they count, probabilities that are none. On an accelerator the
-                loss does not wait for the last three: there NaN comes out as NaN.
+                range; logits that are not ignored and NaN or +inf; targets that are not probabilities. The last three
+                are not checked on an accelerator: there a NaN gives NaN.
         """
         if runs_kernels(self, input):
             from mkc_torch.losses.kernels.entry import label_loss, takes_labels
@@ -144,9 +144,9 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
     def inlier_weight(
         self, input: Float[Tensor, "N C *rest"], target: Int[Tensor, "*samples"] | Float[Tensor, "N C *rest"]
     ) -> Float[Tensor, "*samples"]:
-        """How far the loss believes each label: ``p^(1/σ²)``, its pull relative to that of cross-entropy.
+        """Inlier weight of each label, ``p^(1/σ²)``: its gradient relative to that of cross-entropy.
 
-        Small weights, below 0.1 say, are labels to look at. At σ = ∞ every weight is 1.
+        Inspect labels of small weight, below 0.1 for example. At σ = ∞ every weight is 1.
 
         Args:
             input, target: as for the loss.
@@ -215,13 +215,13 @@ def generalized_cross_entropy(
 
 
 def graduated_sigma(progress: float, *, start: float = 1.2, end: float = 0.8, until: float = 0.5) -> float:
-    """A σ that falls in the course of training: large enough to learn, then small enough not to memorise.
+    """σ at a point of the training: large at first, to learn; smaller later, not to memorise wrong labels.
 
-    1/σ² goes linearly from that of ``start`` to that of ``end`` and stays there: ``loss.sigma = graduated_sigma(epoch /
-    epochs)`` at each epoch.
+    1/σ² changes linearly from that of ``start`` to that of ``end`` and stays there. Set ``loss.sigma =
+    graduated_sigma(epoch / epochs)`` in each epoch.
 
     Args:
-        progress: how much of the training is done, in [0, 1].
+        progress: share of the training that is done, in [0, 1].
         start: σ at the beginning, in [0.5, inf].
         end: σ from ``until`` on, in [0.5, inf].
         until: the progress at which ``end`` is reached, in (0, 1].
@@ -230,10 +230,10 @@ def graduated_sigma(progress: float, *, start: float = 1.2, end: float = 0.8, un
         σ.
 
     Raises:
-        TypeError, ValueError: an argument that is no number, or out of range.
+        TypeError, ValueError: an argument that is not a number, or out of range.
 
     References:
-        Zhang and Sabuncu (2018) keep q; :class:`GeneralizedCrossEntropyLoss` has the source. The course is our own.
+        Zhang and Sabuncu (2018) keep q constant; see :class:`GeneralizedCrossEntropyLoss`. The schedule is our own.
 
     Example:
         >>> [round(graduated_sigma(p), 2) for p in (0.0, 0.25, 0.5, 1.0)]
@@ -259,7 +259,7 @@ def _loss(
     if share is not None:
         if weight is not None:
             share = share * weight.to(share.dtype).reshape([-1 if i == axis else 1 for i in range(share.dim())])
-        # a class of share 0 may have the logit -inf
+        # a class of probability 0 may have the logit -inf
         values = (share * torch.where(share > 0, values, 0.0)).sum(axis)
         if reduction == "none":
             return values
@@ -280,14 +280,14 @@ def _faded(deviance: Tensor, kappa: Tensor) -> Tensor:
     x = own * deviance
     small = x < 0.5
     near = torch.where(small, x, 0.0)
-    if torch.compiler.is_compiling():  # there expm1 is exp - 1 on some processors, which is 0 for small x
+    if torch.compiler.is_compiling():  # compiled expm1 is exp - 1 on some processors, which is 0 for small x
         series = torch.zeros_like(x)
         for j in range(14, -1, -1):  # sum_j (-x)^j / (j + 1)! in Horner form
             series = 1.0 / math.factorial(j + 1) - near * series
         head = near * series
     else:
         head = -torch.expm1(-near)
-    # expm1 alone would lose the slope of large x, exp alone the value of small ones
+    # expm1 alone would lose the gradient at large x, exp alone the value at small x
     far = 1.0 - torch.exp(-torch.where(small, 1.0, x))
     return torch.where(kappa > 0, torch.where(small, head, far) / own, deviance)
 
@@ -295,7 +295,7 @@ def _faded(deviance: Tensor, kappa: Tensor) -> Tensor:
 def _checked(
     input: Tensor, target: Tensor, weight: Tensor | None, ignore_index: int
 ) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Cross-entropy of each label, or of each class; the shares of the classes, if given; which labels count."""
+    """Cross-entropy of each label or class, the class probabilities or None, and the mask of labels not ignored."""
     refuse_not_real("input", input, "floating-point logits")
     refuse_no_tensor("target", target, "a tensor of integer labels or floating-point probabilities")
     if target.dtype == torch.bool or target.is_complex():
@@ -333,7 +333,7 @@ def _checked(
             f"{tuple(target.shape)}; the classes are dimension {axis} of `input`, and probabilities of them, one-hot "
             "or soft, need a floating-point type."
         )
-    # -100 is 156 among labels of eight bits
+    # in uint8 labels, -100 is 156
     target = target.long()
     counts = target != ignore_index
     if watched:
@@ -350,20 +350,20 @@ def _axis(input: Tensor) -> int:
 
 
 def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """``1 / sigma^2`` as a scalar tensor; of a number in the dtype given, or the default one."""
+    """``1 / sigma^2`` as a scalar tensor; a number is converted to ``dtype``, None being the default dtype."""
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError(
-            "Expected argument `sigma` without a gradient but got a tensor that asks for one: the loss is smallest at "
-            "the least sigma, whatever the data. Pass sigma.detach(), and see graduated_sigma for its course."
+            "Expected argument `sigma` without a gradient but got a tensor that requires one: the loss is smallest at "
+            "the smallest sigma, whatever the data. Pass sigma.detach(), and see graduated_sigma for a schedule."
         )
     t = as_numbers("sigma", sigma, dtype)
     t = t.to(at_least_float32(t))
     if t.dim() != 0:
-        raise ValueError(f"Expected argument `sigma` to be one number but got shape {tuple(t.shape)}.")
+        raise ValueError(f"Expected argument `sigma` to be a single number but got shape {tuple(t.shape)}.")
     if not torch.compiler.is_compiling():
         try:
             fine = t.item() >= SIGMA_LEAST
-        except RuntimeError:  # under vmap there is no one value
+        except RuntimeError:  # under vmap values cannot be read
             fine = True
         if not fine:
             raise ValueError(f"Expected argument `sigma` in [{SIGMA_LEAST:g}, inf] but got {sigma}; 1.2 is usual.")
@@ -392,22 +392,22 @@ def _refuse_out_of_range(target: Tensor, counts: Tensor, classes: int, ignore_in
     index = tuple(wrong.nonzero()[0].tolist())
     raise ValueError(
         f"Expected labels `target` in [0, {classes}), the classes of `input`, but got {target[index].item()} at index "
-        f"{index} and {int(wrong.sum()) - 1} more out of range; labels that do not count are {ignore_index}, "
+        f"{index} and {int(wrong.sum()) - 1} more out of range; masked labels must be {ignore_index}, "
         "`ignore_index`."
     )
 
 
 @torch.no_grad()
 def _refuse_not_finite(input: Tensor, counts: Tensor, axis: int) -> bool:
-    """Refuse NaN and +inf among logits that count, -inf being a class that cannot be; True if all are finite."""
+    """Raise ValueError on NaN or +inf in unmasked logits; -inf is an impossible class. True if all are finite."""
     total = input.sum()
     try:
         if math.isfinite(total.item()):
             return True
-    except RuntimeError:  # under vmap there is no one value
+    except RuntimeError:  # under vmap values cannot be read
         return False
     wrong = counts.unsqueeze(axis) & (input.isnan() | (input == torch.inf))
-    # no class left that can be
+    # every class is impossible
     wrong = wrong | (counts & (input == -torch.inf).all(axis)).unsqueeze(axis)
     if bool(wrong.any()):
         index = tuple(wrong.nonzero()[0].tolist())
@@ -435,5 +435,5 @@ def _refuse_no_probabilities(target: Tensor, axis: int) -> None:
 def _any(wrong: Tensor) -> bool:
     try:
         return bool(wrong.any().item())
-    except RuntimeError:  # under vmap there is no one value
+    except RuntimeError:  # under vmap values cannot be read
         return False

@@ -1,4 +1,4 @@
-"""MKC likelihood whose σ and d differ from sample to sample, and the layer of a network that predicts them."""
+"""MKC likelihood with σ and d of each sample, and the output layers of a network that predict them."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 __all__ = ["HeteroscedasticMKCLoss", "MKCConvHead", "MKCHead", "MKCHeadOutput"]
 
 KAPPA_MIN = 1e-6
-"""Least ``1 / sigma²`` that a head gives; beyond, the gradients of σ leave the range of float32."""
+"""Smallest ``1 / sigma²`` of a head; below it the gradients of σ leave the range of float32."""
 
 _CHUNK = 1 << 14
-"""Elements whose normaliser is computed at once, each by a quadrature of 32 nodes."""
+"""Elements per chunk of the normaliser, each a quadrature of 32 nodes."""
 
 _ROUNDING = 1e-5
-"""Relative distance beyond a limit that is taken for rounding of a value on the limit."""
+"""Relative tolerance on the limits of σ and d, for rounding."""
 
 
 class _WideBuffers(nn.Module):
-    """Its own buffers stay in float32 at least: half would round them, or overflow."""
+    """A module whose own buffers stay in float32 at least: half precision would round them, or overflow."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> _WideBuffers:
         def keep(t: Tensor) -> Tensor:
@@ -58,28 +58,29 @@ class _WideBuffers(nn.Module):
 class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
     """Negative log-likelihood of the MKC density with a bandwidth σ and a scale d for every element.
 
-    σ and d come from a network, :class:`MKCHead` say, beside the prediction: noise that differs from place to place is
-    told from outliers. With constant σ and d it is :class:`mkc_torch.MKCLoss`. A network that can single out samples
-    drives their d to its floor: give the head a physical ``d_min`` and watch a validation set.
+    The network predicts σ and d together with the location, by :class:`MKCHead` for example. This distinguishes samples
+    of large noise from outliers. With constant σ and d the loss equals :class:`mkc_torch.MKCLoss`. A network that
+    interpolates single samples drives their d to its floor: give the head a physical ``d_min`` and watch a validation
+    set.
 
-    The normaliser of every σ and d is a quadrature of 32 nodes, computed in chunks of bounded memory: a microsecond or
-    more an element on one core, thirty times the rest of the loss. In float32, on the CPU and in the kernels of a GPU,
-    a table takes its place where the domain reaches beyond the head of the density; the loss is then ten times as fast.
-    Where σ and d have a dimension 1 that the input has not, one value a sample for many channels say, the normaliser is
-    computed once and shared, by torch's operations.
+    The normaliser of each element is a quadrature of 32 nodes, computed in chunks of bounded memory. It costs a
+    microsecond or more per element on one core, thirty times the rest of the loss. In float32, on the CPU and in GPU
+    kernels, a table replaces it where the domain extends beyond the head of the density; the loss is then ten times as
+    fast. If σ and d have size 1 along a dimension of the input, for example one value per sample for many channels,
+    torch computes the normaliser once and broadcasts it.
 
     Args:
         bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,).
         channel_dim: the dimension of the input that holds the channels.
         reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
-        impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" and "triton"
-            name one. All compute the same.
+        impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
+            select an implementation. All compute the same.
 
     Attributes:
         bound: buffer () or (m,), saved in the state_dict.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of another type, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -123,22 +124,22 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
         Args:
             input: predictions, any shape; with a bound of shape (m,), ``channel_dim`` has size m.
             target: targets of the same shape; nothing is broadcast.
-            sigma: bandwidths in [0.05, inf] of the shape of the input, or of that shape with any dimensions 1.
-            d: scales in (0, bound], in the unit of the target, of the shape of the input, or with any dimensions 1.
-            weight: non-negative weights, or a boolean mask that is True where an element counts; of the shape of the
-                input, or that shape without the channel dimension. What an element of weight 0 or False holds, NaN
-                included, reaches neither the value nor a gradient; nor do a σ and a d for which no element counts.
+            sigma: bandwidths in [0.05, inf], of the shape of the input, or with size 1 along any dimensions.
+            d: scales in (0, bound], in the unit of the target; shaped like ``sigma``.
+            weight: non-negative weights, or a boolean mask (True: used); of the shape of the input, or without the
+                channel dimension. Elements of weight 0 or False, NaN included, affect neither the value nor a gradient;
+                nor do a σ and a d that only masked elements use.
 
         Returns:
-            A scalar, or for reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
-            the weighted mean over elements, and 0 if no element counts.
+            A scalar, or with reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
+            the weighted mean over elements, and 0 if all weights are 0.
 
         Raises:
-            TypeError: integer or complex input, target, sigma or d, or what is no tensor.
-            ValueError: shapes differ, are empty, or do not fit the bound's; a weight is negative, NaN or infinite; an
-                input or a target that counts is NaN or infinite; a sigma or d that counts is out of range. For the last
-                three the loss does not wait for an accelerator, nor are they seen in compiled code or under vmap: there
-                a NaN comes out as NaN.
+            TypeError: integer or complex input, target, sigma or d, or an argument that is not a tensor.
+            ValueError: shapes that differ, are empty, or do not fit the bound; a weight that is negative, NaN or
+                infinite; an unmasked input or target that is NaN or infinite; an unmasked sigma or d out of range. The
+                last three are checked on the CPU in eager code only; on an accelerator, in compiled code and under vmap
+                a NaN gives NaN.
         """
         if runs_kernels(self, input):
             from mkc_torch.losses.kernels.entry import sample_loss
@@ -160,7 +161,7 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
         if weight is not None:
             weight, counts = checked_weight(weight, error, axis)
             error = torch.where(counts, error, 0.0)
-            # what only masked elements use gives way to a value in range
+            # a σ or d that only masked elements use is replaced by a value in range
             sigma = torch.where(counts.to(dtype).sum_to_size(sigma.shape) > 0, sigma, 1.0)
             d = torch.where(counts.to(dtype).sum_to_size(d.shape) > 0, d, bound.amin())
         if bound.dim():
@@ -189,7 +190,7 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
         if self.bound.dim() and input.shape[axis] != self.bound.shape[0]:
             raise ValueError(
                 f"Expected {self.bound.shape[0]} channels, as `bound` has, in dimension {self.channel_dim} "
-                f"but got {tuple(input.shape)}; pass one number as `bound` for any number of channels."
+                f"but got {tuple(input.shape)}; pass a number as `bound` for any number of channels."
             )
         return axis
 
@@ -215,33 +216,32 @@ class MKCHeadOutput(NamedTuple):
 
 
 class MKCHead(_WideBuffers):
-    """The last layer of a network: a prediction with its σ and d for each of m channels.
+    """Output layer of a network: the prediction, σ and d of each of m channels.
 
-    ``1 / sigma²`` lies in [1e-6, 400], that is σ in [0.05, 1000], and d in [d_min, bound], by a sigmoid of a linear
-    function of the features. At first that function is constant: σ and d start at the given values everywhere, and
-    learn where they differ once the prediction has taken shape.
+    A sigmoid of a linear function of the features keeps ``1 / sigma²`` in [1e-6, 400], that is σ in [0.05, 1000], and d
+    in [d_min, bound]. Initially this function is constant: σ and d start at the initial values for every sample.
 
-    σ and d are computed in float32 at least, under autocast too. The weights of ``scales`` want no weight decay, its
-    bias least of all.
+    σ and d are computed in float32 at least, under autocast too. Exclude ``scales`` from weight decay, above all its
+    bias.
 
     Args:
         in_features: number of features.
         num_channels: m, the number of predictions.
-        bound: that of the loss, in the unit of the target, a number or (m,).
-        d_min: floor under d, a number or (m,): the precision of the targets, below which no noise can be.
+        bound: half-width of the loss's domain, in the unit of the target, a number or (m,).
+        d_min: floor of d, a number or (m,): the precision of the targets, which limits the noise from below.
         sigma_init: initial σ in (0.05, 1000), a number or (m,).
         d_init: initial d in (d_min, bound), a number or (m,).
 
     Attributes:
         location: linear layer of the predictions.
-        scales: linear layer of what σ and d are made of.
+        scales: linear layer of the raw σ and d.
 
     Raises:
-        TypeError, ValueError: an argument of another kind, or out of range.
+        TypeError, ValueError: an argument of another type, or out of range.
 
     References:
-        Nix and Weigend, "Estimating the mean and variance of the target probability distribution", ICNN 1994: a scale
-        predicted beside the mean.
+        Nix and Weigend, "Estimating the mean and variance of the target probability distribution", ICNN 1994: a
+        network that predicts mean and scale.
 
     Example:
         >>> head = MKCHead(5, 2, bound=50.0, d_min=1e-3, d_init=0.5)
@@ -272,7 +272,7 @@ class MKCHead(_WideBuffers):
         self.register_buffer("d_min", values["d_min"])
         if not bool(((values["d_min"] < values["d_init"]) & (values["d_init"] < values["bound"])).all()):
             raise ValueError(
-                f"Expected argument `d_init` input_hold `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
+                f"Expected argument `d_init` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
                 f"but got {d_init}; a robust scale of the targets is a good start."
             )
         kappa = inverse_square(values["sigma_init"].double())
@@ -297,13 +297,13 @@ class MKCHead(_WideBuffers):
         """Predictions, σ and d of each sample.
 
         Args:
-            features: features, the n = ``in_features`` of a sample in the last dimension.
+            features: features (*, n) with n = ``in_features``.
 
         Returns:
-            ``(location, sigma, d)``, each (*, m); σ without unit, the others in the unit of the target.
+            ``(location, sigma, d)``, each (*, m); σ is dimensionless, the others are in the unit of the target.
 
         Raises:
-            TypeError: integer or complex features, or what is no tensor.
+            TypeError: integer or complex features, or an argument that is not a tensor.
             ValueError: another number of features.
         """
         refuse_not_real("features", features)
@@ -312,7 +312,7 @@ class MKCHead(_WideBuffers):
                 f"Expected argument `features` of shape (*, {self.in_features}) but got {tuple(features.shape)}."
             )
         location = self.location(features)
-        # in half precision a step of the raw d would be a step of a few per cent of d
+        # half precision would resolve d to a few per cent only
         with torch.autocast(features.device.type, enabled=False):
             dtype = at_least_float32(self.scales.weight)
             raw = nn.functional.linear(features.to(dtype), self.scales.weight.to(dtype), self.scales.bias.to(dtype))
@@ -326,7 +326,7 @@ class MKCHead(_WideBuffers):
 
 
 class MKCConvHead(MKCHead):
-    """An :class:`MKCHead` at every place of an image or a series, channels second: a convolution of kernel size 1.
+    """An :class:`MKCHead` at each place of an image or a series, channels second: a convolution of kernel size 1.
 
     Args:
         in_features: number of feature maps; the other arguments are those of :class:`MKCHead`.
@@ -346,7 +346,7 @@ class MKCConvHead(MKCHead):
             features: feature maps, (N, n, *places).
 
         Raises:
-            TypeError: integer or complex features, or what is no tensor.
+            TypeError: integer or complex features, or an argument that is not a tensor.
             ValueError: another number of feature maps.
         """
         refuse_not_real("features", features)
@@ -358,7 +358,7 @@ class MKCConvHead(MKCHead):
 
 
 def _positive(name: str, value: float | Tensor, num_channels: int | None = None) -> Tensor:
-    """A number or one value a channel, (m,) where m is given."""
+    """A positive number or a value per channel as a tensor, expanded to (m,) if m is given."""
     t = as_numbers(name, value).detach()
     t = t.to(at_least_float32(t))
     if t.dim() > 1 or (num_channels is not None and t.dim() == 1 and t.shape[0] not in (1, num_channels)):
@@ -370,9 +370,9 @@ def _positive(name: str, value: float | Tensor, num_channels: int | None = None)
 
 
 def _log_partition(kappa: Tensor, length: Tensor) -> Tensor:
-    """``log Z`` of every element, in chunks: the quadrature holds several times 32 numbers an element."""
+    """``log Z`` of each element, in chunks: the quadrature needs several times 32 numbers per element."""
     kappa, length = torch.broadcast_tensors(kappa, length)
-    # compiled code sums over the nodes as it goes, and a loop would fix the size of the batch
+    # compiled code sums over the nodes without storing them, and a loop would fix the batch size
     if torch.compiler.is_compiling() or kappa.numel() <= _CHUNK:
         return log_partition(kappa, length)
     chunks = zip(kappa.reshape(-1).split(_CHUNK), length.reshape(-1).split(_CHUNK), strict=True)
@@ -384,21 +384,21 @@ def _refuse_other_shape(name: str, value: Tensor, input: Tensor) -> None:
     if value.dim() != input.dim() or any(a not in (1, b) for a, b in zip(value.shape, input.shape, strict=True)):
         raise ValueError(
             f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or that with any dimensions 1, "
-            f"but got {tuple(value.shape)}; give it all dimensions, unsqueeze(-1) say for one value a sample."
+            f"but got {tuple(value.shape)}; add the missing dimensions, as {name}.unsqueeze(-1) for a value per sample."
         )
 
 
 @torch.no_grad()
 def _refuse_out_of_range(sigma: Tensor, d: Tensor, length: Tensor) -> None:
-    """Refuse a σ or d out of range, where looking does not have to wait for an accelerator."""
+    """Raise ValueError for a σ or d out of range; checked on the CPU only, where no read waits for a device."""
     if sigma.device.type != "cpu":
         return
     least = KAPPA_MAX**-0.5
     try:
         least_sigma, (shortest, longest) = sigma.amin().item(), (t.item() for t in torch.aminmax(length))
-    except RuntimeError:  # under vmap there is no one value
+    except RuntimeError:  # under vmap values cannot be read
         return
-    # a NaN is the least and fails every comparison
+    # amin returns a NaN, and a NaN fails every comparison
     if not least_sigma >= least * (1.0 - _ROUNDING):
         wrong = ~(sigma >= least * (1.0 - _ROUNDING))
         raise ValueError(

@@ -38,26 +38,27 @@ __all__ = ["MKCLoss", "checked_loss"]
 class MKCLoss(ChannelCurves, ChannelDensity):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
-    The likelihood is (17) of Li et al. (2023): ``energy + log_normalizer`` where anything is learned, and with σ and d
-    fixed the paper's loss, ``energy = σ² (1 - exp(-e² / (2 d² σ²)))``, e being input less target. Learning
-    un-normalised σ and d is refused: the energy alone is smallest at σ → 0 or d → ∞, whatever the data.
+    The likelihood is (17) of Li et al. (2023). Where σ or d is learned, the loss is ``energy + log_normalizer``. With
+    both fixed it is the paper's loss, ``energy = σ² (1 - exp(-e² / (2 d² σ²)))`` with e = input - target. Learning
+    without the normaliser is refused: the energy alone is smallest at σ → 0 or d → ∞, whatever the data.
 
-    ``objective`` says by what the network learns:
+    ``objective`` selects the loss that trains the network:
 
-    - ``"likelihood"``: the value is the likelihood, and every gradient is its own.
-    - ``"robust"``: in training the value is the sum of two terms, as in any stop-gradient objective. ``network`` moves
-      the network alone: a :class:`BandwidthSchedule` of residuals over their running :class:`ResidualScale`, at first
-      sharper than the absolute value, later Welsch's loss of the widest bandwidth whose estimated risk is within a
-      tenth of the smallest. ``density``, the likelihood at detached residuals, moves σ and d alone. In evaluation the
-      value is the likelihood. Up to half of the targets may be wrong.
+    - ``"likelihood"``: the negative log-likelihood, for the network as for σ and d.
+    - ``"robust"``: in training the value is the sum of two stop-gradient terms. ``network`` has a gradient by the
+      predictions alone: a :class:`BandwidthSchedule` of residuals over their running :class:`ResidualScale`. It starts
+      sharper than the absolute value, and is annealed to Welsch's loss of the widest bandwidth whose estimated risk is
+      within a tenth of the smallest. ``density`` is the negative log-likelihood of detached residuals and has a
+      gradient by σ and d alone. In evaluation the value is the negative log-likelihood. Up to half of the targets may
+      be wrong.
 
-    Without a ``d`` the scales follow the residuals while the network learns, robustly and for each channel, so that
-    targets of any unit need no tuning.
+    Without a ``d``, the scale of each channel follows the residuals robustly during training, so that targets of any
+    unit need no tuning.
 
     Args:
         num_channels: m, the size of the channel dimension.
         sigma: initial or fixed bandwidths in [0.05, inf], a number or (m,). ``inf`` is the Gaussian; a σ that is to be
-            learned must start finite, since its gradient is 0 at ``inf``.
+            learned must start finite, because its gradient is 0 at ``inf``.
         d: initial or fixed scales > 0 in the unit of the target, a number or (m,); "auto" takes them from the
             residuals of each training batch, and ``learn_d`` then learns a factor on them.
         bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). "auto" means half
@@ -69,12 +70,12 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         learn_d: whether d is a parameter; it stays in [d_min, bound].
         normalize: whether to add the log-normaliser; None does so if anything is learned.
         channel_dim: the dimension of the input that holds the channels, 1 for (N, C, H, W); None for the last. An input
-            of four dimensions or more whose second and last both have size m is refused until one is named.
+            of four dimensions or more whose second and last dimension both have size m needs an explicit value.
         reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
         d_min: floor under d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
             residuals. The likelihood of a network that interpolates its targets grows without limit as d → 0.
-        impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" and "triton"
-            name one. All compute the same.
+        impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
+            select an implementation. All compute the same.
 
     Attributes:
         sigma, d: current values (m,), differentiable; assign to set them.
@@ -83,8 +84,8 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         schedule: the :class:`BandwidthSchedule`, or None where the objective is the likelihood.
 
     Raises:
-        TypeError: an argument that is no number.
-        ValueError: an argument out of range, or learning asked for with ``normalize=False``.
+        TypeError: an argument that is not a number.
+        ValueError: an argument out of range, or ``normalize=False`` with a learned σ or d.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (9) and (17).
@@ -169,21 +170,21 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         Args:
             input: predictions, any shape whose ``channel_dim`` has size m.
             target: targets of the same shape; nothing is broadcast.
-            weight: non-negative weights, or a boolean mask that is True where an element counts; of the shape of the
-                input, of size 1 where it is the same, or that shape without the channel dimension. What an element of
-                weight 0 or False holds, NaN included, reaches neither the value nor a gradient.
+            weight: non-negative weights, or a boolean mask (True: used); of the shape of the input, with size 1 along
+                dimensions where it is constant, or without the channel dimension. Elements of weight 0 or False, NaN
+                included, affect neither the value nor a gradient.
 
         Returns:
-            A scalar, or for reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
-            the weighted mean over elements, and 0 if no element counts.
+            A scalar, or with reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
+            the weighted mean over elements, and 0 if all weights are 0.
 
         Raises:
-            TypeError: integer or complex input or target, or what is no tensor.
-            ValueError: shapes differ, are empty, or have another number of channels; a weight is negative, NaN or
-                infinite; an input or a target that counts is NaN or infinite. For the last two the loss does not wait
-                for an accelerator, nor are they seen in compiled code or under vmap: there a NaN comes out as NaN, as
-                for predictions of float16, so that a gradient scaler sees an overflow. The running scale leaves out
-                what is not finite.
+            TypeError: integer or complex input or target, or an argument that is not a tensor.
+            ValueError: shapes that differ, are empty, or have another number of channels; a weight that is negative,
+                NaN or infinite; an unmasked input or target that is NaN or infinite. The last two are checked on the
+                CPU in eager code only; on an accelerator, in compiled code and under vmap a NaN gives NaN. So does a
+                NaN prediction in float16, so that a gradient scaler sees an overflow. The running scale ignores
+                residuals that are not finite.
         """
         if runs_kernels(self, input):
             from mkc_torch.losses.kernels.entry import kernel_loss
@@ -209,11 +210,11 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         target: Float[Tensor, "*shape"],
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
     ) -> LossTerms:
-        """The two terms of the robust objective at the present state, which is not changed.
+        """The two terms of the robust objective at the current state, which is not changed.
 
-        ``network`` has a gradient by input and target alone, ``density`` by σ and d alone. A scheduler or early
-        stopping watches ``network`` once the schedule has ended, or the value in evaluation. Under the likelihood
-        ``network`` is 0 and ``density`` the likelihood, with all gradients.
+        ``network`` has a gradient by input and target alone, ``density`` by σ and d alone. Let a scheduler or early
+        stopping watch ``network`` after the annealing, or the value in evaluation. With ``objective="likelihood"``,
+        ``network`` is 0 and ``density`` the negative log-likelihood with all gradients.
 
         Args:
             input, target, weight: as in :meth:`forward`.
@@ -238,13 +239,14 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         *,
         optimizer: torch.optim.Optimizer | None = None,
     ) -> tuple[str, ...]:
-        """What goes wrong in a training, a sentence each: empty where nothing does. It reads values; forward does not.
+        """Warnings about a training, a sentence each; empty if there are none. Reads values, and so waits for a device.
 
-        A d next to its floor; more than 1 % of the errors beyond a given bound; σ or d that no optimizer has.
+        The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
+        optimizer.
 
         Args:
-            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss has them.
-            optimizer: the optimizer of the training; None leaves this check out.
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss keeps them.
+            optimizer: the optimizer of the training; None skips its check.
 
         Example:
             >>> loss, net = MKCLoss(1), torch.nn.Linear(3, 1)
@@ -259,18 +261,18 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         target: Float[Tensor, "*shape"] | None = None,
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
     ) -> Tails:
-        """Whether the errors have heavier tails than a Gaussian, and how many of them are expected beyond three d.
+        """Whether the errors have heavier tails than a Gaussian, and the share expected beyond three d.
 
-        σ alone does not say it: it is finite for about half of all Gaussian samples.
+        A finite σ is not evidence of heavy tails: it is finite for about half of all Gaussian samples.
 
         Args:
-            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss has them.
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss keeps them.
 
         Returns:
-            A :class:`mkc_torch.density.Tails`, at the loss's bound; ``print`` shows a line for each channel.
+            A :class:`mkc_torch.density.Tails` at the loss's bound; ``print`` shows a line for each channel.
 
         Raises:
-            ValueError: no residuals: nothing was given and the loss keeps none, or has seen none.
+            ValueError: no residuals: none were passed, and the loss keeps none or has seen none yet.
 
         Example:
             >>> loss = MKCLoss(1)
@@ -283,10 +285,10 @@ class MKCLoss(ChannelCurves, ChannelDensity):
 
     def _tensors(self, batch: Batch) -> list[Tensor]:
         given = (batch.input, batch.target, batch.weight, self.raw_kappa, self.raw_d)
-        return [one for one in given if one is not None]
+        return [value for value in given if value is not None]
 
     def _batch(self, input: Tensor, target: Tensor, weight: Tensor | None) -> Batch:
-        """The batch, checked, in the dtype of the computation."""
+        """The checked batch in the dtype of the computation."""
         axis = self._checked_axis(input, target)
         dtype = torch.promote_types(torch.promote_types(input.dtype, target.dtype), self._dtype)
         prediction, wanted, counts = input.to(dtype), target.to(dtype), None
@@ -295,17 +297,17 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             weight, counts = checked_weight(weight, prediction, axis)
             error = torch.where(counts, prediction - wanted, 0.0)
         advice = "" if self.schedule is None else _SEVERAL_CALLS
-        # an overflow of half precision is the gradient scaler's to see
+        # the gradient scaler handles an overflow of half precision
         overflows = input.dtype == torch.float16
         refuse_bad_batch(None if overflows else prediction, wanted, counts, None if overflows else error, advice)
         return Batch(prediction, wanted, weight, counts, axis)
 
     def _update(self, batch: Batch) -> bool:
-        """Take the batch into the running state, in training; whether it was."""
+        """Update the running state by the batch, in training. Returns whether it was updated."""
         scale, schedule = self._running()
         if scale is None or not self.training:
             return False
-        # transforms of functions have no state; activation checkpointing calls a second time, in the backward pass
+        # function transforms have no state; activation checkpointing repeats the forward pass during the backward pass
         if not torch.compiler.is_compiling() and (in_backward() or any(map(is_transformed, self._tensors(batch)))):
             return False
         scale.update(batch.input, batch.target, batch.weight, batch.axis)
@@ -318,11 +320,11 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         axis = checked_axis(input, self.channel_dim)
         m = self.num_channels
         if input.shape[axis] != m:
-            mend = "; give each sample a dimension for its channel, unsqueeze(-1)" if m == 1 else ""
+            fix = "; give each sample a dimension for its channel, unsqueeze(-1)" if m == 1 else ""
             if input.dim() > 2 and input.shape[1] == m:
-                mend = "; give the loss `channel_dim=1` where the channels are the second dimension, (N, C, ...)"
+                fix = "; give the loss `channel_dim=1` where the channels are the second dimension, (N, C, ...)"
             raise ValueError(
-                f"Expected {m} channels in dimension {self.channel_dim} but got {tuple(input.shape)}{mend}."
+                f"Expected {m} channels in dimension {self.channel_dim} but got {tuple(input.shape)}{fix}."
             )
         if not self._named_dim and input.dim() > 3 and input.shape[1] == m:
             raise ValueError(
@@ -355,7 +357,11 @@ def _compiled() -> Callable[..., Tensor]:
 
 
 def checked_loss(loss: nn.Module) -> MKCLoss:
-    """The MKCLoss itself, taken out of a compiled one."""
+    """The MKCLoss, unwrapped where it was compiled.
+
+    Raises:
+        TypeError: ``loss`` is not an MKCLoss.
+    """
     own = getattr(loss, "_orig_mod", loss)
     if not isinstance(own, MKCLoss):
         got = format_value(loss) if isinstance(loss, type) else type(loss).__name__

@@ -1,4 +1,4 @@
-"""A running robust scale and half range of the residuals of each channel, with the contract of batch normalisation."""
+"""Running robust scale and half range of each channel's residuals, updated in training like batch normalisation."""
 
 from __future__ import annotations
 
@@ -19,60 +19,59 @@ if TYPE_CHECKING:
 __all__ = ["ResidualScale", "alike_in_all_processes", "average_over_processes", "is_distributed", "numpy_may_read"]
 
 QUANTILE = 0.4
-"""Level of the quantile of |residual| that gives the scale: below one half, where half of the targets are wrong."""
+"""Level of the quantile of |residual| that gives the scale: below 0.5, because half of the targets may be wrong."""
 
 NORMAL_QUANTILE = 0.5244005
-"""That quantile of the absolute value of a standard normal variable."""
+"""The ``QUANTILE`` quantile of the absolute value of a standard normal variable."""
 
 MOST_RECENT = 512
-"""Residuals of a channel that are kept."""
+"""Most recent residuals kept per channel, at most."""
 
 FEWEST_RECENT = 64
-"""Residuals of a channel that are kept however many channels there are."""
+"""Most recent residuals kept per channel, at least, however many channels there are."""
 
 RECENT_IN_ALL = 1 << 16
-"""Residuals that are kept of all channels together, but for ``FEWEST_RECENT``."""
+"""Limit of the residuals kept in all channels together, where it allows ``FEWEST_RECENT`` per channel."""
 
 RANGE_ROWS = 1 << 12
-"""Residuals of a batch and channel from which the half range is taken, evenly spaced."""
+"""Evenly spaced residuals per batch and channel from which the half range is taken, at most."""
 
 RATE = 0.1
-"""Share of a new batch in the running scale; the n-th batch has 1 / n while that is more."""
+"""Share of a new batch in the running scale; the n-th batch has 1 / n as long as that is larger."""
 
 RANGE_DECAY = 0.999
-"""Factor by which the half range shrinks with each batch that does not reach it."""
+"""Factor on the half range with each batch whose residuals stay within it."""
 
 SCALES_IN_BOUND = 10.0
-"""Least bound, in scales."""
+"""Smallest bound, in scales."""
 
 FLOOR_IN_SPREAD = 1e-3
-"""Floor of d, in mean absolute deviations of the first residuals."""
+"""Floor of d, as a share of the mean absolute deviation of the first residuals."""
 
 TINY = 1e-30
-"""Stands for 0 in a logarithm and in a denominator."""
+"""Lower limit of logarithms' arguments and of denominators."""
 
 SMALL_STATE = 64
-"""Channels up to which NumPy, which costs less a call than torch, computes the state on the CPU."""
+"""Channels up to which NumPy computes the state on the CPU: its overhead per call is smaller than torch's."""
 
 
 class ResidualScale(nn.Module):
     """Running robust scale, half range and most recent residuals of each channel, all in buffers.
 
-    ``update`` is the only method that changes the state, and is called in training. The scale is the 0.4 quantile of
-    the recent absolute residuals over that of a standard normal variable, averaged over the batches in its logarithm.
-    Residuals of weight 0 and residuals that are not finite do not count.
+    ``update`` is the only method that changes the state; it is called in training. The scale is the 0.4 quantile of
+    the recent absolute residuals over that of a standard normal variable; its logarithm is averaged over the batches.
+    Residuals of weight 0 and residuals that are not finite are ignored.
 
-    In distributed training the scales of all processes are averaged and their half ranges joined, so that all
-    processes have the same.
+    In distributed training, all processes have the same state: the mean of their scales and the widest half range.
 
     Args:
         num_channels: m.
 
     Attributes:
-        recent: the latest residuals, the predictions that they belong to and their weights, (3, m, L).
-        position: index in the last dimension of ``recent`` that the next residual takes; equal for all channels, (m,),
-            because a kernel has one program a channel.
-        batches: how many batches had a residual that counts, (m,).
+        recent: the most recent residuals, their predictions and their weights, (3, m, L); a ring buffer.
+        position: index in the last dimension of ``recent`` that the next residual takes, (m,); equal for all channels,
+            stored per channel because a kernel has one program per channel.
+        batches: number of batches with at least one finite residual of positive weight, (m,).
         log_scale: logarithm of the scale in the unit of the target, (m,).
         half_range: half the range of the residuals, (m,).
         floor: a thousandth of the spread of the first residuals, (m,).
@@ -108,7 +107,7 @@ class ResidualScale(nn.Module):
 
     @property
     def bound(self) -> Float[Tensor, " m"]:
-        """Half the range of the residuals, and no less than ten scales."""
+        """Half the range of the residuals, and at least ten scales, in the unit of the target."""
         return torch.maximum(self.half_range, SCALES_IN_BOUND * self.scale)
 
     @torch.no_grad()
@@ -119,7 +118,7 @@ class ResidualScale(nn.Module):
         weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
         channel_dim: int = -1,
     ) -> None:
-        """Take a batch into the state.
+        """Update the state by a batch.
 
         Args:
             prediction: predictions whose dimension ``channel_dim`` has size m.
@@ -148,7 +147,7 @@ class ResidualScale(nn.Module):
     def _sampled(
         self, prediction: Tensor, target: Tensor, weight: Tensor | None, axis: int
     ) -> tuple[list[Tensor], list[Tensor] | None]:
-        """Evenly spaced rows of the batch to keep and, of a larger batch, more of them for the half range."""
+        """Evenly spaced rows to keep and, for a batch larger than the buffer, more rows for the half range."""
         given = [v.detach() for v in (prediction, target, weight) if v is not None]
         length = self.recent.shape[-1]
         rows = [spaced_rows(values, axis, length) for values in given]
@@ -161,7 +160,7 @@ class ResidualScale(nn.Module):
 
     @torch.no_grad()
     def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
-        """The state, or of a channel that has had no batch what it would be after this one. Changes nothing."""
+        """The state; for a channel without a batch so far, its state after this batch. Changes no buffer."""
         batch = rows_of_batch(torch, self.recent.dtype, *self._sampled(prediction, target, weight, channel_dim))
         state, known = self._state(), self.batches > 0
         new = updated(torch, batch.rows, state, batch)
@@ -169,7 +168,7 @@ class ResidualScale(nn.Module):
 
 
 class ScaleState(NamedTuple):
-    """The buffers of :class:`ResidualScale` that have one number a channel, (m,) each."""
+    """The buffers of :class:`ResidualScale` with one number per channel, (m,) each."""
 
     batches: Any
     log_scale: Any
@@ -178,24 +177,25 @@ class ScaleState(NamedTuple):
 
 
 class BatchRows(NamedTuple):
-    """Residuals, predictions and weights of some rows of a batch (3, m, k), and its half range (m,)."""
+    """Residuals, predictions and weights of rows of a batch, (3, m, k), and the half range of the batch, (m,)."""
 
     rows: Any
     half_range: Any
 
 
 def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] | None) -> BatchRows:
-    """Residuals of rows, with weight 0 where a residual is not finite, and the half range of these or of more rows.
+    """Residuals of rows, with weight 0 where a residual is not finite, and the half range of ``more`` rows.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are.
-        dtype: of the result.
-        rows, more: predictions, targets and, if any, weights, (k, m) each.
+        xp: ``numpy`` or ``torch``, the library of the other arrays.
+        dtype: dtype of the result.
+        rows: predictions, targets and, if any, weights, (k, m) each.
+        more: the same of more rows, for the half range; None takes ``rows``.
     """
     residual, prediction, weight = _residuals(xp, dtype, *rows)
     wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
     least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
-    half_range = at_least(xp, 0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0)  # 0 where none counts
+    half_range = at_least(xp, 0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0)  # 0 where all weights are 0
     return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
 
 
@@ -212,7 +212,7 @@ def _residuals(xp: Any, dtype: Any, prediction: Any, target: Any, weight: Any = 
 
 
 def _arrays(values: Sequence[Tensor]) -> list[Any]:
-    return [one.numpy() for one in values]
+    return [value.numpy() for value in values]
 
 
 def _cast(xp: Any, values: Any, dtype: Any) -> Any:
@@ -220,7 +220,7 @@ def _cast(xp: Any, values: Any, dtype: Any) -> Any:
 
 
 def _insert_in_numpy(recent: Any, position: Tensor, rows: Any) -> None:
-    """Put new residuals in the place of the oldest ones."""
+    """Overwrite the oldest residuals with the new residuals."""
     count, length, start = rows.shape[-1], recent.shape[-1], position[0].item()
     head = min(count, length - start)
     recent[..., start : start + head] = rows[..., :head]
@@ -229,11 +229,11 @@ def _insert_in_numpy(recent: Any, position: Tensor, rows: Any) -> None:
 
 
 def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleState:
-    """The state after a batch whose residuals stand in ``recent``; a channel of which none counts keeps its state.
+    """The state after a batch that ``recent`` already contains; a channel without residuals of weight keeps its state.
 
     Args:
-        xp: ``numpy`` or ``torch``, whose arrays the others are.
-        recent: as the buffer of :class:`ResidualScale`.
+        xp: ``numpy`` or ``torch``, the library of the other arrays.
+        recent: the buffer of :class:`ResidualScale`.
         old: the state before the batch.
         batch: rows and half range of this batch.
     """
@@ -241,7 +241,7 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     size = xp.abs(residual)
     share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
-    # where most residuals are exactly 0, their mean size stands for the quantile
+    # if most residuals are exactly 0, the mean absolute residual replaces the quantile
     candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
     known = (candidate > 0) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
@@ -249,11 +249,11 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     rate = at_least(xp, 1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE)
     log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
     floor = old.floor
-    if xp is not np or first.any():  # NumPy may look
+    if xp is not np or first.any():  # only NumPy may branch on a value
         middle = (residual * share).sum(-1)
         spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
         scale = xp.exp(log_scale)
-        # an offset widens the scale, targets that are wrong by far widen the spread
+        # an offset widens the scale; far outliers widen the spread: take the smaller
         own = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
         floor = xp.where(first, own, old.floor)
     wider = xp.maximum(batch.half_range, RANGE_DECAY * old.half_range)
@@ -266,10 +266,10 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
 
 
 def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
-    """The least value, of each channel, up to which a share ``level`` of the weight lies; (m, L), (m, L) -> (m,)."""
+    """Weighted quantile of each channel: the smallest value up to which a share ``level`` of the weight lies, (m,)."""
     if xp is np:
         equal = weight == (weight > 0)
-        if equal.all():  # sorting alone is several times as fast as sorting weights along
+        if equal.all():  # sorting values alone is several times as fast as sorting weights with them
             ordered = np.sort(np.where(weight > 0, values, np.inf), -1)
             rank = np.ceil(level * weight.sum(-1)).astype(np.int64) - 1
             found = np.take_along_axis(ordered, rank.clip(0)[:, None], -1)[:, 0]
@@ -285,7 +285,7 @@ def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
 
 
 def spaced_rows(values: Tensor, axis: int, most: int) -> Float[Tensor, "n m"]:
-    """As many evenly spaced samples as asked for, or all if they are fewer, with their channels last."""
+    """At most ``most`` evenly spaced samples, channels last."""
     moved = values.movedim(axis, -1)
     shape = moved.shape[:-1]
     count = shape.numel()
@@ -294,7 +294,7 @@ def spaced_rows(values: Tensor, axis: int, most: int) -> Float[Tensor, "n m"]:
     index = torch.arange(most, device=values.device) * count // most
     if moved.dim() == 2 or moved.is_contiguous():
         return moved.reshape(count, moved.shape[-1])[index]
-    # channels that are not last in memory: a reshape would copy the whole batch
+    # channels are not last in memory: a reshape would copy the whole batch
     places = []
     for size in reversed(shape):
         places.append(index % size)
@@ -303,7 +303,7 @@ def spaced_rows(values: Tensor, axis: int, most: int) -> Float[Tensor, "n m"]:
 
 
 def numpy_may_read(*values: Tensor) -> bool:
-    """Whether NumPy may read and write the memory of tensors: on the CPU, in eager code, under no transform."""
+    """Whether NumPy may read and write the tensors' memory: on the CPU, in eager code, outside function transforms."""
     return not torch.compiler.is_compiling() and all(
         type(value) in (Tensor, nn.Parameter) and value.device.type == "cpu" and not is_wrapped(value)
         for value in values
@@ -311,7 +311,7 @@ def numpy_may_read(*values: Tensor) -> bool:
 
 
 def average_over_processes(values: Sequence[Float[Tensor, " m"]]) -> Sequence[Float[Tensor, " m"]]:
-    """The means over the processes of a distributed training."""
+    """Means over the processes of a distributed training."""
     if not is_distributed():
         return values
     means = torch.stack(list(values))
@@ -326,9 +326,9 @@ def is_distributed() -> bool:
 
 
 def alike_in_all_processes(state: ScaleState) -> ScaleState:
-    """The state that all processes of a distributed training go on with: mean scales, the widest range.
+    """The common state of all processes in distributed training: the mean scales, the widest half range.
 
-    Of a channel that has had no batch in a process, the others' scale and range are taken.
+    Processes in which a channel has had no batch are left out of that channel's mean.
     """
     if not is_distributed():
         return state

@@ -1,4 +1,4 @@
-"""What a fitted loss says of single samples: inlier weights, outlier flags, errors beyond the bound, intervals."""
+"""Single samples under a fitted loss: inlier weights, outlier flags, errors beyond the bound, intervals."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["BeyondBound", "PredictiveInterval", "beyond_bound", "inlier_weight",
 
 @dataclass(frozen=True)
 class BeyondBound:
-    """How many errors of each channel that count lie beyond the loss's bound, and their share of the weight, (m,)."""
+    """Number of each channel's unmasked errors beyond the loss's bound, and their share of the weight, (m,) each."""
 
     count: Int[Tensor, " m"]
     share: Float[Tensor, " m"]
 
 
 class PredictiveInterval(NamedTuple):
-    """Ends of an interval about each prediction, of its shape and unit."""
+    """Ends of an interval around each prediction, in its shape and unit."""
 
     low: Float[Tensor, "*shape"]
     high: Float[Tensor, "*shape"]
@@ -39,10 +39,10 @@ class PredictiveInterval(NamedTuple):
 def inlier_weight(
     loss: MKCLoss, input: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]
 ) -> Float[Tensor, "*shape"]:
-    """How far the loss believes each element: ``exp(-e² / (2 d² σ²))``, 1 on the prediction and 0 far from it.
+    """Inlier weight of each element, ``exp(-e² / (2 d² σ²))``: 1 at the prediction, 0 far from it.
 
-    It is the weight of the error in the paper's fixed point (15), the loss's pull relative to that of least squares.
-    At σ = ∞ every weight is 1: the loss has found no outliers.
+    It is the weight of the error in the paper's fixed point (15): the gradient relative to that of least squares. At
+    σ = ∞ every weight is 1: the loss has found no outliers.
 
     Args:
         loss: the loss with its current σ and d.
@@ -53,8 +53,8 @@ def inlier_weight(
         Weights in [0, 1] of the shape of ``input``, float32 at least, without a gradient.
 
     Raises:
-        TypeError: a loss of another kind; integer or complex input or target, or what is no tensor.
-        ValueError: shapes differ, are empty, or have another number of channels than the loss; an error is NaN. An
+        TypeError: a loss of another class; integer or complex input or target, or an argument that is not a tensor.
+        ValueError: shapes that differ, are empty, or have another number of channels than the loss; a NaN error. An
             infinite error has the weight 0.
 
     References:
@@ -75,9 +75,9 @@ def inlier_weight(
 def outliers(
     loss: MKCLoss, input: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"], weight_below: float = 0.1
 ) -> Bool[Tensor, "*shape"]:
-    """Which elements the loss sets aside: those whose :func:`inlier_weight` is below a limit.
+    """Outlier flags: True where :func:`inlier_weight` is below a limit.
 
-    At the limit 0.1 these are the errors greater than 2.15 σ d; at σ = ∞ there are none, however large an error is.
+    At the limit 0.1 these are the errors larger than 2.15 σ d. At σ = ∞ no error is flagged, however large.
 
     Args:
         loss, input, target: as in :func:`inlier_weight`.
@@ -109,10 +109,10 @@ def beyond_bound(
     target: Float[Tensor, "*shape"],
     weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
 ) -> BeyondBound:
-    """How many errors lie outside the domain on which the loss is a likelihood.
+    """Number and share of errors outside the domain of the density, per channel.
 
-    There the density is 0 and the loss a continuation with a finite gradient. A share of more than a few in a thousand
-    says that ``MKCLoss(bound=...)`` is smaller than what errors physically reach.
+    Outside the domain the density is 0, and the loss is continued with a finite gradient. A share above a few in a
+    thousand means that ``MKCLoss(bound=...)`` is smaller than the errors that physically occur.
 
     Args:
         loss: the loss with its bound.
@@ -121,12 +121,12 @@ def beyond_bound(
         weight: as for the loss: non-negative weights or a mask, of the shape of ``input`` or without its channels.
 
     Returns:
-        For each channel the number of elements of positive weight beyond the bound, and their share of the weight,
-        which is NaN for a channel of which nothing counts.
+        For each channel the number of elements of positive weight beyond the bound, and their share of the weight; NaN
+        for a channel whose weights are all 0.
 
     Raises:
         TypeError: as in :func:`inlier_weight`.
-        ValueError: as the loss: shapes, channels, weights, an input or a target that counts and is not finite.
+        ValueError: as the loss: shapes, channels, weights, an unmasked input or target that is not finite.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -152,11 +152,11 @@ def beyond_bound(
 
 @torch.no_grad()
 def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: float = 0.9) -> PredictiveInterval:
-    """The equal-tailed interval in which the density induced by the loss expects a target.
+    """Equal-tailed predictive interval of each target under the loss's density.
 
-    It is made of the noise alone: that the prediction itself is uncertain does not widen it. σ and d must have been
-    fitted, by learning them, by MKC-EM or by :func:`mkc_torch.fit_density` on residuals of data that the network has
-    not seen; those of a loss with ``normalize=False`` are what it was given.
+    The interval covers the noise alone, not the uncertainty of the prediction. σ and d must have been fitted: learned,
+    by MKC-EM, or by :func:`mkc_torch.fit_density` on residuals of data that the network has not seen. With
+    ``normalize=False`` they are the values passed to the loss.
 
     Args:
         loss: the loss with its current σ, d and bound.
@@ -168,7 +168,7 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
         more than ``1 - level``, the ends lie far out on the flat tail, within ``bound`` of the prediction.
 
     Raises:
-        TypeError: a loss of another kind; an integer or complex input, or what is no tensor.
+        TypeError: a loss of another class; an integer or complex input, or an argument that is not a tensor.
         ValueError: a level outside (0, 1), an input that is empty or not finite, or another number of channels than the
             loss.
 
@@ -178,16 +178,16 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
     Example:
         >>> loss = MKCLoss(1, sigma=float("inf"), d=1.0, learn_sigma=False)
         >>> predictive_interval(loss, torch.tensor([[10.0]]), level=0.95)
-        Interval(low=tensor([[8.0400]]), high=tensor([[11.9600]]))
+        PredictiveInterval(low=tensor([[8.0400]]), high=tensor([[11.9600]]))
     """
     checked_number("level", level, 0.0, 1.0, advice="0.9 leaves 5 % on either side")
     loss = checked_loss(loss)
     axis = loss._checked_axis(input, input)
     if not seems_finite(input):
         refuse_not_finite("input", input, DIVERGED)
-    # on the processor, since not every accelerator has float64
+    # on the CPU, because not every accelerator has float64
     kappa, d, bound = (t.detach().cpu().double() for t in (loss.kappa, loss.d, loss.bound))
-    density = MKCDistribution(kappa.rsqrt().clamp(min=SIGMA_MIN), d, bound)  # rounding may lead below the least σ
+    density = MKCDistribution(kappa.rsqrt().clamp(min=SIGMA_MIN), d, bound)  # rounding may lead below the smallest σ
     half = density.icdf(torch.tensor(0.5 + 0.5 * level, dtype=torch.float64))
     centre = input.to(at_least_float32(input))
     half = _along(half.to(centre), input, axis)
@@ -195,13 +195,13 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
 
 
 def _refuse_missing(error: Tensor) -> None:
-    """Refuse an error that is NaN: it is neither inlier nor outlier. An infinite error is an outlier."""
+    """Raise ValueError on a NaN error, which is neither inlier nor outlier. An infinite error is an outlier."""
     unknown = error.isnan()
     if bool(unknown.any()):
         raise ValueError(
             f"Expected `input - target` without NaN but got {int(unknown.sum())}, the first at index "
-            f"{tuple(unknown.nonzero()[0].tolist())}: neither inlier nor outlier. Where a target is missing put the "
-            "prediction, torch.where(torch.isfinite(target), target, input), which is never flagged."
+            f"{tuple(unknown.nonzero()[0].tolist())}: neither inlier nor outlier. Replace missing targets by the "
+            "prediction, torch.where(torch.isfinite(target), target, input); these are never flagged."
         )
 
 
@@ -210,7 +210,7 @@ def _error(input: Tensor, target: Tensor) -> Tensor:
 
 
 def _along(per_channel: Float[Tensor, " m"], input: Tensor, axis: int) -> Tensor:
-    """Broadcast against the input, the channels being its dimension ``axis``."""
+    """Values of each channel in a shape that broadcasts with the input, channels in dimension ``axis``."""
     shape = [1] * input.dim()
     shape[axis] = -1
     return per_channel.reshape(shape)

@@ -1,4 +1,4 @@
-"""The objective of one problem without constraints, with NumPy: a tensor operation costs more than its few numbers."""
+"""The descent for a single problem without constraints, in NumPy, since torch's overhead exceeds its few operations."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from mkc_torch.nonlinear._problem import NONLINEAR, TRUST, Descent, Problem, ProblemPoint
 
-__all__ = ["descended_alone", "is_alone"]
+__all__ = ["descend_single", "is_single"]
 
 Array = NDArray[np.float64]
 
 
-def is_alone(problem: Problem, point: ProblemPoint) -> bool:
-    """Whether there is one problem, without constraints, in double precision on the CPU."""
+def is_single(problem: Problem, point: ProblemPoint) -> bool:
+    """Whether this is a single problem, without constraints, in float64 on the CPU."""
     theta = point.theta
     return (
         len(theta) == 1
@@ -28,7 +28,7 @@ def is_alone(problem: Problem, point: ProblemPoint) -> bool:
     )
 
 
-def descended_alone(
+def descend_single(
     problem: Problem,
     point: ProblemPoint,
     kappa: Tensor,
@@ -40,22 +40,22 @@ def descended_alone(
     damping: Tensor | None,
     exact: bool,
 ) -> Descent:
-    """As :func:`mkc_torch.nonlinear._descent.descended`, of one problem without constraints, step for step."""
+    """As :func:`mkc_torch.nonlinear._descent.descend`, for a single problem without constraints, step for step."""
     eps = float(np.finfo(float).eps)
-    objective, at = _Objective(problem, kappa, d), _At.of(point)
+    objective, at = _Objective(problem, kappa, d), _Point.of(point)
     with np.errstate(all="ignore"):
         quadratic = objective.quadratic(at.theta, at.residual, at.tangents, None)
         model, scaling = _model_curvature(quadratic), _positive(quadratic.majoriser.diagonal())
         own, growth = 1e-4 if damping is None else float(damping[0]), 4.0
-        done = taken = tired = False
+        done = accepted = needs_refresh = False
         least = eps * eps * quadratic.value
         if allowance is not None:
             least = max(least, float(allowance[0]))
         n_iter = 0
         while n_iter < max_iter and not done:
-            if tired:
+            if needs_refresh:
                 point = problem.refreshed(point)
-                at = _At.of(point)
+                at = _Point.of(point)
                 quadratic = objective.quadratic(at.theta, at.residual, at.tangents, quadratic.value)
                 model = _model_curvature(quadratic)
                 scaling = _positive(np.maximum(quadratic.majoriser.diagonal(), 1e-6 * scaling))
@@ -68,29 +68,29 @@ def descended_alone(
             value = objective.value(theta, after)
             actual = quadratic.value - value
             limit = max(max(tol, 16 * eps) * quadratic.value, least)
-            # a step cut off by bounds may be one that the model itself thinks no good
+            # a step that bounds cut off may increase the model
             solved = solved and predicted >= -limit
             accept = solved and actual > 0
-            rest = solved and own <= 1.0 and predicted <= limit and not actual > limit
-            rest = rest or (solved and bool((np.abs(step) <= 4 * eps * np.abs(at.theta)).all()))
+            small = solved and own <= 1.0 and predicted <= limit and not actual > limit
+            small = small or (solved and bool((np.abs(step) <= 4 * eps * np.abs(at.theta)).all()))
             ratio = min(actual / max(predicted, np.finfo(float).tiny), 2.0)
-            taken = accept
+            accepted = accept
             if accept:
                 own, growth = own * min(max(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1), 2.0), 4.0
-            elif not rest:
-                # a step that old derivatives have led astray says nothing about the damping
+            elif not small:
+                # a failed step with stale derivatives does not raise the damping
                 own, growth = own if point.stale else own * growth, 2.0 * growth
             own = min(max(own, 100 * eps), 1e16)
-            unforeseen = _unforeseen(at, step, after) > NONLINEAR
-            led = point.stale and exact
-            tired = bool((unforeseen and accept and not rest) or (rest and led))
-            tired = tired or (point.stale and not accept and not rest)
-            done = rest and not led
+            unpredicted = _unpredicted_share(at, step, after) > NONLINEAR
+            must_refresh = point.stale and exact
+            needs_refresh = bool((unpredicted and accept and not small) or (small and must_refresh))
+            needs_refresh = needs_refresh or (point.stale and not accept and not small)
+            done = small and not must_refresh
             if accept:
-                stale = point.stale or not rest
+                stale = point.stale or not small
                 point = replace(point, theta=there, residual=residual, stale=stale)
-                at = _At(theta, after, at.tangents)
-                if n_iter < max_iter and not done and not tired:
+                at = _Point(theta, after, at.tangents)
+                if n_iter < max_iter and not done and not needs_refresh:
                     quadratic = objective.quadratic(theta, after, at.tangents, value)
                     model = _model_curvature(quadratic)
                 else:
@@ -102,15 +102,15 @@ def descended_alone(
         point,
         torch.full_like(like, quadratic.value),
         torch.full_like(like, done, dtype=torch.bool),
-        tired,
-        torch.full_like(like, taken, dtype=torch.bool),
+        needs_refresh,
+        torch.full_like(like, accepted, dtype=torch.bool),
         torch.full_like(like, own),
         n_iter,
     )
 
 
 @dataclass(frozen=True)
-class _At:
+class _Point:
     """Parameters (p,) with their residual (N, m) and tangents (p, N m)."""
 
     theta: Array
@@ -118,12 +118,12 @@ class _At:
     tangents: Array
 
     @classmethod
-    def of(cls, point: ProblemPoint) -> _At:
+    def of(cls, point: ProblemPoint) -> _Point:
         return cls(point.theta[0].numpy(), point.residual[0].numpy(), point.tangents[0].numpy())
 
 
-def _unforeseen(at: _At, step: Array, after: Array) -> float:
-    """The share of a step's effect on residuals that the derivatives at hand did not predict."""
+def _unpredicted_share(at: _Point, step: Array, after: Array) -> float:
+    """Share of a step's effect on the residuals that the derivatives did not predict."""
     linear = step @ at.tangents
     off = np.square((after - at.residual).reshape(-1) - linear).sum() / np.square(linear).sum()
     return 0.0 if np.isnan(off) else float(np.sqrt(off))
@@ -135,7 +135,7 @@ def _within(box: tuple[Array, ...] | None, theta: Array) -> Array:
 
 @dataclass(frozen=True)
 class _LocalModel:
-    """The objective about a point: its value, gradient (p,), and the curvatures (p, p) of it and of its majoriser."""
+    """Quadratic model of the objective: value, gradient (p,), its curvature and that of its majoriser, (p, p)."""
 
     value: float
     gradient: Array
@@ -144,10 +144,10 @@ class _LocalModel:
 
 
 class _Objective:
-    """One problem at fixed κ and d.
+    """Objective of a single problem at fixed κ and d.
 
     Args:
-        problem: of which there is one, see :func:`is_alone`.
+        problem: a single problem, see :func:`is_single`.
         kappa, d: (1, m).
     """
 
@@ -160,7 +160,7 @@ class _Objective:
         self._precision = problem.prior_precision.numpy() if problem.prior_precision is not None else None
 
     def value(self, theta: Array, residual: Array) -> float:
-        """The objective of parameters (p,) with this residual (N, m)."""
+        """Objective at parameters (p,) with this residual (N, m)."""
         z = residual / self.d
         q = 0.5 * z * z
         x = self.kappa * q
@@ -169,7 +169,7 @@ class _Objective:
         return float((energy if self.weight is None else self.weight * energy).sum()) + self._prior(theta)
 
     def quadratic(self, theta: Array, residual: Array, tangents: Array, value: float | None) -> _LocalModel:
-        """The quadratic model with tangents (p, N m); ``value`` is the objective where it is known."""
+        """Quadratic model with tangents (p, N m); ``value`` is the objective if known."""
         precision = self.d**-2.0
         x = np.square(residual) * (precision * self.kappa)
         w = np.exp(-x / 2.0) * precision
@@ -193,7 +193,7 @@ class _Objective:
 
 
 def _model_curvature(quadratic: _LocalModel) -> Array:
-    """The objective's own curvature where it is safely positive, and that of the majoriser elsewhere."""
+    """Curvature of the objective where it is safely positive, else that of the majoriser."""
     majoriser = quadratic.majoriser
     scale = 1.0 / np.sqrt(_positive(majoriser.diagonal()))
     scaled = majoriser * scale[:, None] * scale + 100 * np.finfo(float).eps * np.eye(len(scale))
@@ -210,14 +210,14 @@ def _model_curvature(quadratic: _LocalModel) -> Array:
 
 
 def _positive(diagonal: Array) -> Array:
-    """Marquardt's scaling; a parameter without effect has no scale and gets 1."""
+    """Marquardt's scaling; a parameter without effect gets 1."""
     return np.where(diagonal > 0, diagonal, 1.0)
 
 
 def _damped_step(
     box: tuple[Array, ...] | None, theta: Array, quadratic: _LocalModel, model: Array, scaling: Array, damping: float
 ) -> tuple[Array, float, bool]:
-    """The damped step within the box, the decrease that the model predicts for it, and whether it could be solved."""
+    """Damped step within the box, its predicted decrease, and whether the linear system could be solved."""
     damped = model + np.diag(damping * scaling)
     gradient, step = quadratic.gradient, np.zeros_like(theta)
     held = np.zeros(len(theta), dtype=bool)
@@ -225,15 +225,15 @@ def _damped_step(
         held = ((theta <= box[0]) & (gradient > 0)) | ((theta >= box[1]) & (gradient < 0))
     solved = True
     for _ in range(len(theta) + 1):
-        pulled = gradient + damped @ np.where(held, step, 0.0)
+        linear_term = gradient + damped @ np.where(held, step, 0.0)
         matrix = np.where(held[:, None] | held, 0.0, damped) + np.diag(np.where(held, _positive(scaling), 0.0))
-        free, solved = _solved(matrix, np.where(held, 0.0, -pulled))
+        free, solved = _solved(matrix, np.where(held, 0.0, -linear_term))
         step = np.where(held, step, free)
         if box is None:
             break
         beyond = ~held & ((theta + step < box[0]) | (theta + step > box[1]))
         step = np.where(beyond, np.minimum(np.maximum(theta + step, box[0]), box[1]) - theta, step)
-        # a parameter that meets its bound stays there while the others are solved for again
+        # a parameter that reaches its bound stays there while the others are solved for again
         if not beyond.any():
             break
         held = held | beyond
@@ -242,7 +242,7 @@ def _damped_step(
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, bool]:
-    """The solution with a positive definite matrix, and whether it is one."""
+    """Solution for a positive definite matrix, and whether the matrix is positive definite."""
     try:
         lower = np.linalg.cholesky(matrix)
         return np.linalg.solve(lower.T, np.linalg.solve(lower, right)), bool(np.isfinite(lower).all())

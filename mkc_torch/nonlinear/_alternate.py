@@ -1,4 +1,4 @@
-"""MKC-EM: the density of the residual and the parameters in turn."""
+"""MKC-EM: alternating updates of the residual's density and of the parameters."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from torch import Tensor
 
 from mkc_torch.density.em import gaussian_state, normalised, spread, written
 from mkc_torch.density.likelihood import DensityState, conclusive, newton_step
-from mkc_torch.nonlinear._constraints import constrained
+from mkc_torch.nonlinear._constraints import descend_constrained
 from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
 
-__all__ = ["AlternatingMaximum", "alternated", "gaussian_candidate", "likelihood_of"]
+__all__ = ["AlternatingMaximum", "alternate", "gaussian_candidate", "likelihood_of"]
 
 
 @dataclass(frozen=True)
 class _Likelihood:
-    """What the E-step needs of a problem: normalised weights (B, N, m) and the total of each channel (B, m)."""
+    """Data of the E-step: normalised weights (B, N, m) and the total weight of each channel (B, m)."""
 
     weight: Tensor | None
     total: Tensor
@@ -46,7 +46,7 @@ class AlternatingMaximum:
     penalty: Penalty | None
 
 
-def alternated(
+def alternate(
     problem: Problem,
     likelihood: _Likelihood,
     point: ProblemPoint,
@@ -57,7 +57,7 @@ def alternated(
     exact: bool = True,
     penalty: Penalty | None = None,
 ) -> AlternatingMaximum:
-    """E-steps on (σ, d) and damped steps on θ in turn, until they bring less than ``tol`` nats and promise no more."""
+    """Alternate E-steps on (σ, d) and damped steps on θ until gain and predicted gain are below ``tol`` nats."""
     eps = torch.finfo(point.theta.dtype).eps
     share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
     samples = likelihood.total.mean(-1)
@@ -73,7 +73,7 @@ def alternated(
         value = (share * state.value).sum(-1) + prior_value(problem, point.theta) / samples
         change = (previous - value).abs() if problem.is_inequality is not None else previous - value
         improved = change > tol + 8 * eps * value.abs()
-        # rounding can make a Newton step that has nothing left to gain look like a failed one
+        # rounding can make a Newton step at the optimum look like a failed step
         earlier, settled = settled, conclusive(before, state)
         calm = ~improved.unsqueeze(-1) & (calm | settled | earlier)
         done = calm.all(-1) & stepped
@@ -81,7 +81,7 @@ def alternated(
         if bool(done.all()):
             break
         kappa, d = state.kappa, torch.exp(state.log_d)
-        found, penalty = constrained(
+        found, penalty = descend_constrained(
             problem,
             point,
             kappa,
@@ -94,8 +94,8 @@ def alternated(
             exact=exact,
         )
         n_iter += found.n_iter
-        damping, stepped, point = found.damping, found.quiet, found.point
-        if found.tired:
+        damping, stepped, point = found.damping, found.converged, found.point
+        if found.needs_refresh:
             point = problem.refreshed(point)
     return AlternatingMaximum(point, state, previous, done, n_iter, penalty)
 
@@ -103,7 +103,7 @@ def alternated(
 def gaussian_candidate(
     problem: Problem, likelihood: _Likelihood, maximum: AlternatingMaximum, *, max_iter: int, tol: float
 ) -> AlternatingMaximum:
-    """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
+    """Continue from a Gaussian density at weighted least squares where it has a higher likelihood than the result."""
     state = maximum.state
     point = problem.refreshed(maximum.point)
     tailed = (state.kappa > 0).any(-1)
@@ -111,7 +111,7 @@ def gaussian_candidate(
         return replace(maximum, point=point)
     d_min = torch.exp(state.log_d_min)
 
-    # the linear model of the residual shows whether the Gaussian stands a chance before any fit is made
+    # the linearised residual shows whether a Gaussian can have a higher likelihood, before a fit is made
     d = spread(point.residual, likelihood.weight, d_min)
     residual = point.residual
     for _ in range(1 if d.shape[-1] == 1 else 2):
@@ -135,10 +135,10 @@ def gaussian_candidate(
     if index.numel() == 0:
         return replace(maximum, point=point)
     part, part_likelihood = problem.select(index), likelihood.select(index)
-    begun = replace(gaussian.select(index), free_kappa=False)
-    again = alternated(part, part_likelihood, point.select(index), begun, max_iter=max_iter, tol=tol)
-    freed = replace(again.state, free_kappa=True, damping=torch.full_like(again.state.damping, 1e-3))
-    again = alternated(part, part_likelihood, again.point, freed, max_iter=max_iter, tol=tol, penalty=again.penalty)
+    initial = replace(gaussian.select(index), free_kappa=False)
+    again = alternate(part, part_likelihood, point.select(index), initial, max_iter=max_iter, tol=tol)
+    released = replace(again.state, free_kappa=True, damping=torch.full_like(again.state.damping, 1e-3))
+    again = alternate(part, part_likelihood, again.point, released, max_iter=max_iter, tol=tol, penalty=again.penalty)
     won = (again.value < maximum.value[index]).nonzero().squeeze(-1)
     if won.numel() == 0:
         return replace(maximum, point=point, n_iter=maximum.n_iter + again.n_iter)

@@ -1,4 +1,4 @@
-"""The arguments of a problem, checked."""
+"""Checks of the arguments of a problem."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mkc_torch.nonlinear._descent import within
 from mkc_torch.nonlinear._problem import TANGENTS, Constraint, Problem, ProblemPoint
 from mkc_torch.nonlinear.prior import GaussianPrior
 
-__all__ = ["per_channel", "prepared", "refuse_out_of_reach"]
+__all__ = ["per_channel", "prepare", "refuse_out_of_reach"]
 
 
 class NoFitError(ValueError):
-    """A residual that cannot be fitted from there: it is not finite, has no slope, or is out of the domain's reach."""
+    """The residual cannot be fitted from the start: not finite, without finite derivatives, or beyond the domain."""
 
 
 def refuse_out_of_reach(bound: Tensor, scale: Tensor) -> None:
-    """Refuse a start whose residuals are too large for the domain of errors: the head of the density would not fit.
+    """Refuse a start whose residuals are too large for the domain: the head of the density would not fit.
 
     Args:
         bound: half-width of the domain, (*, m).
@@ -38,13 +38,13 @@ def refuse_out_of_reach(bound: Tensor, scale: Tensor) -> None:
         first = tuple(narrow.nonzero()[0])
         channel = f" of channel {int(first[-1])}" if bound.shape[-1] > 1 else ""
         raise NoFitError(
-            f"The fit begins too far from the data: the residuals{channel} have a robust scale of "
-            f"{scale[first].item():.4g}, and the domain of errors, `bound`, reaches to {bound[first].item():.4g}, "
-            f"less than two of that. Begin nearer, or give a `bound` of {2.0 * scale[first].item():.4g} or more."
+            f"The start is too far from the data: expected a `bound` of at least two robust scales of the residuals"
+            f"{channel}, {scale[first].item():.4g}, but got {bound[first].item():.4g}. Start nearer, or pass a `bound` "
+            f"of {2.0 * scale[first].item():.4g} or more."
         )
 
 
-def prepared(
+def prepare(
     residual: Residual,
     start: Tensor,
     *,
@@ -57,12 +57,12 @@ def prepared(
     inequality: Constraint | None,
     jacobian: str,
 ) -> tuple[Problem, ProblemPoint]:
-    """The checked problem and its start."""
+    """Return the checked problem and its start."""
     for name, function in (("residual", residual), ("equality", equality), ("inequality", inequality)):
         if not callable(function) and (name == "residual" or function is not None):
             raise TypeError(
-                f"Expected argument `{name}` to be a function of the parameters but got {format_value(function)}; write "
-                "lambda theta: ..."
+                f"Expected argument `{name}` to be a function of the parameters but got {format_value(function)}; "
+                "write lambda theta: ..."
             )
     refuse_not_real("start", start)
     if start.dtype in (torch.float16, torch.bfloat16):
@@ -76,7 +76,8 @@ def prepared(
         )
     if jacobian not in TANGENTS:
         raise ValueError(
-            f"Expected argument `jacobian` to be 'forward', 'reverse' or 'reverse twice' but got {jacobian!r}."
+            f"Expected argument `jacobian` to be 'forward', 'reverse' or 'reverse twice' but got {jacobian!r}; "
+            "'forward' suits few parameters."
         )
     batch, p = start.shape[:-1], start.shape[-1]
     theta = start.detach().reshape(-1, p)
@@ -84,7 +85,7 @@ def prepared(
     theta = within(box, theta)
     for leaf in tree_leaves(data):
         if data is not None:
-            refuse_other_type("data", leaf, Tensor, "tensors", "close over what is none, lambda theta, data: ...")
+            refuse_other_type("data", leaf, Tensor, "tensors", "let `residual` close over other values")
         if isinstance(leaf, Tensor) and leaf.shape[: len(batch)] != batch:
             raise ValueError(
                 f"Expected every tensor in argument `data` to begin with the batch dimensions {tuple(batch)} of "
@@ -111,7 +112,8 @@ def prepared(
         )
     if first.dtype != theta.dtype:
         raise TypeError(
-            f"Expected `residual` to return the dtype of `start`, {theta.dtype}, but got {first.dtype}; convert one."
+            f"Expected `residual` to return the dtype of `start`, {theta.dtype}, but got {first.dtype}; "
+            "convert it, residual.to(start)."
         )
     full_weight, used = _checked_weight(weight, first, batch)
     count = torch.full_like(theta[:, 0], float(first[0].numel())) if used is None else used.sum((-2, -1)).to(theta)
@@ -146,7 +148,7 @@ def prepared(
 def per_channel(
     name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool, least: float = 0.0
 ) -> Tensor:
-    """A positive parameter of every channel, (B, m), from a number, (m,) or (*, m)."""
+    """Return a positive parameter of every channel, (B, m), from a number, (m,) or (*, m)."""
     t = as_numbers(name, value, like.dtype, like.device).to(like)
     if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
         kind = "positive" if infinite else "positive and finite"
@@ -215,7 +217,7 @@ def _checked_prior(prior: GaussianPrior | None, theta: Tensor) -> tuple[Tensor |
 
 
 def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> tuple[Tensor | None, Tensor | None]:
-    """Weights (B, N, m) and which of them are positive; None where all are."""
+    """Weights (B, N, m), and a mask of the positive weights, or None if all are positive."""
     if weight is None:
         return None, None
     N, m = first.shape[1:]
@@ -236,10 +238,10 @@ def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> 
 
 def _constraint_count(name: str, constraint: Constraint, theta: Tensor) -> int:
     value = constraint(theta)
-    refuse_other_type(name, value, Tensor, "a function that returns a tensor (k,)", "make one of its result")
+    refuse_other_type(name, value, Tensor, "a function that returns a tensor (k,)", "return a tensor")
     if value.dim() != 1 or not bool(torch.isfinite(value).all()):
         raise ValueError(
             f"Expected argument `{name}` to return finite values (k,) at `start` but got {value.tolist()}; "
-            "one constraint is (1,)."
+            "a single constraint is (1,)."
         )
     return value.shape[0]

@@ -1,4 +1,4 @@
-"""Equalities and inequalities: descents with better and better multipliers."""
+"""Equalities and inequalities by an augmented Lagrangian: descents with updated multipliers."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear._descent import Descent, descended
+from mkc_torch.nonlinear._descent import Descent, descend
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
 
-__all__ = ["constrained"]
+__all__ = ["descend_constrained"]
 
 _MULTIPLIERS = 30
-"""Sets of multipliers at most."""
+"""Largest number of updates of the multipliers."""
 
 _STIFFNESS = 100.0
-"""Curvature of the penalty over that of the objective along a constraint: each outer step gains about this factor."""
+"""Curvature of the penalty over that of the objective along a constraint; each update gains about this factor."""
 
 
-def constrained(
+def descend_constrained(
     problem: Problem,
     point: ProblemPoint,
     kappa: Tensor,
@@ -33,11 +33,11 @@ def constrained(
     allowance: Tensor | None = None,
     exact: bool = True,
 ) -> tuple[Descent, Penalty | None]:
-    """A descent, repeated with better multipliers until the constraints hold."""
+    """Descend, and repeat with updated multipliers until the constraints hold."""
     if penalty is None and problem.is_inequality is not None:
         penalty = _first_penalty(problem, problem.refreshed(point), kappa, d)
     if penalty is None:
-        found = descended(
+        found = descend(
             problem,
             point,
             kappa,
@@ -55,7 +55,7 @@ def constrained(
     holds = torch.zeros_like(point.theta[:, 0], dtype=torch.bool)
     previous: Tensor | None = None
     for outer in range(_MULTIPLIERS):
-        found = descended(
+        found = descend(
             problem,
             problem.refreshed(point),
             kappa,
@@ -71,7 +71,7 @@ def constrained(
         assert point.normals is not None
         assert problem.is_inequality is not None
         multiplier = penalty.rho * penalty.excess(problem, point.constraint)
-        # a constraint rests when it holds and, where it is an inequality with slack, pulls no more
+        # a constraint has converged when it holds and, for an inequality with slack, its multiplier is 0
         off = torch.where(
             problem.is_inequality,
             torch.maximum(point.constraint, multiplier / penalty.rho).abs(),
@@ -86,15 +86,15 @@ def constrained(
         stiff = _first_penalty(problem, point, kappa, d)
         assert stiff is not None
         rho = torch.maximum(rho, stiff.rho)
-        if bool((holds & found.quiet).all()) and 10.0 ** (-3 - 2 * outer) <= max(tol, 1e-9):
+        if bool((holds & found.converged).all()) and 10.0 ** (-3 - 2 * outer) <= max(tol, 1e-9):
             break
         previous = off
         penalty = Penalty(multiplier, rho)
-    return replace(found, n_iter=n_iter, quiet=found.quiet & holds), penalty
+    return replace(found, n_iter=n_iter, converged=found.converged & holds), penalty
 
 
 def _first_penalty(problem: Problem, point: ProblemPoint, kappa: Tensor, d: Tensor) -> Penalty | None:
-    """Multipliers 0 and a ρ that is stiff against the objective along each constraint."""
+    """Multipliers 0, and a ρ that is stiff compared to the objective along each constraint."""
     if point.constraint is None or point.normals is None:
         return None
     majoriser = quadratic_about(problem, point, kappa, d, None).majoriser
@@ -102,6 +102,6 @@ def _first_penalty(problem: Problem, point: ProblemPoint, kappa: Tensor, d: Tens
     scaled = majoriser * scale.unsqueeze(-1) * scale.unsqueeze(-2)
     eye = torch.eye(scale.shape[-1], dtype=scale.dtype, device=scale.device)
     normals = point.normals * scale.unsqueeze(-2)
-    yielding = (normals * torch.linalg.solve(scaled + 1e-6 * eye, normals.mT).mT).sum(-1)
-    rho = _STIFFNESS / torch.where(yielding > 0, yielding, 1.0)
+    compliance = (normals * torch.linalg.solve(scaled + 1e-6 * eye, normals.mT).mT).sum(-1)
+    rho = _STIFFNESS / torch.where(compliance > 0, compliance, 1.0)
     return Penalty(torch.zeros_like(rho), rho)

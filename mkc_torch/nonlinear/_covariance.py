@@ -1,4 +1,4 @@
-"""The covariance of the parameters, within the bounds and constraints that hold them."""
+"""Covariance of the parameters, within active bounds and constraints."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def parameter_covariance(
     kind: CovarianceKind,
     bandwidth: float | None,
 ) -> Float[Tensor, "B p p"]:
-    """Sandwich in coordinates of column norm 1, within the active bounds and constraints."""
+    """Sandwich covariance, computed with columns scaled to norm 1, within the active bounds and constraints."""
     quadratic = quadratic_about(problem, point, kappa, d, None)
     size = positive(quadratic.majoriser.diagonal(dim1=-2, dim2=-1)).rsqrt()
     curvature = quadratic.curvature * size.unsqueeze(-1) * size.unsqueeze(-2)
@@ -52,7 +52,7 @@ def parameter_covariance(
     left = used - free.diagonal(dim1=-2, dim2=-1).sum(-1).round()
     covariance = sandwich(curvature, score, used / left.clamp(min=1.0), kind, bandwidth)
     if problem.prior_precision is not None:
-        # the prior is one more measurement, of its own precision
+        # the prior is a further measurement with its own precision
         inverse = torch.linalg.pinv(curvature, hermitian=True) @ free
         extra = problem.prior_precision * size.unsqueeze(-1) * size.unsqueeze(-2)
         covariance = covariance + inverse @ extra @ inverse.mT
@@ -63,7 +63,7 @@ def parameter_covariance(
 
 
 def _active_normals(problem: Problem, point: ProblemPoint, gradient: Tensor, penalty: Penalty | None) -> Tensor:
-    """Normals (B, k, p) of the bounds and constraints that hold the parameters; 0 for those that do not."""
+    """Normals (B, k, p) of the active bounds and constraints; 0 for inactive ones."""
     B, p = point.theta.shape
     rows = [torch.zeros(B, 1, p, dtype=gradient.dtype, device=gradient.device)]
     if problem.box is not None:
@@ -71,6 +71,6 @@ def _active_normals(problem: Problem, point: ProblemPoint, gradient: Tensor, pen
         rows.append(torch.diag_embed(at.to(gradient.dtype)))
     if penalty is not None and point.constraint is not None and point.normals is not None:
         assert problem.is_inequality is not None
-        pulls = ~problem.is_inequality | (penalty.rho * penalty.excess(problem, point.constraint) < 0)
-        rows.append(point.normals * pulls.to(gradient.dtype).unsqueeze(-1))
+        active = ~problem.is_inequality | (penalty.rho * penalty.excess(problem, point.constraint) < 0)
+        rows.append(point.normals * active.to(gradient.dtype).unsqueeze(-1))
     return torch.cat(rows, -2)

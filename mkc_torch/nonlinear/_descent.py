@@ -1,4 +1,4 @@
-"""Damped steps within a box: Levenberg-Marquardt on one objective."""
+"""Levenberg-Marquardt on one objective: damped steps within a box."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear._alone import descended_alone, is_alone
+from mkc_torch.nonlinear._alone import descend_single, is_single
 from mkc_torch.nonlinear._problem import NONLINEAR, Descent, Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, model_curvature, objective, positive, quadratic_about
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Descent", "damped_step", "descended", "within"]
+__all__ = ["Descent", "damped_step", "descend", "within"]
 
 
 def within(box: tuple[Tensor, Tensor] | None, theta: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def within(box: tuple[Tensor, Tensor] | None, theta: Tensor) -> Tensor:
 def damped_step(
     problem: Problem, theta: Tensor, gradient: Tensor, model: Tensor, scaling: Tensor, damping: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The damped step within the box, the decrease that the model predicts for it, and whether it could be solved."""
+    """Damped step within the box, its predicted decrease, and whether the linear system could be solved."""
     damped = model + torch.diag_embed(damping.unsqueeze(-1) * scaling)
     held = torch.zeros_like(theta, dtype=torch.bool)
     step = torch.zeros_like(theta)
@@ -34,18 +34,18 @@ def damped_step(
         held = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
     solved = torch.ones_like(damping, dtype=torch.bool)
     for _ in range(theta.shape[-1] + 1):
-        pulled = gradient + torch.matmul(damped, torch.where(held, step, 0.0).unsqueeze(-1)).squeeze(-1)
+        linear_term = gradient + torch.matmul(damped, torch.where(held, step, 0.0).unsqueeze(-1)).squeeze(-1)
         coupled = held.unsqueeze(-1) | held.unsqueeze(-2)
         matrix = torch.where(coupled, 0.0, damped) + torch.diag_embed(torch.where(held, positive(scaling), 0.0))
         factor, failed = torch.linalg.cholesky_ex(matrix)
         solved = failed == 0
-        free = torch.cholesky_solve(torch.where(held, 0.0, -pulled).unsqueeze(-1), factor).squeeze(-1)
+        free = torch.cholesky_solve(torch.where(held, 0.0, -linear_term).unsqueeze(-1), factor).squeeze(-1)
         step = torch.where(held, step, free)
         if problem.box is None:
             break
         beyond = ~held & ((theta + step < lower) | (theta + step > upper))
         step = torch.where(beyond, within(problem.box, theta + step) - theta, step)
-        # a parameter that meets its bound stays there while the others are solved for again
+        # a parameter that reaches its bound stays there while the others are solved for again
         if not bool(beyond.any()):
             break
         held = held | beyond
@@ -53,7 +53,7 @@ def damped_step(
     return step, predicted, solved & torch.isfinite(step).all(-1)
 
 
-def descended(
+def descend(
     problem: Problem,
     point: ProblemPoint,
     kappa: Tensor,
@@ -66,13 +66,13 @@ def descended(
     damping: Tensor | None = None,
     exact: bool = True,
 ) -> Descent:
-    """Levenberg-Marquardt on the objective at fixed σ, d and penalty; never uphill.
+    """Levenberg-Marquardt on the objective at fixed σ, d and penalty; the objective never rises.
 
-    A problem rests when a barely damped step promises and brings no more than ``tol`` of the objective, or than
-    ``allowance``; unless ``exact``, with derivatives of a point nearby too.
+    A problem has converged when a step with little damping has a predicted and an actual decrease of at most ``tol`` of
+    the objective, or of ``allowance``. Without ``exact``, derivatives of a nearby point suffice for that.
     """
-    if penalty is None and is_alone(problem, point):
-        return descended_alone(
+    if penalty is None and is_single(problem, point):
+        return descend_single(
             problem, point, kappa, d, max_iter=max_iter, tol=tol, allowance=allowance, damping=damping, exact=exact
         )
     eps = torch.finfo(point.theta.dtype).eps
@@ -83,13 +83,13 @@ def descended(
         damping = torch.full_like(quadratic.value, 1e-4)
     growth = torch.full_like(damping, 4.0)
     done = torch.zeros_like(damping, dtype=torch.bool)
-    taken = torch.zeros_like(done)
+    accepted = torch.zeros_like(done)
     least = eps * eps * quadratic.value
     if allowance is not None:
         least = torch.maximum(least, allowance)
-    n_iter, tired = 0, False
+    n_iter, needs_refresh = 0, False
     while n_iter < max_iter and not bool(done.all()):
-        if tired:
+        if needs_refresh:
             point = problem.refreshed(point)
             quadratic = quadratic_about(problem, point, kappa, d, penalty, quadratic.value)
             model = model_curvature(quadratic)
@@ -101,41 +101,45 @@ def descended(
         value = objective(problem, theta, residual, constraint, kappa, d, penalty)
         actual = quadratic.value - value
         limit = torch.maximum(max(tol, 16 * eps) * quadratic.value, least)
-        # a step cut off by bounds may be one that the model itself thinks no good
+        # a step that bounds cut off may increase the model
         solved = solved & (predicted >= -limit)
         accept = solved & (actual > 0) & ~done
-        rest = solved & (damping <= 1.0) & (predicted <= limit) & ~(actual > limit)
-        rest = rest | (solved & (step.abs() <= 4 * eps * point.theta.abs()).all(-1))
+        small = solved & (damping <= 1.0) & (predicted <= limit) & ~(actual > limit)
+        small = small | (solved & (step.abs() <= 4 * eps * point.theta.abs()).all(-1))
         ratio = (actual / predicted.clamp(min=torch.finfo(actual.dtype).tiny)).clamp(max=2.0)
         shrink = (1.0 - (2.0 * ratio - 1.0).pow(3)).clamp(0.1, 2.0)
-        taken = torch.where(done, taken, accept)
-        blamed = ~accept & ~rest & ~done
-        # a step that old derivatives have led astray says nothing about the damping
+        accepted = torch.where(done, accepted, accept)
+        failed_step = ~accept & ~small & ~done
+        # a failed step with stale derivatives does not raise the damping
         changed = torch.where(
-            accept, damping * shrink, torch.where(blamed & (not point.stale), damping * growth, damping)
+            accept, damping * shrink, torch.where(failed_step & (not point.stale), damping * growth, damping)
         )
-        growth = torch.where(accept, 4.0, torch.where(blamed, 2.0 * growth, growth))
+        growth = torch.where(accept, 4.0, torch.where(failed_step, 2.0 * growth, growth))
         damping = torch.where(done, damping, changed.clamp(100 * eps, 1e16))
-        unforeseen = _unforeseen(point, step, residual, constraint) > NONLINEAR
-        led = point.stale and exact
-        tired = bool((unforeseen & accept & ~rest).any()) or bool((rest & led | blamed & point.stale).any())
-        done = done | (rest & (not led))
+        unpredicted = _unpredicted_share(point, step, residual, constraint) > NONLINEAR
+        must_refresh = point.stale and exact
+        needs_refresh = bool((unpredicted & accept & ~small).any()) or bool(
+            (small & must_refresh | failed_step & point.stale).any()
+        )
+        done = done | (small & (not must_refresh))
         if bool(accept.any()):
-            moved = bool((accept & ~rest).any())
+            moved = bool((accept & ~small).any())
             point = replace(point.moved(accept, theta, residual, constraint), stale=moved or point.stale)
             current = torch.where(accept, value, quadratic.value)
-            if n_iter < max_iter and not bool(done.all()) and not tired:
+            if n_iter < max_iter and not bool(done.all()) and not needs_refresh:
                 quadratic = quadratic_about(problem, point, kappa, d, penalty, current)
                 model = model_curvature(quadratic)
             else:
                 quadratic = replace(quadratic, value=current)
         elif bool((done | (damping >= 1e15)).all()):
             break
-    return Descent(point, quadratic.value, done, tired, taken, damping, n_iter)
+    return Descent(point, quadratic.value, done, needs_refresh, accepted, damping, n_iter)
 
 
-def _unforeseen(point: ProblemPoint, step: Tensor, residual: Tensor, constraint: Tensor | None) -> Float[Tensor, " B"]:
-    """The share of a step's effect on residuals and constraints that the derivatives at hand did not predict."""
+def _unpredicted_share(
+    point: ProblemPoint, step: Tensor, residual: Tensor, constraint: Tensor | None
+) -> Float[Tensor, " B"]:
+    """Share of a step's effect on residuals and constraints that the derivatives did not predict."""
     linear = torch.matmul(step.unsqueeze(-2), point.tangents).squeeze(-2)
     change = (residual - point.residual).flatten(1)
     error = (change - linear).square().sum(-1) / linear.square().sum(-1)

@@ -1,4 +1,4 @@
-"""How much of its targets a fit explains."""
+"""Robust share of the targets' variation that a fit explains."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["explained"]
 
 
 def explained(residual: Float[Tensor, "*batch N m"], target: Tensor) -> Float[Tensor, "*batch m"]:
-    """1 less the square of the ratio of the robust scales of residuals and targets.
+    """1 minus the squared ratio of the robust scales of residuals and targets.
 
     Args:
-        residual: of the fit.
+        residual: residual of the fit.
         target: (N,), (N, m) or (*, N, m).
     """
     refuse_not_real("target", target)
@@ -28,15 +28,15 @@ def explained(residual: Float[Tensor, "*batch N m"], target: Tensor) -> Float[Te
     if given.shape not in (shape, shape[-2:]) and given.shape != (*shape[-2:-1], 1):
         raise ValueError(
             f"Expected argument `target` of shape {tuple(shape)}, {tuple(shape[-2:])} or ({shape[-2]},), as the "
-            f"residual has, but got {tuple(target.shape)}; give what the residual is of."
+            f"residual, but got {tuple(target.shape)}; pass the targets of the residual."
         )
-    refuse_not_finite("target", given, "The scale is that of all targets")
+    refuse_not_finite("target", given, "The scale uses all targets")
     given = given.to(residual).expand(shape)
     middle = order_statistic(given, None, 0.5 * shape[-2]).unsqueeze(-2)
     whole = robust_scale(given - middle)
     if not bool((whole > 0).all()):
         raise ValueError(
-            "Expected argument `target` to scatter but got targets of which more than half are equal; there is nothing "
-            "to explain."
+            "Expected argument `target` to vary but got targets of which more than half are equal; their robust scale "
+            "is 0."
         )
     return 1.0 - (robust_scale(residual) / whole).square()

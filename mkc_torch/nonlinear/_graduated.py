@@ -1,4 +1,4 @@
-"""A start that outliers do not pull: kernels of many robust scales first, and of less than one at last."""
+"""A start that is robust to outliers: fits with kernels from many robust scales down to less than one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import order_statistic
-from mkc_torch.nonlinear._constraints import constrained
+from mkc_torch.nonlinear._constraints import descend_constrained
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 
 if TYPE_CHECKING:
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 __all__ = ["LEAST_SCALE", "graduated", "residual_scale"]
 
 LEAST_SCALE = 0.3
-"""Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
+"""Least d in robust scales. Outliers at most double a scale; the d of a fit that interpolates is far smaller."""
 
 _KERNELS = (10.0, 4.0, 1.6, 0.7)
-"""Widths of the kernel in robust scales, in turn: wide ones have few local minima, narrow ones no pull by outliers."""
+"""Successive kernel widths in robust scales: wide kernels have few local minima, narrow ones ignore outliers."""
 
 
 def residual_scale(problem: Problem, point: ProblemPoint) -> Float[Tensor, "B m"]:
-    """Robust scale of each channel, no less than the rounding error of the residual.
+    """Robust scale of each channel, and at least the rounding error of the residual.
 
     From the h-th smallest absolute residual, h = (N + p + 1) // 2 with p parameters a channel, since a narrow kernel
-    can interpolate p of them; 1 + 5 / (N - p) is the small-sample factor of Rousseeuw & Leroy, Robust Regression and
-    Outlier Detection (1987), p. 202, and N / (N - p) stands for the degrees of freedom.
+    can interpolate p of them. 1 + 5 / (N - p) is the small-sample factor of Rousseeuw & Leroy, Robust Regression and
+    Outlier Detection (1987), p. 202, and N / (N - p) corrects for the degrees of freedom.
     """
     N, m = point.residual.shape[1:]
     p = math.ceil(point.theta.shape[-1] / m)
@@ -43,7 +43,7 @@ def residual_scale(problem: Problem, point: ProblemPoint) -> Float[Tensor, "B m"
 
 
 def graduated(problem: Problem, point: ProblemPoint, max_iter: int) -> tuple[ProblemPoint, int]:
-    """Fits with a kernel of many robust scales first and of less than one at last, again while the scale shrinks."""
+    """Fit with kernels from many robust scales to less than one, and again while the scale shrinks."""
     n_iter = 0
     last: Tensor | None = None
     for stage in range(16):
@@ -52,7 +52,9 @@ def graduated(problem: Problem, point: ProblemPoint, max_iter: int) -> tuple[Pro
             break
         last = scale
         kernel = _KERNELS[min(stage, len(_KERNELS) - 1)] * scale
-        found, _ = constrained(problem, point, torch.ones_like(scale), kernel, max_iter=max_iter, tol=1e-3, exact=False)
+        found, _ = descend_constrained(
+            problem, point, torch.ones_like(scale), kernel, max_iter=max_iter, tol=1e-3, exact=False
+        )
         n_iter += found.n_iter
-        point = problem.refreshed(found.point) if found.tired else found.point
+        point = problem.refreshed(found.point) if found.needs_refresh else found.point
     return point, n_iter

@@ -1,4 +1,4 @@
-"""A batch of problems, flattened, and the points at which they are looked at."""
+"""A flattened batch of problems, and its state at given parameters."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ TANGENTS: dict[str, Callable[[Residual], Residual]] = {
     "reverse": reverse_tangents,
     "reverse twice": twice_reverse_tangents,
 }
-"""Ways to a Jacobian."""
+"""Methods to compute a Jacobian, by name."""
 
 Constraint = Callable[[Tensor], Tensor]
 
 NONLINEAR = 0.03
-"""Least share of a step's effect that the Jacobian did not foresee at which a new one is taken."""
+"""Share of a step's effect that the Jacobian did not predict from which a new Jacobian is computed."""
 
 TRUST = 0.1
-"""Least share of the majoriser's curvature, in every direction, at which the objective's own curvature is used."""
+"""Least share of the majoriser's curvature, in every direction, at which the objective's curvature is used."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Problem:
     batch: torch.Size
     jacobian: str
     weight: Tensor | None = None
-    used: Tensor | None = None  # None: all residuals are
+    used: Tensor | None = None  # None: all residuals are used
     prior_mean: Tensor | None = None
     prior_precision: Tensor | None = None
     box: tuple[Tensor, Tensor] | None = None  # (p,) each
@@ -65,7 +65,7 @@ class Problem:
         arguments = (theta,) if self.data is None else (theta, self.data)
         if theta.shape[0] == 1:
             found = function(*tree_map(lambda t: t[0], arguments))
-            refuse_other_type("residual", found, Tensor, "a function that returns a tensor", "make one of its result")
+            refuse_other_type("residual", found, Tensor, "a function that returns a tensor", "return a tensor")
             return found.unsqueeze(0)
         return torch.func.vmap(function)(*arguments)
 
@@ -77,16 +77,16 @@ class Problem:
         return residual if self.used is None else torch.where(self.used, residual, 0.0)
 
     def tangents(self, theta: Float[Tensor, "B p"], values: int) -> Float[Tensor, "B p N*m"]:
-        """The transposed Jacobian: a row for each parameter, as forward mode makes them; ``values`` is B N m.
+        """The transposed Jacobian, a row per parameter; ``values`` is B N m.
 
-        A function may have a method ``tangents`` of its own, which returns the rows of one problem, (p, N, m), or None.
+        A function may have its own method ``tangents``, which returns the rows of one problem, (p, N, m), or None.
         """
         own = getattr(self.function, "tangents", None)
         if own is not None and len(theta) == 1 and self.data is None:
             known: Tensor | None = own(theta[0])
             if known is not None and bool(known.isfinite().all()):
                 return self._counted(known.unsqueeze(0))
-        # a batch is differentiated in one, which reverse mode of reverse mode cannot be
+        # reverse mode over reverse mode does not support vmap over a batch
         way = "forward" if self.jacobian == "reverse twice" and len(theta) > 1 else self.jacobian
         function = forward_tangents(self.function, values) if way == "forward" else TANGENTS[way](self.function)
         return self._counted(self._over_batch(function, theta))
@@ -113,7 +113,7 @@ class Problem:
         return ProblemPoint(theta, residual, tangents, self.constraints(theta), self.normals(theta))
 
     def refreshed(self, point: ProblemPoint) -> ProblemPoint:
-        """The point with derivatives taken at its own parameters."""
+        """The point with derivatives recomputed at its parameters if they are stale."""
         if not point.stale:
             return point
         tangents = self.tangents(point.theta, point.residual.numel())
@@ -141,7 +141,7 @@ class ProblemPoint:
     tangents: Float[Tensor, "B p N*m"]
     constraint: Float[Tensor, "B k"] | None = None
     normals: Float[Tensor, "B k p"] | None = None
-    stale: bool = False  # the derivatives are those of a point nearby
+    stale: bool = False  # the derivatives are those of a nearby point
 
     def moved(self, accept: Tensor, theta: Tensor, residual: Tensor, constraint: Tensor | None) -> ProblemPoint:
         return replace(
@@ -180,13 +180,13 @@ class ProblemPoint:
 
 @dataclass(frozen=True)
 class Descent:
-    """Where damped steps at fixed σ and d ended."""
+    """End of a descent at fixed σ and d."""
 
     point: ProblemPoint
     value: Tensor
-    quiet: Tensor  # at rest: neither the step nor the model, of fresh derivatives, promises more than the limit
-    tired: bool  # the derivatives are too old to go on with
-    taken: Tensor  # whether the last trial was accepted
+    converged: Tensor  # converged: actual and predicted decrease, with fresh derivatives, are below the limit
+    needs_refresh: bool  # the derivatives are too stale to continue
+    accepted: Tensor  # whether the last trial step was accepted
     damping: Tensor
     n_iter: int
 

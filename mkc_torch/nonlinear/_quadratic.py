@@ -1,4 +1,4 @@
-"""The objective and its quadratic model about a point."""
+"""The objective and its quadratic model at a point."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Penalty", "model_curvature", "objective", "positive", "prior_value",
 
 @dataclass(frozen=True)
 class Penalty:
-    """The augmented Lagrangian ``½ ρ (c + u/ρ)²``, cut off at 0 for inequalities; multipliers and ρ are (B, k)."""
+    """Augmented Lagrangian ``½ ρ (c + u/ρ)²``, clipped at 0 for inequalities; multipliers and ρ are (B, k)."""
 
     multiplier: Tensor
     rho: Tensor
@@ -32,7 +32,7 @@ class Penalty:
 
 @dataclass(frozen=True)
 class _Quadratic:
-    """The objective about a point: its value (B,), gradient (B, p) and two curvatures (B, p, p)."""
+    """Quadratic model of the objective: value (B,), gradient (B, p) and two curvatures (B, p, p)."""
 
     value: Tensor
     gradient: Tensor
@@ -102,7 +102,7 @@ def quadratic_about(
 
 
 def model_curvature(quadratic: _Quadratic) -> Tensor:
-    """The objective's own curvature where it is safely positive, and that of the majoriser elsewhere."""
+    """Curvature of the objective where it is safely positive, else that of the majoriser."""
     majoriser = quadratic.majoriser
     scale = positive(majoriser.diagonal(dim1=-2, dim2=-1)).rsqrt()
     scaled = majoriser * scale.unsqueeze(-1) * scale.unsqueeze(-2)
@@ -118,5 +118,5 @@ def model_curvature(quadratic: _Quadratic) -> Tensor:
 
 
 def positive(diagonal: Tensor) -> Tensor:
-    """Marquardt's scaling; a parameter without effect has no scale and gets 1."""
+    """Marquardt's scaling; a parameter without effect gets 1."""
     return torch.where(diagonal > 0, diagonal, 1.0)

@@ -1,4 +1,4 @@
-"""Many starts of one problem: where they lie, and which end is the likeliest."""
+"""Several starts of one problem: how they are drawn, and which result is the most likely."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from mkc_torch.nonlinear._quadratic import prior_value
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Ends", "at_each", "drawn", "likeliest"]
+__all__ = ["Ends", "draw_starts", "most_likely", "repeat_problem"]
 
 AGREE = 0.01
-"""Nats of all residuals by which two ends may differ and be the same minimum: a fit that has come to rest is nearer."""
+"""Difference of log-likelihoods of all residuals, in nats, up to which two results count as the same minimum."""
 
 _REACH = 1e-6
-"""Share of a prior's distribution at each side that no start is drawn from, for infinity lies there."""
+"""Share of a prior's distribution at each end from which no start is drawn, since it extends to infinity."""
 
 
-def drawn(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int) -> Float[Tensor, "B S p"]:
-    """The start itself, and others evenly between the bounds, or over the prior where a bound is missing.
+def draw_starts(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int) -> Float[Tensor, "B S p"]:
+    """Draw starts uniformly between the bounds, or from the prior where a bound is missing; the first is ``theta``.
 
-    Even means a scrambled Sobol sequence (Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A start
-    at which the residual is not finite gives way to the given one.
+    They follow a scrambled Sobol sequence (Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A start
+    at which the residual is not finite is replaced by ``theta``.
 
     Raises:
         ValueError: a parameter has neither two bounds nor a prior.
     """
     p = theta.shape[-1]
-    endless = theta.new_full((p,), math.inf)
-    low, high = (-endless, endless) if problem.box is None else problem.box
+    infinite = theta.new_full((p,), math.inf)
+    low, high = (-infinite, infinite) if problem.box is None else problem.box
     precision = theta.new_zeros(p) if problem.prior_precision is None else problem.prior_precision.diagonal()
     mean = theta.new_zeros(p) if problem.prior_mean is None else problem.prior_mean
     boxed, known = torch.isfinite(low) & torch.isfinite(high), precision > 0
@@ -46,7 +46,7 @@ def drawn(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int)
     if missing:
         raise ValueError(
             f"Expected arguments `lower` and `upper`, or `prior`, for every parameter with `starts`={starts} but got "
-            f"neither for the parameters {missing}; say where to draw starts, or leave `starts` out."
+            f"neither for the parameters {missing}; pass them, or leave `starts` out."
         )
     engine = torch.quasirandom.SobolEngine(p, scramble=True, seed=seed)
     even = engine.draw(starts - 1, dtype=torch.float64).to(theta)
@@ -61,12 +61,12 @@ def drawn(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int)
         seen = torch.cat([residual.flatten(1), problem.tangents(at, residual.numel()).flatten(1)], -1)
         return torch.isfinite(seen).all(-1, keepdim=True)
 
-    fit_for_a_start = torch.stack([finite(found[:, i]) for i in range(starts)], 1)
-    return torch.where(fit_for_a_start, found, theta.unsqueeze(1))
+    usable = torch.stack([finite(found[:, i]) for i in range(starts)], 1)
+    return torch.where(usable, found, theta.unsqueeze(1))
 
 
-def at_each(problem: Problem, starts: Float[Tensor, "B S p"]) -> tuple[Problem, ProblemPoint]:
-    """The problem once for each start, B S problems in all, and their starts."""
+def repeat_problem(problem: Problem, starts: Float[Tensor, "B S p"]) -> tuple[Problem, ProblemPoint]:
+    """Repeat the problem for each start: B S problems and their starting points."""
     count = starts.shape[1]
 
     def repeated(value: Tensor) -> Tensor:
@@ -83,13 +83,13 @@ def at_each(problem: Problem, starts: Float[Tensor, "B S p"]) -> tuple[Problem, 
 
 
 class Ends(NamedTuple):
-    """The likeliest end of each problem, (B,), and how many ended as likely."""
+    """Index of the most likely result of each problem, (B,), and the number of results that are as likely."""
 
     best: Int[Tensor, " B"]
     agreeing: Int[Tensor, " B"]
 
 
-def likeliest(
+def most_likely(
     problem: Problem,
     theta: Float[Tensor, "B S p"],
     residual: Float[Tensor, "B S N m"],
@@ -99,24 +99,26 @@ def likeliest(
     sigma: Float[Tensor, "B m"] | None,
     d: Float[Tensor, "B m"] | None,
 ) -> Ends:
-    """Of ends whose residuals are judged on one domain: the given one, or that of the end of the smallest scale.
+    """Find the most likely result, with all residuals judged on one domain.
+
+    The domain is the given one, or that of the result with the smallest scale.
 
     Args:
-        problem: of B problems.
-        theta, residual, bound: of each end.
-        given, sigma, d: what is not learned.
+        problem: B problems.
+        theta, residual, bound: of each result.
+        given, sigma, d: fixed domain, bandwidths and scales, or None if learned.
     """
     weight = None if problem.weight is None else problem.weight.unsqueeze(1).expand_as(residual)
     scale = robust_scale(residual, weight)
     tiny = torch.finfo(scale.dtype).tiny
     first = scale.clamp(min=tiny).log().sum(-1).argmin(-1)
-    one = torch.arange(len(first), device=first.device)
-    domain = bound[one, first] if given is None else given
-    # what is not within reach of the domain is no candidate, and the reference stands in for it
+    rows = torch.arange(len(first), device=first.device)
+    domain = bound[rows, first] if given is None else given
+    # a result beyond the domain is no candidate; the reference result replaces it
     near = (2.0 * scale <= domain.unsqueeze(1)).all(-1)
     shape = residual.shape[:2]
-    judged = torch.where(near[..., None, None], residual, residual[one, first].unsqueeze(1))
-    if not bool(near[one, first].all()):
+    judged = torch.where(near[..., None, None], residual, residual[rows, first].unsqueeze(1))
+    if not bool(near[rows, first].all()):
         return Ends(first, torch.ones_like(first))
 
     def each(value: Tensor | None) -> Tensor | None:
@@ -130,6 +132,6 @@ def likeliest(
     total = total - prior_value(problem, flat).reshape(shape)
     total = torch.where(near, total, -torch.inf)
     best = total.argmax(-1)
-    most = total[one, best]
+    most = total[rows, best]
     rounding = 64.0 * torch.finfo(total.dtype).eps * most.abs()
     return Ends(best, (total >= (most - AGREE - rounding).unsqueeze(-1)).sum(-1))

@@ -1,4 +1,4 @@
-"""Most likely parameters, with σ and d of each channel."""
+"""Maximum-likelihood parameters, with σ and d of each channel."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mkc_torch.density.domain import domain_rule
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.likelihood import DensityState, initial_state
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
-from mkc_torch.nonlinear._alternate import AlternatingMaximum, alternated, gaussian_candidate, likelihood_of
-from mkc_torch.nonlinear._arguments import per_channel, prepared, refuse_out_of_reach
+from mkc_torch.nonlinear._alternate import AlternatingMaximum, alternate, gaussian_candidate, likelihood_of
+from mkc_torch.nonlinear._arguments import per_channel, prepare, refuse_out_of_reach
 from mkc_torch.nonlinear._covariance import parameter_covariance
 from mkc_torch.nonlinear._explained import explained
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
 from mkc_torch.nonlinear._problem import Constraint, Problem, ProblemPoint, kernel_weights, shaped_jacobian
-from mkc_torch.nonlinear._starts import at_each, drawn, likeliest
+from mkc_torch.nonlinear._starts import draw_starts, most_likely, repeat_problem
 from mkc_torch.nonlinear.prior import GaussianPrior
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ __all__ = ["NonlinearFit", "fit"]
 
 @dataclass(frozen=True)
 class NonlinearFit:
-    """What :func:`fit` found.
+    """Result of :func:`fit`.
 
     Attributes:
         theta: (*, p).
@@ -41,16 +41,15 @@ class NonlinearFit:
             without the prior; compare only at equal ``bound``.
         weights: ``exp(-e² / (2 d² σ²))`` of each residual, (*, N, m).
         residual: (*, N, m) at ``theta``; 0 where the weight is 0.
-        covariance: of ``theta`` at the learned σ and d, (*, p, p), or None. It is 0 along active bounds and
+        covariance: covariance of ``theta`` at the learned σ and d, (*, p, p), or None. It is 0 along active bounds and
             constraints, and infinite for parameters that the residual does not determine.
-        jacobian: of the residual at ``theta``, (*, N, m, p).
-        n_iter: trial steps made.
-        converged: whether it came to rest, (*,). That is a minimum, and not always the one looked for: see ``agreeing``
-            and :meth:`explained`.
-        starts: how many starts were made.
-        agreeing: how many of them ended at this minimum, (*,), or at others that are as likely to 0.01 nats of all
-            residuals. One of many says that there may be a better one: make more starts.
-
+        jacobian: Jacobian of the residual at ``theta``, (*, N, m, p).
+        n_iter: number of trial steps.
+        converged: whether each problem converged, (*,), to a minimum that may be a local one: see ``agreeing`` and
+            :meth:`explained`.
+        starts: number of starts.
+        agreeing: number of starts that ended at this minimum, or at others within 0.01 nats of all residuals, (*,). A
+            single one of many suggests that a better minimum exists: use more starts.
     Example:
         >>> generator = torch.Generator().manual_seed(0)
         >>> y = 2.0 + 0.1 * torch.randn(200, generator=generator, dtype=torch.float64)
@@ -80,23 +79,25 @@ class NonlinearFit:
             ValueError: the fit was made without a covariance.
         """
         if self.covariance is None:
-            raise ValueError("Expected a fit with a covariance but it was made with covariance=None; name a kind.")
+            raise ValueError(
+                "Expected a fit with a covariance but got covariance=None; fit with covariance='sandwich'."
+            )
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
 
     def explained(self, target: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
-        """Share of the targets' scatter that the fit explains, robustly: 1 less the square of the ratio of the scales.
+        """Robust share of the targets' variation that the fit explains: 1 minus the squared ratio of scales, (*, m).
 
-        The scales are of the residuals about 0 and of the targets about their median, 1.4826 times the median absolute
-        value; weights have no say. Below 0.8 a model that should describe its targets does not: the fit came to rest at
-        another minimum. A robust fit chooses the half that it likes, and a wrong one explains up to 0.69 of that (sines
-        of unknown frequency, noise of 0.1, one target in ten wrong by far: 239 wrong ends, 61 right ones above 0.97).
+        The scales are 1.4826 times the median absolute value of the residuals, and of the targets about their median,
+        without weights. A value below 0.8 for a model that should describe its targets shows a wrong local minimum. A
+        robust fit may choose half of the targets, and a wrong fit explains up to 0.69 in that way (sines of unknown
+        frequency, noise of 0.1, one target in ten a gross outlier: 239 wrong minima, 61 right ones above 0.97).
 
         Args:
-            target: what the residual is of, (N,), (N, m) or (*, N, m).
+            target: targets of the residual, (N,), (N, m) or (*, N, m).
 
         Raises:
-            TypeError, ValueError: no real tensor, of another shape, not finite where it counts, or targets of which
-                more than half are equal.
+            TypeError, ValueError: not a real tensor, of another shape, not finite, or targets of which more than half
+                are equal.
 
         Example:
             >>> x = torch.linspace(0.0, 6.0, 60, dtype=torch.float64)
@@ -133,39 +134,40 @@ def fit(
     starts: int = 1,
     seed: int = 0,
 ) -> NonlinearFit:
-    """Parameters, bandwidths and scales of a residual by maximum likelihood of the MKC density: MKC-EM.
+    """Fit parameters, bandwidths and scales of a residual by maximum likelihood of the MKC density: MKC-EM.
 
-    Newton steps on (σ, d) of each channel and a damped step on θ in turn, as in :class:`mkc_torch.linear.MKCRegression`
-    and with its safeguards: a domain that stays fixed, d no less than 0.3 robust scales, and a second attempt from
-    weighted least squares where a Gaussian is likelier than what was found. A graduated start leads in: fits with a
-    kernel of ten robust scales of the residuals and fewer and fewer of them, so that a start from which most residuals
-    are large is survived.
+    Alternates Newton steps on (σ, d) of each channel and a damped step on θ, as :class:`mkc_torch.linear.MKCRegression`
+    does and with its safeguards: a fixed domain, d of at least 0.3 robust scales, and a second attempt from weighted
+    least squares where a Gaussian has a higher likelihood than the result. The start is graduated: fits with a kernel
+    of ten robust scales of the residuals, then of fewer and fewer, so that a start with mostly large residuals is
+    allowed.
 
-    The prior is weighed against the likelihood of all residuals; the E-step does not see it.
+    The prior is weighed against the likelihood of all residuals; the E-step does not use it.
 
     Args:
         residual: as in :func:`minimise`.
-        start: (*, p).
+        start: starting parameters (*, p).
         bound: half-width of the domain in the unit of the residual, at least two robust scales: a number, (m,) or
             (*, m); None takes :func:`mkc_torch.density.fit.domain_rule` on a rough robust fit.
-        sigma: None learns σ; a value in [0.05, inf] keeps it.
-        d: None learns d; a value keeps it.
-        graduate: False begins at ``start`` as it is; only for starts near the answer.
+        sigma: None learns σ; a value in [0.05, inf] fixes it.
+        d: None learns d; a value fixes it.
+        graduate: False starts at ``start`` without graduation; only for starts near the solution.
         data, weight, prior, lower, upper, equality, inequality, jacobian: as in :func:`minimise`.
-        max_iter: trial steps at most in each of the rough and the final fit.
-        tol: converged when two alternations in a row each raise the mean log-likelihood by less (nats per sample).
-        covariance: "sandwich" for independent samples, "hac" for a time series, None for none. The curvature is the
-            objective's, without the residual's second derivatives; the scores of a sample's channels are summed.
+        max_iter: largest number of trial steps in each of the rough and the final fit.
+        tol: converged when two successive alternations each raise the mean log-likelihood by less (nats per sample).
+        covariance: "sandwich" for independent samples, "hac" for a time series, None for no covariance. The curvature
+            is that of the objective, without the residual's second derivatives; the scores of a sample's channels are
+            summed.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
-        starts: where a residual has many minima, fits from so many starts at once, of which the likeliest is kept, all
-            judged on one domain: ``start`` and others drawn evenly input_hold ``lower`` and ``upper``, or over the prior
-            where a bound is missing. The result says how many agree. It takes as many times the memory.
-        seed: of the starts.
+        starts: number of starts, for a residual with many minima; the most likely result is kept, all judged on one
+            domain. ``start`` is the first; the others are drawn uniformly between ``lower`` and ``upper``, or from the
+            prior where a bound is missing. The result reports how many agree. Memory grows with this number.
+        seed: seed of the starts.
 
     Raises:
-        TypeError, ValueError: as :func:`minimise`; or several starts are asked for, and a parameter has neither two
-            bounds nor a prior.
-        NoFitError: the residual or its slope is not finite at ``start``, or the head of the density does not fit in the
+        TypeError, ValueError: as :func:`minimise`; or ``starts`` > 1 and a parameter has neither two bounds nor a
+            prior.
+        NoFitError: residual or derivatives are not finite at ``start``, or the head of the density does not fit in the
             domain.
 
     References:
@@ -184,7 +186,7 @@ def fit(
     checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
     kind = None if covariance is None else checked_kind(covariance)
     checked_bandwidth(bandwidth)
-    problem, point = prepared(
+    problem, point = prepare(
         residual,
         start,
         data=data,
@@ -197,43 +199,43 @@ def fit(
         jacobian=jacobian,
     )
     like, size = point.residual, problem.batch
-    given = _Given(
+    given = _FixedParameters(
         None if sigma is None else per_channel("sigma", sigma, like, size, infinite=True, least=SIGMA_LEAST),
         None if d is None else per_channel("d", d, like, size, infinite=False),
         None if bound is None else per_channel("bound", bound, like, size, infinite=False),
     )
     if checked_whole("starts", starts, 1, "32 is usual where there are many minima") == 1:
         found = _from_start(problem, point, given, graduate=graduate, max_iter=max_iter, tol=tol)
-        return _told(problem, found, kind, bandwidth)
-    places = drawn(problem, point.theta, starts, checked_whole("seed", seed, 0))
-    many, at = at_each(problem, places)
+        return _result(problem, found, kind, bandwidth)
+    places = draw_starts(problem, point.theta, starts, checked_whole("seed", seed, 0))
+    many, at = repeat_problem(problem, places)
     ends = _from_start(
-        many, at, given.of_each(starts)._replace(bound=None), graduate=graduate, max_iter=max_iter, tol=tol
+        many, at, given.repeated(starts)._replace(bound=None), graduate=graduate, max_iter=max_iter, tol=tol
     )
     at, reach = ends.point, torch.exp(ends.state.log_bound)
-    theta, left, reach = (one.unflatten(0, places.shape[:2]) for one in (at.theta, at.residual, reach))
-    best, agreeing = likeliest(problem, theta, left, reach, given=given.bound, sigma=given.sigma, d=given.d)
+    theta, left, reach = (value.unflatten(0, places.shape[:2]) for value in (at.theta, at.residual, reach))
+    best, agreeing = most_likely(problem, theta, left, reach, given=given.bound, sigma=given.sigma, d=given.d)
     point = problem.at(theta[torch.arange(len(best), device=best.device), best])
     found = _from_start(problem, point, given, graduate=False, max_iter=max_iter, tol=tol)
-    told = _told(problem, found, kind, bandwidth)
-    return replace(told, n_iter=ends.n_iter + found.n_iter, starts=starts, agreeing=problem.restore(agreeing))
+    result = _result(problem, found, kind, bandwidth)
+    return replace(result, n_iter=ends.n_iter + found.n_iter, starts=starts, agreeing=problem.restore(agreeing))
 
 
-class _Given(NamedTuple):
-    """What is not learned, (B, m) each."""
+class _FixedParameters(NamedTuple):
+    """Parameters that are fixed, (B, m) each, or None if learned."""
 
     sigma: Tensor | None
     d: Tensor | None
     bound: Tensor | None
 
-    def of_each(self, starts: int) -> _Given:
-        return _Given(*(None if one is None else one.repeat_interleave(starts, 0) for one in self))
+    def repeated(self, starts: int) -> _FixedParameters:
+        return _FixedParameters(*(None if value is None else value.repeat_interleave(starts, 0) for value in self))
 
 
 def _from_start(
-    problem: Problem, point: ProblemPoint, given: _Given, *, graduate: bool, max_iter: int, tol: float
+    problem: Problem, point: ProblemPoint, given: _FixedParameters, *, graduate: bool, max_iter: int, tol: float
 ) -> AlternatingMaximum:
-    """The maximum that a start leads to, with the steps of the whole way."""
+    """Maximise from one start; ``n_iter`` counts all steps."""
     fixed_sigma, fixed_d, fixed_bound = given
     steps = 0
     if graduate:
@@ -242,7 +244,7 @@ def _from_start(
     scale = residual_scale(problem, point)
     d_min = LEAST_SCALE * scale if fixed_d is None else torch.minimum(fixed_d, LEAST_SCALE * scale)
 
-    def begun(at: ProblemPoint, size: Tensor, domain: Tensor, tails: Sequence[float | Tensor]) -> DensityState:
+    def initial(at: ProblemPoint, size: Tensor, domain: Tensor, tails: Sequence[float | Tensor]) -> DensityState:
         return initial_state(
             at.residual,
             likelihood.weight,
@@ -256,11 +258,11 @@ def _from_start(
 
     if fixed_bound is None:
         tight = domain_rule(point.residual, scale, problem.used, scales=5.0)
-        rough = alternated(
+        rough = alternate(
             problem,
             likelihood,
             point,
-            begun(point, scale, tight, (0.1, 0.4, 1.5)),
+            initial(point, scale, tight, (0.1, 0.4, 1.5)),
             max_iter=max_iter,
             tol=1e-4,
             exact=False,
@@ -269,19 +271,19 @@ def _from_start(
         point = rough.point
         size = torch.exp(rough.state.log_d)
         domain = domain_rule(point.residual, size, problem.used)
-        state = begun(point, size, domain, (rough.state.kappa,))
+        state = initial(point, size, domain, (rough.state.kappa,))
         penalty = rough.penalty
     else:
         refuse_out_of_reach(fixed_bound, scale)
-        state = begun(point, scale, fixed_bound, (0.1, 0.4, 1.5))
+        state = initial(point, scale, fixed_bound, (0.1, 0.4, 1.5))
         penalty = None
-    maximum = alternated(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)
+    maximum = alternate(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)
     if state.free_kappa and state.free_d:
         maximum = gaussian_candidate(problem, likelihood, maximum, max_iter=max_iter, tol=tol)
     return replace(maximum, n_iter=steps + maximum.n_iter)
 
 
-def _told(
+def _result(
     problem: Problem, maximum: AlternatingMaximum, kind: CovarianceKind | None, bandwidth: float | None
 ) -> NonlinearFit:
     point = problem.refreshed(maximum.point)

@@ -1,4 +1,4 @@
-"""What is known of the parameters beforehand."""
+"""Prior knowledge of the parameters."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["GaussianPrior"]
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """A Gaussian on the parameters, ``½ (θ - mean)ᵀ P (θ - mean)`` added to the objective.
+    """A Gaussian prior on the parameters, which adds ``½ (θ - mean)ᵀ P (θ - mean)`` to the objective.
 
     Attributes:
-        mean: (p,).
-        precision: the diagonal of P (p,), or P (p, p), symmetric and positive semi-definite, in 1 / unit².
+        mean: mean of the parameters, (p,).
+        precision: diagonal of P (p,), or P (p, p), symmetric and positive semi-definite, in 1 / unit².
 
-    What they hold is looked at by :func:`minimise` and :func:`fit`.
+    :func:`minimise` and :func:`fit` check the values.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Recordings: tables with named columns, from files and tensors, and what is noticed of them."""
+"""Recordings: tables of named columns, read from files, data frames or tensors, with warnings about their data."""
 
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.formats import MissingColumnError, RecordingError

@@ -1,4 +1,4 @@
-"""Which topic of a file is read, and which of its columns as what: as the caller says, else as recognised."""
+"""Choose the topic of a file and its columns: those that the caller names, else those that are recognised."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _MAG = ("mag_x", "mag_y", "mag_z")
 
 
 class ColumnChoice(NamedTuple):
-    """What is read of a file.
+    """The topic and the columns that are read from a file.
 
     Attributes:
-        topic: number of the topic.
-        columns: for each name that a column is to have, the name it has in the topic.
-        found: those of them that were recognised and have another name there.
-        units: that were recognised with them, by the new names.
-        sensor: the magnetometer; None where none is read as one.
-        warnings: sentences about what was left out.
+        topic: index of the topic.
+        columns: new name to the name in the topic.
+        found: the part of ``columns`` that was recognised and renamed.
+        units: recognised units by new name.
+        sensor: the magnetometer; None if the columns are not read as a magnetometer.
+        warnings: sentences about topics that were left out.
     """
 
     topic: int
@@ -38,51 +38,51 @@ class ColumnChoice(NamedTuple):
 def choose(
     path: Path, topics: Sequence[Topic], columns: Mapping[str, str], sensor: str | None, *, recognise: bool
 ) -> ColumnChoice:
-    """Choose.
+    """Choose the topic and its columns.
 
     Args:
-        path: of the file, for messages.
-        topics: in it.
-        columns: the caller's: new name to the name in the file; in a file of several topics ``topic.column`` too.
-        sensor: name of the magnetometer, where the file has several.
-        recognise: whether the names of columns say what they are.
+        path: path of the file, for messages.
+        topics: topics of the file.
+        columns: the caller's columns, new name to the name in the file; ``topic.column`` in a file of several topics.
+        sensor: name of the magnetometer if the file has several.
+        recognise: recognise columns by their names.
 
     Raises:
-        RecordingError: several magnetometers and none is named, or none of that name.
+        RecordingError: several magnetometers without ``sensor``, or no magnetometer of that name.
         MissingColumnError: ``columns`` names a column that no topic has.
     """
     if set(columns) & set(_MAG) or not recognise:
         if sensor is not None:
-            raise RecordingError(f"{path}: name the magnetometer's columns, or a sensor, but not both.")
-        return _as_said(path, topics, columns)
+            raise RecordingError(f"{path}: got both a sensor and the magnetometer's columns; give only one of them.")
+        return _by_given_columns(path, topics, columns)
     found = recognised(topics, path.stem)
     chosen = _chosen(path, topics, found, sensor)
     if chosen is None:
-        return _as_said(path, topics, columns)
+        return _by_given_columns(path, topics, columns)
     topic = topics[chosen.topic]
-    said = {new: _local(old, topic) for new, old in columns.items()}
-    mine = {
+    given = {new: _local(old, topic) for new, old in columns.items()}
+    recognised_columns = {
         new: old
         for new, old in chosen.columns.items()
-        if new not in said
-        and old not in said.values()
-        and (new == old or new in _MAG or new not in topic.table.names)  # the sensor that was chosen wins
+        if new not in given
+        and old not in given.values()
+        and (new == old or new in _MAG or new not in topic.table.names)  # columns of the chosen sensor take precedence
     }
     return ColumnChoice(
         chosen.topic,
-        said | mine,
-        {new: old for new, old in mine.items() if new != old},
-        {new: unit for new, unit in chosen.units.items() if new in mine},
+        given | recognised_columns,
+        {new: old for new, old in recognised_columns.items() if new != old},
+        {new: unit for new, unit in chosen.units.items() if new in recognised_columns},
         chosen,
         found.left_out,
     )
 
 
 def sensors_in(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> list[str]:
-    """The names of the magnetometers in a file; one empty name, where it has one alone or ``columns`` says which.
+    """Names of the magnetometers in a file; ``[""]`` if it has only one or ``columns`` names its axes.
 
     Raises:
-        RecordingError: there are several and nobody can tell which is meant.
+        RecordingError: several triples of columns may be the magnetometer.
     """
     if set(columns) & set(_MAG):
         return [""]
@@ -93,10 +93,10 @@ def sensors_in(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) 
 
 
 def which_columns(path: Path, topics: Sequence[Topic]) -> str:
-    """What to say where no magnetometer was recognised: the option that names columns which may be one."""
+    """Error message if no magnetometer was recognised: the options that name the columns in question."""
     options = [columns_option(triple) for topic in topics for triple in candidates(topic)]
     if any(_has(topic, "accel") for topic in topics):
-        options.append("--sensor accel")
+        options.append("--quantity accel")
     named = listed(name for topic in topics for name in topic.table.names if name)
     where = "" if len(topics) == 1 else f" in {len(topics)} topics"
     if not options:
@@ -104,8 +104,8 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
             f"{path}: no magnetometer is recognised among {named}{where}; name its columns: "
             "`--columns mag_x=...,mag_y=...,mag_z=...`."
         )
-    accel = options == ["--sensor accel"]
-    mean = "An accelerometer is calibrated by" if accel else "If one is meant, name its columns"
+    accel = options == ["--quantity accel"]
+    mean = "An accelerometer is calibrated by" if accel else "If these columns are a magnetometer, name them"
     return (
         f"{path}: no magnetometer is recognised among {named}{where}. {mean}: "
         f"{' or '.join(f'`{option}`' for option in options[:6])}."
@@ -113,64 +113,70 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
 
 
 def _has(topic: Topic, quantity: str) -> bool:
-    """Whether the names of a topic say that it holds all axes of a quantity."""
-    said = [meaning(name) for name in topic.table.names if name]
-    return {one.axis for one in said if one is not None and one.quantity == quantity} >= {"x", "y", "z"}
+    """Whether a topic has columns for all axes of a quantity, by their names."""
+    meanings = [meaning(name) for name in topic.table.names if name]
+    return {known.axis for known in meanings if known is not None and known.quantity == quantity} >= {"x", "y", "z"}
 
 
 def columns_option(columns: Mapping[str, str]) -> str:
-    """The option that names a magnetometer's columns.
+    """The command-line option that names a magnetometer's columns.
 
     Example:
         >>> columns_option({"mag_x": "Mag X", "mag_y": "Mag Y", "mag_z": "Mag Z", "time": "t"})
         '--columns "mag_x=Mag X,mag_y=Mag Y,mag_z=Mag Z"'
     """
     text = ",".join(f"{name}={columns[name]}" for name in _MAG)
-    return f"--columns {text}" if all(one.isalnum() or one in "_=,.-/:" for one in text) else f'--columns "{text}"'
+    return f"--columns {text}" if all(c.isalnum() or c in "_=,.-/:" for c in text) else f'--columns "{text}"'
 
 
 def _chosen(path: Path, topics: Sequence[Topic], found: RecognisedColumns, sensor: str | None) -> SensorColumns | None:
-    names = [one.name for one in found.sensors]
+    names = [candidate.name for candidate in found.sensors]
     if sensor is not None:
-        same = [one for one in found.sensors if sensor.strip().strip("/").casefold() == one.name.casefold()]
+        same = [
+            candidate
+            for candidate in found.sensors
+            if sensor.strip().strip("/").casefold() == candidate.name.casefold()
+        ]
         if not same:
-            there = f"there are {listed(names)}" if any(names) else "the file has one alone; leave it out"
+            there = (
+                f"there are {listed(names)}" if any(names) else "the file has a single magnetometer; omit the sensor"
+            )
             raise RecordingError(
-                f"{path}: there is no magnetometer `{sensor}`; {there if names else 'none is recognised'}."
+                f"{path}: there is no magnetometer `{sensor}`; {there if names else 'no magnetometer is recognised'}."
             )
         return same[0]
     if len(found.sensors) < 2:
         return found.sensors[0] if found.sensors else None
-    own = [one for one in found.sensors if all(one.columns[name] == name for name in _MAG)]
+    own = [candidate for candidate in found.sensors if all(candidate.columns[name] == name for name in _MAG)]
     if len(own) == 1 and len(topics) == 1:
         return own[0]
     if not found.several:
         raise _ambiguous(path, found)
     raise RecordingError(
         f"{path}: the file holds {len(names)} magnetometers, {listed(names)}; choose one with `--sensor {names[0]}` "
-        f'(in Python `sensor="{names[0]}"`, or `recognise=False` for the table as it is).'
+        f'(in Python `sensor="{names[0]}"`, or `recognise=False` to read the table unchanged).'
     )
 
 
 def _ambiguous(path: Path, found: RecognisedColumns) -> RecordingError:
     options = " or ".join(f"`{columns_option(sensor.columns)}`" for sensor in found.sensors)
     return RecordingError(
-        f"{path}: {len(found.sensors)} triples of columns may be the magnetometer; say which: {options}."
+        f"{path}: {len(found.sensors)} triples of columns may be the magnetometer; choose: {options}."
     )
 
 
-def _as_said(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> ColumnChoice:
-    """The topic that has the caller's columns, and its time."""
+def _by_given_columns(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> ColumnChoice:
+    """The topic that has the caller's columns, and its time column."""
     number = _topic_of(path, topics, columns)
     topic = topics[number]
-    said = {new: _local(old, topic) for new, old in columns.items()}
-    time = time_column(topic, weak=bool(set(said) & set(_MAG)))
-    mine, units = {}, {}
-    if time is not None and "time" not in said and "time" not in topic.table.names and time[0] not in said.values():
-        mine, units = {"time": time[0]}, {"time": time[1]} if time[1] else {}
-    elif time is not None and said.get("time", "time") == time[0] and time[1]:
+    given = {new: _local(old, topic) for new, old in columns.items()}
+    time = time_column(topic, weak=bool(set(given) & set(_MAG)))
+    recognised_columns, units = {}, {}
+    if time is not None and "time" not in given and "time" not in topic.table.names and time[0] not in given.values():
+        recognised_columns, units = {"time": time[0]}, {"time": time[1]} if time[1] else {}
+    elif time is not None and given.get("time", "time") == time[0] and time[1]:
         units = {"time": time[1]}
-    return ColumnChoice(number, said | mine, mine, units, None, ())
+    return ColumnChoice(number, given | recognised_columns, recognised_columns, units, None, ())
 
 
 def _topic_of(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> int:
@@ -187,7 +193,7 @@ def _topic_of(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -
     if not columns:
         raise RecordingError(
             f"{path}: the file holds {len(topics)} topics, {names}, and no magnetometer is recognised in them; name "
-            "columns of one as topic.column: `--columns mag_x=TOPIC.x,mag_y=TOPIC.y,mag_z=TOPIC.z`."
+            "its columns as topic.column: `--columns mag_x=TOPIC.x,mag_y=TOPIC.y,mag_z=TOPIC.z`."
         )
     what = "no topic has" if not having else f"{len(having)} topics have"
     raise MissingColumnError(
@@ -196,9 +202,9 @@ def _topic_of(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -
 
 
 def _local(name: str, topic: Topic) -> str:
-    """A column's name in its topic, where the caller wrote the topic before it."""
+    """A column's name without the prefix of its topic."""
     name = name.strip()
-    for sign in (".", "/"):
-        if topic.name and name.startswith(topic.name + sign):
+    for separator in (".", "/"):
+        if topic.name and name.startswith(topic.name + separator):
             return name[len(topic.name) + 1 :]
     return name

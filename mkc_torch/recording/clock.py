@@ -1,4 +1,4 @@
-"""Times as they stand in a file, stamps or numbers of any unit, as seconds; differences are taken before rounding."""
+"""Parse the times of a file, stamps or numbers of any unit, into seconds; differences are taken before rounding."""
 
 from __future__ import annotations
 
@@ -16,18 +16,28 @@ from mkc_torch.recording.unit_words import conversion
 __all__ = ["ClockError", "TimeAxis", "clock_of"]
 
 _NANO = 10**9
+"""Nanoseconds in a second."""
+
 _DAY = 86_400
+"""Seconds in a day."""
+
 _EPOCH = (10**9, 41 * 10**8)
-"""Seconds from 1970 to September 2001 and to 2099: what a count since 1970 lies between in one unit alone."""
+"""Range of a count since 1970, September 2001 to 2099, in s; only one unit puts a count in this range."""
 
 _INTERVALS = (1e-6, 3600.0)
-"""Median intervals in s that a sensor's samples have: a count since 1970 of the wrong unit misses them."""
+"""Range of a sensor's median sampling interval, in s; a wrong unit of a count since 1970 lies outside."""
 
 _FEW = 10
+"""Fewest samples from which a column of days is recognised."""
+
 _DAYS = ((36_526, 73_051), (730_486, 767_011))
+"""Ranges of day numbers of this century: since 1900 (spreadsheets) and since the year 0 (MATLAB)."""
+
 _DAY_STEPS = (1e-8, 1e-5)
+"""Range of the median sampling interval of a column of days, in days."""
 
 _LONG = {"min": 60.0, "h": 3600.0, "days": 86_400.0}
+"""Seconds in units longer than a second."""
 
 _ISO = (
     r"^(\d{4})-?(\d\d)-?(\d\d)(?:[T ](\d\d):?(\d\d)(?::?(\d\d)(?:[.,](\d+))?)?\s*"
@@ -40,7 +50,7 @@ _OF_DAY = r"^(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d+))?)?$"
 
 
 class ClockError(ValueError):
-    """A cell that is no time; ``row`` is where, from 0."""
+    """A cell does not hold a time; ``row`` is its row, counted from 0."""
 
     def __init__(self, row: int, advice: str) -> None:
         super().__init__(advice)
@@ -51,24 +61,24 @@ class TimeAxis(NamedTuple):
     """The times of a table.
 
     Attributes:
-        ticks: whole nanoseconds, (N,); None where the numbers are not so.
-        seconds: of a column that is in seconds already, or whose numbers are no whole nanoseconds; NaN where none is.
-        told: how the times were read, for a sentence; empty where they are seconds as they stand.
+        ticks: times in whole nanoseconds, (N,); None if the times are not whole nanoseconds.
+        seconds: times in s, (N,); NaN where a time is missing.
+        format: how the times were read, for a warning; empty if the file holds plain seconds.
     """
 
     ticks: np.ndarray | None
     seconds: np.ndarray
-    told: str
+    format: str
 
     def spread(self, seconds: np.ndarray) -> TimeAxis:
-        """The clock with other times, in s, that differ by parts of a step of its own."""
+        """Replace the times by ``seconds``, (N,), which differ from them by less than a step of the clock."""
         if self.ticks is None:
             return self._replace(seconds=seconds)
         added = np.nan_to_num(seconds - self.seconds)
         return self._replace(ticks=self.ticks + np.rint(added * _NANO).astype(np.int64), seconds=seconds)
 
     def since(self, row: int) -> np.ndarray:
-        """Seconds from the time of a row on."""
+        """Seconds since the time of a row, (N,)."""
         if self.ticks is None:
             return self.seconds - self.seconds[row]
         passed = (self.ticks - self.ticks[row]) / _NANO
@@ -76,17 +86,17 @@ class TimeAxis(NamedTuple):
 
 
 def clock_of(series: Any, unit: str = "") -> TimeAxis:
-    """The times that a column holds: ISO 8601 stamps, times of the day, counts since 1970, or numbers of a unit.
+    """Parse a column of times: ISO 8601 stamps, times of the day, counts since 1970, or numbers with a unit.
 
-    A count since 1970 is known by its size: in one unit alone it lies between 2001 and 2099 and its samples lie a
-    microsecond to an hour apart. Other numbers without a unit are taken as seconds.
+    A count since 1970 is recognised by its size: only one unit puts it between 2001 and 2099 with sampling intervals
+    of a microsecond to an hour. Other numbers without a unit are taken as seconds.
 
     Args:
-        series: of polars.
-        unit: of its numbers, where it is known: s, ms, µs or ns.
+        series: a polars series.
+        unit: unit of its numbers if known: s, ms, µs or ns.
 
     Raises:
-        ClockError: a cell is no time, or stamps with and without a zone stand side by side.
+        ClockError: a cell does not hold a time, or only some of the stamps have a time zone.
 
     Example:
         >>> import polars as pl
@@ -99,7 +109,7 @@ def clock_of(series: Any, unit: str = "") -> TimeAxis:
     if series.dtype == package.String:
         text = series.str.strip_chars()
         text = text.set(text.str.to_lowercase().is_in(MISSING).fill_null(False), None)
-        first = next((one for one in text if one is not None), "")
+        first = next((cell for cell in text if cell is not None), "")
         if not is_stamp(first):
             return _of_numbers(text, unit)
         minutes = bool(_MINUTES.fullmatch(first))
@@ -120,19 +130,19 @@ def _of_type(series: Any) -> TimeAxis:
     return _exact(ticks, "stamps")
 
 
-def _exact(ticks: Any, told: str) -> TimeAxis:
+def _exact(ticks: Any, format_name: str) -> TimeAxis:
     none = ticks.is_null().to_numpy()
     whole = ticks.fill_null(0).to_numpy().astype(np.int64)
-    return TimeAxis(whole, np.where(none, np.nan, whole / _NANO), told)
+    return TimeAxis(whole, np.where(none, np.nan, whole / _NANO), format_name)
 
 
 def _of_stamps(text: Any, minutes: bool) -> TimeAxis:
     package = polars()
-    if ":" in next(one for one in text if one is not None)[:3]:
+    if ":" in next(cell for cell in text if cell is not None)[:3]:
         return _of_days(text, 3600 if minutes else _DAY)
     parts = text.str.extract_groups(_ISO).struct.unnest()
-    year, month, day, hour, minute, second, digits, zulu, sign, off_hour, off_minute = parts.get_columns()
-    date = package.select(package.date(*(one.cast(package.Int32) for one in (year, month, day)))).to_series() if (
+    year, month, day, hour, minute, second, digits, utc, sign, off_hour, off_minute = parts.get_columns()
+    date = package.select(package.date(*(part.cast(package.Int32) for part in (year, month, day)))).to_series() if (
         _dates_exist(year, month, day)
     ) else (year + "-" + month + "-" + day).str.to_date("%Y-%m-%d", strict=False)  # fmt: skip
     bad = text.is_not_null() & date.is_null()
@@ -140,23 +150,25 @@ def _of_stamps(text: Any, minutes: bool) -> TimeAxis:
     bad = bad | (clock[0] > 24) | (clock[1] > 59) | (clock[2] > 60)
     if bad.any():
         raise ClockError(int(bad.arg_max()), "write times as seconds, or as 2024-05-03T10:00:00.25")
-    zoned = (zulu.is_not_null() | sign.is_not_null()) & text.is_not_null()
+    zoned = (utc.is_not_null() | sign.is_not_null()) & text.is_not_null()
     if zoned.any() and not (zoned | text.is_null()).all():
         unlike = zoned != zoned[int(text.is_not_null().arg_max())]
-        raise ClockError(int((unlike & text.is_not_null()).arg_max()), "write all stamps with a zone, or none")
+        raise ClockError(
+            int((unlike & text.is_not_null()).arg_max()), "write all stamps with a zone, or all without a zone"
+        )
     offset = (_whole(off_hour) * 3600 + _whole(off_minute) * 60) * (1 - 2 * (sign == "-").fill_null(False).cast(int))
     seconds = date.cast(package.Int64) * _DAY + clock[0] * 3600 + clock[1] * 60 + clock[2] - offset
     return _exact(seconds * _NANO + _fraction(digits), "ISO 8601 stamps")
 
 
 def _dates_exist(year: Any, month: Any, day: Any) -> bool:
-    """Whether no day is one that no calendar has, so that it need not be asked for one by one."""
+    """Whether all dates surely exist (day 28 at most), so that they can be converted at once."""
     months, days = _whole(month), _whole(day)
     return bool(year.is_not_null().all() and months.is_between(1, 12).all() and days.is_between(1, 28).all())
 
 
 def _of_days(text: Any, turn: int) -> TimeAxis:
-    """Times of the day, or of the hour; a fall of more than half of it is midnight, or the next hour."""
+    """Parse times of the day, or of the hour; a fall by more than half a turn is midnight, or the next hour."""
     hour, minute, second, digits = text.str.extract_groups(_OF_DAY).struct.unnest().get_columns()
     bad = text.is_not_null() & (hour.is_null() | (_whole(hour) > 24) | (_whole(minute) > 59) | (_whole(second) > 60))
     if bad.any():
@@ -176,7 +188,7 @@ def _whole(digits: Any) -> Any:
 
 
 def _fraction(digits: Any) -> Any:
-    """Digits after the point as nanoseconds."""
+    """Convert the digits after the decimal point to nanoseconds."""
     return _whole(digits.fill_null("0").str.slice(0, 9).str.pad_end(9, "0"))
 
 
@@ -187,12 +199,12 @@ def _of_numbers(series: Any, unit: str) -> TimeAxis:
     if not end:
         return clock
     ticks = None if clock.ticks is None else clock.ticks + np.rint(added * size * _NANO).astype(np.int64)
-    told = f"{clock.told or 's'}, whose counter turned over at {end} and is counted on"
-    return TimeAxis(ticks, clock.seconds + added * size, told)
+    format_name = f"{clock.format or 's'}, unwrapped where the counter turned over at {end}"
+    return TimeAxis(ticks, clock.seconds + added * size, format_name)
 
 
 def _counted(series: Any, unit: str) -> tuple[TimeAxis, float]:
-    """The times of a column of numbers, and the seconds that one of them is."""
+    """The times of a column of numbers, and the size of its unit in s."""
     package = polars()
     values = series.cast(package.Float64, strict=False)
     if series.dtype == package.String and (bad := series.is_not_null() & values.is_null()).any():
@@ -209,18 +221,18 @@ def _counted(series: Any, unit: str) -> tuple[TimeAxis, float]:
     if known is not None and known.unit in _LONG:
         return TimeAxis(None, seconds * _LONG[known.unit], known.unit), _LONG[known.unit]
     name = known.unit if known is not None else str(epoch)
-    told = f"{name} since 1970" if epoch == name else name
+    format_name = f"{name} since 1970" if epoch == name else name
     digits = {"s": 9, "ms": 6, "µs": 3, "ns": 0}[name]
     exact = _ticks(series, digits)
     if exact is not None:
-        return _exact(exact, told), 10.0**digits / _NANO
-    return TimeAxis(None, seconds * 10.0**digits / _NANO, told), 10.0**digits / _NANO
+        return _exact(exact, format_name), 10.0**digits / _NANO
+    return TimeAxis(None, seconds * 10.0**digits / _NANO, format_name), 10.0**digits / _NANO
 
 
 def _are_days(values: np.ndarray) -> bool:
-    """Whether numbers are days since 1900, as of spreadsheets, or since the year 0, as of MATLAB, in this century.
+    """Whether numbers are days of this century since 1900 (spreadsheets) or since the year 0 (MATLAB).
 
-    Taken for seconds, the samples would lie less than ten microseconds apart.
+    Read as seconds, the samples would be less than ten microseconds apart.
     """
     finite = values[np.isfinite(values)]
     if len(finite) < _FEW:
@@ -230,7 +242,7 @@ def _are_days(values: np.ndarray) -> bool:
 
 
 def _epoch_unit(values: np.ndarray) -> str | None:
-    """The unit of a count since 1970; None where the numbers are none."""
+    """The unit of a count since 1970; None if the numbers are not such a count."""
     finite = values[np.isfinite(values)]
     if len(finite) < 2:
         return None
@@ -242,7 +254,7 @@ def _epoch_unit(values: np.ndarray) -> str | None:
 
 
 def _ticks(series: Any, digits: int) -> Any | None:
-    """Whole nanoseconds of numbers of 10^digits nanoseconds; None where there are parts of one."""
+    """Convert numbers in units of 10^digits ns to whole nanoseconds; None if a number is not a whole nanosecond."""
     package = polars()
     if series.dtype.is_integer():
         whole = series.cast(package.Int64)

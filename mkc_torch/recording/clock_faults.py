@@ -1,4 +1,4 @@
-"""What clocks of loggers do: counters that turn over, and clocks that stand still over several samples."""
+"""Correct the clocks of loggers: counters that turn over, and clocks coarser than the sampling interval."""
 
 from __future__ import annotations
 
@@ -13,28 +13,32 @@ __all__ = ["interleaved", "spread", "turned_over"]
 
 _DAY, _WEEK = 86_400, 604_800
 _CLOSE = 5.0
-"""Median intervals within which a counter that turned over goes on."""
+"""Largest step over the end of a counter, in median intervals."""
 
 _STILL = 0.5
-"""Share of rows with the time of the row before from which the clock is slower than the samples."""
+"""Smallest share of rows that repeat the time of the row before if the clock is coarser than the samples."""
 
 _LARGEST = 1e100
+"""Largest magnitude of a measured value; larger values are ignored."""
 
 _PERIODS = (2, 3, 4)
+"""Numbers of sensors whose rows may alternate."""
+
 _APART = 4.0
-"""Times as far from the row before as from the one of the same sensor, from which rows are of sensors in turn. What
-one sensor measures is nearer to the row before the farther that is; at rest, noise makes the two alike."""
+"""Smallest ratio of two median distances if rows of several sensors alternate: to the row before, and to the row one
+period before. With a single sensor the row before is closer; for a sensor that does not move, noise makes the two
+distances equal."""
 
 
 def turned_over(values: Float[np.ndarray, " N"], unit: float) -> tuple[Float[np.ndarray, " N"], int]:
-    """What to add to a counter so that it goes on where it turned over, and the number at which it did; 0 if nowhere.
+    """The correction that unwraps a counter, and the value at which it turned over; 0 if it did not.
 
-    A counter of 16 or 32 bits, a second of the day or of the GPS week turned over where it falls from just below its
-    end to just above 0, so that it goes on within five median intervals.
+    A counter of 16 or 32 bits, or the seconds of the day or of the GPS week, turned over where it falls from just
+    below its end to just above 0, such that the unwrapped step is at most five median intervals.
 
     Args:
-        values: of the counter.
-        unit: of it, in s.
+        values: values of the counter.
+        unit: its unit in s.
 
     Example:
         >>> added, end = turned_over(np.array([65510.0, 65530.0, 14.0, 34.0]), 1e-3)
@@ -59,7 +63,7 @@ def turned_over(values: Float[np.ndarray, " N"], unit: float) -> tuple[Float[np.
 
 
 def _more(values: np.ndarray, added: np.ndarray, rows: np.ndarray, end: int, interval: float) -> np.ndarray:
-    """Further turns of a counter whose end is known."""
+    """Add the further turns of a counter whose end is known."""
     steps = np.diff((values + added)[rows])
     for k in np.flatnonzero(steps < 0):
         if steps[k] + end <= _CLOSE * interval:
@@ -70,14 +74,14 @@ def _more(values: np.ndarray, added: np.ndarray, rows: np.ndarray, end: int, int
 def spread(
     time: Float[np.ndarray, " N"], values: Float[np.ndarray, "N k"]
 ) -> tuple[Float[np.ndarray, " N"], int] | None:
-    """Times of a clock that is slower than the samples: those of one time lie evenly up to the next.
+    """Spread samples that share a time stamp evenly up to the next stamp.
 
     Args:
-        time: in the order of the rows.
-        values: of the sensor, by which samples of one time are told from rows that are there twice.
+        time: times in the order of the rows.
+        values: values of the sensor, which distinguish samples of equal time from duplicate rows.
 
     Returns:
-        The times, and the most samples that had one; None where the clock is as fast as the samples.
+        The times, and the largest number of samples that shared a stamp; None if the clock is fine enough.
 
     Example:
         >>> spread(np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0]), np.arange(6.0)[:, None])[0].tolist()
@@ -99,7 +103,7 @@ def spread(
 
 
 def interleaved(values: Float[np.ndarray, "N k"]) -> int:
-    """After how many rows the same sensor comes again, where rows of several lie in turn; 0 where they do not.
+    """The number of sensors whose rows alternate in the table; 0 if rows do not alternate.
 
     Example:
         >>> turn = np.linspace(0.0, 6.0, 200)

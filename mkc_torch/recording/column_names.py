@@ -1,4 +1,4 @@
-"""What the name of a column says: the quantity, the axis, which of several sensors, and the unit."""
+"""Parse the name of a column into quantity, axis, sensor and unit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _STRONG = {
     "q": {"q", "quat", "quaternion", "orientation", "attitude"},
 }
 _WEAK = {"mag": {"m", "b", "h"}, "gyro": {"g", "w"}, "accel": {"a"}}
-"""Letters that stand for a quantity where an axis follows them: mx, Bx, gx, ax."""
+"""Letters that stand for a quantity if an axis follows: mx, Bx, gx, ax."""
 
 _AXES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
 _OTHERS = {
@@ -43,14 +43,14 @@ _OTHERS = {
     "delta", "setpoint", "sp",
     "accuracy", "residual", "true", "truth", "free", "rate", "ekf", "id", "valid", "angle", "lin", "pos", "position",
 }  # fmt: skip
-"""Words that make another quantity of one: what is estimated, expected, or derived from it."""
+"""Words that mark another quantity: an estimate, an expected value, or a derived value."""
 
 _FILLERS = {
     "field", "raw", "sensor", "imu", "data", "value", "values", "val", "measured", "measurement", "reading", "body",
     "frame", "vector", "vec", "axis", "component", "motion", "device", "msg", "message", "uncalibrated", "uncal",
     "calibrated", "cal", "calib", "corrected", "si",
 }  # fmt: skip
-"""Words that say nothing of which sensor it is, or only in which form."""
+"""Words that do not identify the sensor, or only describe the form of the data."""
 
 _TIME_UNITS = {"millis", "micros", "seconds", "milliseconds", "microseconds", "nanoseconds"}
 _TIME = {
@@ -80,18 +80,18 @@ _UNIT = re.compile(r"^(.*?\S)\s*[\[({<]\s*([^\])}>]*?)\s*[\])}>]$")
 _TOKEN = re.compile(r"[A-Z]+(?![a-zµμ])|[A-Z]?[a-zäöüß]+|\d+|[µμ°]\w*")
 _GLUED = re.compile(r"(?<=[XYZxyz])(uT|nT|mT|µT|μT|mG|mGauss|Gauss|dps)$|(?<=[a-z])(Us|Ms|Ns|US|MS|NS)$")
 _ONE_LETTER = {"time": "s", "mag": "TG", "accel": "gG", "current": "Aa", "temperature": "CcKF"}
-"""Units of one letter that a name may end with, as they are written."""
+"""Units of one letter that a name may end with; capitals matter."""
 
 
 class Meaning(NamedTuple):
-    """What a name says.
+    """The parsed name of a column.
 
     Attributes:
         quantity: mag, gyro, accel, q, temperature, current or time.
-        axis: w, x, y or z; empty where there is none.
-        sensor: what the name is without quantity's axis and unit, such as ``mag0``.
-        unit: as it is written; empty where the name has none.
-        sure: False of a single letter such as ``mx`` has.
+        axis: w, x, y or z; empty for a scalar.
+        sensor: the name without axis and unit, such as ``mag0``.
+        unit: the unit as written; empty if the name has no unit.
+        sure: False if the quantity is a single letter, as in ``mx``.
     """
 
     quantity: str
@@ -102,12 +102,12 @@ class Meaning(NamedTuple):
 
     @property
     def column(self) -> str:
-        """The name that such a column has here."""
+        """The canonical name of such a column, such as ``mag_x``."""
         return f"{self.quantity}_{self.axis}" if self.axis else self.quantity
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A name and the unit in brackets behind it.
+    """Split a name from the unit in brackets behind it.
 
     Example:
         >>> split_unit("magX [uT]"), split_unit("MAG[0].x (gauss)"), split_unit("q[0]")
@@ -120,7 +120,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def meaning(name: str) -> Meaning | None:
-    """What the name of a column says; None where it is not known.
+    """Parse the name of a column; None if it is not recognised.
 
     Example:
         >>> meaning("magX [uT]")
@@ -141,27 +141,27 @@ def meaning(name: str) -> Meaning | None:
         found = _classified([word.lower() for word in rest], int(index[1]) if index else None)
         if found is not None and not tail:
             return found._replace(unit=unit or _unit_of_time(found, rest))
-        for told in ("/".join(end), "".join(end)):
-            if found is not None and conversion(found.quantity, told) and _is_unit_of(found, told):
-                return found._replace(unit=told)
+        for unit_text in ("/".join(end), "".join(end)):
+            if found is not None and conversion(found.quantity, unit_text) and _is_unit_of(found, unit_text):
+                return found._replace(unit=unit_text)
     return None
 
 
-def _is_unit_of(found: Meaning, told: str) -> bool:
-    """Whether the end of a name is its unit: a single letter is only where it is written as units are."""
-    return len(told) > 1 or told in _ONE_LETTER.get(found.quantity, "")
+def _is_unit_of(found: Meaning, unit_text: str) -> bool:
+    """Whether the end of a name is its unit; a single letter must have the capitals of a unit."""
+    return len(unit_text) > 1 or unit_text in _ONE_LETTER.get(found.quantity, "")
 
 
 def _unit_of_time(found: Meaning, words: list[str]) -> str:
-    """Arduino's millis and micros, and seconds_elapsed, are units by themselves."""
-    told = [word.lower() for word in words if word.lower() in _TIME_UNITS]
+    """The unit of a time whose name contains it, such as Arduino's millis and micros, or seconds_elapsed."""
+    units = [word.lower() for word in words if word.lower() in _TIME_UNITS]
     if found.quantity == "time" and any(word.lower() == "itow" for word in words):
         return "ms"  # of UBX and other GNSS receivers
-    return told[0] if found.quantity == "time" and told else ""
+    return units[0] if found.quantity == "time" and units else ""
 
 
 def _classified(words: list[str], index: int | None) -> Meaning | None:
-    """The meaning of words without a unit, and of the index in brackets behind them."""
+    """The meaning of words without a unit, given the index in brackets behind them."""
     for axis, rest in _axes(words, index):
         joined = _joined(rest)
         if _OTHERS & set(joined):
@@ -190,7 +190,7 @@ def _of_vector(quantity: str, words: list[str], strong: set[str], axis: str) -> 
 
 
 def _axes(words: list[str], index: int | None) -> Iterable[tuple[str | None, list[str]]]:
-    """The ways of taking an axis off: an index, a word of its own, or the letter that a word begins or ends with."""
+    """Yield each possible axis with the remaining words: an index, a separate word, or a first or last letter."""
     if index is not None:
         yield str(index), words
     for i, word in enumerate(words):
@@ -205,7 +205,7 @@ def _axes(words: list[str], index: int | None) -> Iterable[tuple[str | None, lis
 
 
 def _joined(words: list[str]) -> list[str]:
-    """Words with those of two parts as one: angular velocity."""
+    """Join words of two parts, such as angular velocity."""
     pairs = {"angularvelocity", "angularrate", "rotationrate", "linearacceleration"}
     for i in range(len(words) - 1):
         if words[i] + words[i + 1] in pairs:
@@ -214,14 +214,14 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _sensor(words: list[str]) -> str:
-    """Words as one name, a number with the word before it, and none twice."""
-    told: list[str] = []
+    """Join words to a sensor's name: a number is appended to the word before it, and no word is repeated."""
+    parts: list[str] = []
     for word in words:
-        if word.isdigit() and told:
-            told[-1] += word
-        elif word not in told and f"{word}" not in [re.sub(r"\d+$", "", one) for one in told]:
-            told.append(word)
-    return "_".join(told)
+        if word.isdigit() and parts:
+            parts[-1] += word
+        elif word not in parts and f"{word}" not in [re.sub(r"\d+$", "", part) for part in parts]:
+            parts.append(word)
+    return "_".join(parts)
 
 
 def _of_scalar(words: list[str]) -> Meaning | None:
@@ -236,7 +236,7 @@ def _of_scalar(words: list[str]) -> Meaning | None:
 
 
 def is_about_magnetometer(name: str) -> bool:
-    """Whether a topic or a file is called after a magnetometer, and after no other sensor.
+    """Whether the name of a topic or file names a magnetometer and no other sensor.
 
     Example:
         >>> [is_about_magnetometer(name) for name in ("sensor_mag_0", "/imu/mag", "Magnetometer", "imu", "gyro_mag")]
@@ -248,7 +248,7 @@ def is_about_magnetometer(name: str) -> bool:
 
 
 def form(sensor: str) -> str:
-    """A sensor's name without numbers and words of place: what two of one kind have in common."""
+    """A sensor's name without numbers and words of position; equal for two sensors of the same kind."""
     words = [re.sub(r"\d+$", "", word) for word in sensor.split("_")]
     places = {
         "primary",

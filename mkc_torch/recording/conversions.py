@@ -1,4 +1,4 @@
-"""Units of columns: as the file says, as the caller says instead, and the numbers in this library's own."""
+"""Units of columns: as stated by the file or the caller, and their conversion to this library's units."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, is
 if TYPE_CHECKING:
     from mkc_torch.recording.choice import ColumnChoice
 
-__all__ = ["DEFAULT_UNITS", "Units", "converted", "in_units", "quantity_of", "said_units", "units_told"]
+__all__ = ["DEFAULT_UNITS", "Units", "converted", "in_units", "quantity_of", "stated_units", "unit_conversion_warnings"]
 
 _AXES = {"mag": "xyz", "field": "xyz", "gyro": "xyz", "accel": "xyz", "position": "xyz", "q": "wxyz"}
 DEFAULT_UNITS: Mapping[str, str] = {
@@ -21,34 +21,35 @@ DEFAULT_UNITS: Mapping[str, str] = {
     for quantity, unit in CANONICAL.items()
     for axis in _AXES.get(quantity, " ").strip() or ("",)
 }
-"""The units of the columns whose names have a meaning."""
+"""Default unit of each canonical column name."""
 
 _LABELLED = ("mag", "field")
-"""Quantities that may be in a unit of the user's own."""
+"""Quantities that may keep an unknown unit as a label."""
 
 
 class Units(NamedTuple):
     """Units of a table's columns.
 
     Attributes:
-        written: as the file or the caller writes them.
-        conversions: of columns that are converted.
-        labels: units that stay as they are written.
-        asked: columns whose unit the caller says.
+        written: units as stated by the file or the caller.
+        conversions: conversions of the columns that are converted.
+        labels: units that are kept as written.
+        requested: columns whose unit the caller states.
     """
 
     written: dict[str, str]
     conversions: dict[str, Conversion]
     labels: dict[str, str]
-    asked: frozenset[str]
+    requested: frozenset[str]
 
     @property
-    def said(self) -> frozenset[str]:
+    def with_stated_unit(self) -> frozenset[str]:
+        """Columns whose unit the file or the caller states."""
         return frozenset(self.written)
 
 
 def quantity_of(column: str) -> str | None:
-    """The quantity of a column that has a name of a recording's own.
+    """The quantity of a column with a canonical name; None for other names.
 
     Example:
         >>> quantity_of("mag_x"), quantity_of("time"), quantity_of("mag_status")
@@ -57,41 +58,41 @@ def quantity_of(column: str) -> str | None:
     return column.split("_")[0] if column in DEFAULT_UNITS else None
 
 
-def said_units(choice: ColumnChoice, topic: Topic, names: Iterable[str]) -> dict[str, str]:
-    """The units that a file says of columns: by its format, a row of units, or brackets behind a name."""
-    told = {}
+def stated_units(choice: ColumnChoice, topic: Topic, names: Iterable[str]) -> dict[str, str]:
+    """Units that a file states for columns: by its format, a row of units, or brackets behind a name."""
+    stated = {}
     for name in names:
         old = choice.columns.get(name, name)
         unit = choice.units.get(name) or topic.units.get(old) or split_unit(old)[1]
         if unit:
-            told[name] = unit
-    return told
+            stated[name] = unit
+    return stated
 
 
-def in_units(path: Path, names: Iterable[str], said: Mapping[str, str], given: Mapping[str, str]) -> Units:
-    """What is to be done to columns so that they are in this library's units.
+def in_units(path: Path, names: Iterable[str], stated: Mapping[str, str], given: Mapping[str, str]) -> Units:
+    """Find the conversions that bring columns to this library's units.
 
     Args:
-        path: of the file, for messages.
-        names: of the columns.
-        said: units that the file says.
-        given: units that the caller says, of a quantity such as mag or of one column; these win.
+        path: path of the file, for messages.
+        names: names of the columns.
+        stated: units that the file states, by column.
+        given: units that the caller states, by quantity (such as mag) or column; these take precedence.
 
     Raises:
-        MissingColumnError: ``given`` has neither a quantity nor a column of the file.
-        RecordingError: a unit of a quantity is not known, or a vector's axes are not all in known ones.
+        MissingColumnError: a key of ``given`` is neither a quantity nor a column of the file.
+        RecordingError: a unit is unknown for its quantity, or the axes of a vector have incompatible units.
     """
     names = list(names)
-    asked: dict[str, str] = {}
+    requested: dict[str, str] = {}
     for key, unit in given.items():
         mine = [name for name in names if name == key or (quantity_of(name) == key and key in CANONICAL)]
         if not mine and key not in CANONICAL:
             raise MissingColumnError(
-                f"{path}: `--unit {key}={unit}` names no column of the file and no quantity; quantities are "
+                f"{path}: `--convert {key}={unit}` names no column of the file and no quantity; quantities are "
                 f"{', '.join(CANONICAL)}."
             )
-        asked |= dict.fromkeys(mine, unit.strip())
-    written = {name: unit for name, unit in {**said, **asked}.items() if name in names}
+        requested |= dict.fromkeys(mine, unit.strip())
+    written = {name: unit for name, unit in {**stated, **requested}.items() if name in names}
     conversions: dict[str, Conversion] = {}
     labels: dict[str, str] = {}
     for name, unit in written.items():
@@ -100,29 +101,29 @@ def in_units(path: Path, names: Iterable[str], said: Mapping[str, str], given: M
         if known is not None and known.unit != CANONICAL[quantity or ""]:
             conversions[name] = known
         elif known is None:
-            if quantity and quantity not in _LABELLED and name in asked:
+            if quantity and quantity not in _LABELLED and name in requested:
                 raise RecordingError(
-                    f"{path}: `--unit {quantity}={unit}` is no unit of {quantity} that is known; known: "
+                    f"{path}: `--convert {quantity}={unit}` is not a known unit of {quantity}; known: "
                     f"{known_units(quantity)}."
                 )
-            if quantity != "time":  # what a time is called says less than what it holds
+            if quantity != "time":  # the values of a time determine its unit, not the label
                 labels[name] = unit
     _refuse_mixed(path, labels, names)
-    return Units(written, {k: c for k, c in conversions.items() if k != "time"}, labels, frozenset(asked))
+    return Units(written, {k: c for k, c in conversions.items() if k != "time"}, labels, frozenset(requested))
 
 
 def _refuse_mixed(path: Path, labels: Mapping[str, str], names: list[str]) -> None:
     axes = [name for name in names if quantity_of(name) == "mag"]
-    told = {labels.get(name, "µT") for name in axes}
-    if len(told) > 1:
+    units = {labels.get(name, "µT") for name in axes}
+    if len(units) > 1:
         raise RecordingError(
-            f"{path}: the axes of the magnetometer are in different units, {', '.join(sorted(told))}, which cannot be "
-            "converted to one; correct the names, or say `--unit mag=...`."
+            f"{path}: the axes of the magnetometer are in different units, {', '.join(sorted(units))}, which cannot be "
+            "converted to a common unit; correct the column names, or give the unit, `--convert mag=...`."
         )
 
 
 def converted(series: Any, numbers: Any, known: Conversion | None) -> Any:
-    """Numbers in this library's unit; of text that is a power of ten away without a rounding of its own."""
+    """Convert numbers to this library's unit; text is scaled by a power of ten without an extra rounding."""
     if known is None:
         return numbers
     package = polars()
@@ -137,13 +138,13 @@ def converted(series: Any, numbers: Any, known: Conversion | None) -> Any:
     return exact.zip_with(plain.str.contains(r"^[+-]?[\d.]+$").fill_null(False), scaled)
 
 
-def units_told(units: Units, values: Mapping[str, Any]) -> list[str]:
-    """Sentences about what was converted, and about units that stay."""
-    told = [
-        f"`{name}` and the others keep their numbers: {unit} is no unit of a magnetic field that is known; known: "
+def unit_conversion_warnings(units: Units, values: Mapping[str, Any]) -> list[str]:
+    """Return the warnings about converted columns, and about unknown units that are kept."""
+    warnings = [
+        f"`{name}` and the other axes are not converted: {unit} is not a known unit of a magnetic field; known: "
         f"{known_units('mag')}."
         for name, unit in units.labels.items()
-        if name == "mag_x" and name in units.asked and not is_unit(unit)
+        if name == "mag_x" and name in units.requested and not is_unit(unit)
     ]
     done: set[tuple[str, str]] = set()
     for name, known in units.conversions.items():
@@ -151,7 +152,7 @@ def units_told(units: Units, values: Mapping[str, Any]) -> list[str]:
         if name not in values or (quantity, known.unit) in done:
             continue
         done.add((quantity, known.unit))
-        same = [one for one, other in units.conversions.items() if quantity_of(one) == quantity and other == known]
-        why = "as asked for" if name in units.asked else "as the file says"
-        told.append(f"{listed(same)}: converted from {known.unit}, {why}, to {CANONICAL[quantity]}.")
-    return told
+        same = [key for key, other in units.conversions.items() if quantity_of(key) == quantity and other == known]
+        why = "as requested" if name in units.requested else "as the file says"
+        warnings.append(f"{listed(same)}: converted from {known.unit}, {why}, to {CANONICAL[quantity]}.")
+    return warnings

@@ -1,4 +1,4 @@
-"""A SIMULATED magnetometer for the demonstration: turned by hand while something magnetic passes, or beside a cable."""
+"""A SIMULATED magnetometer for the demonstration: turned by hand while a magnet passes, or next to a cable."""
 
 from __future__ import annotations
 
@@ -30,14 +30,16 @@ NEAREST = 0.17  # m
 SPEED = 0.24  # m/s
 MU0_OVER_4PI = 0.1  # µT·m³/(A·m²)
 
-FIELD_PER_AMPERE = (0.3, -0.2, 0.4)  # µT/A, of a cable beside the sensor
-_CABLE_RATE, _CABLE_SECONDS = 20.0, 60.0  # Hz, s
-_OUTLIERS, _OUTLIER = 0.05, 8.0  # share, µT
+FIELD_PER_AMPERE = (0.3, -0.2, 0.4)  # µT/A, field of a cable next to the sensor
+_CABLE_RATE = 20.0  # Hz
+_CABLE_SECONDS = 60.0  # s
+_OUTLIERS = 0.05  # share of samples
+_OUTLIER = 8.0  # µT, standard deviation
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the simulation was made with: offset and semi-axes in µT, and when the disturbance exceeded 1 µT, in s."""
+    """True values: offset and semi-axes in µT, and the interval in s in which the disturbance exceeds 1 µT."""
 
     center: tuple[float, float, float]
     semi_axes: tuple[float, float, float]
@@ -45,10 +47,10 @@ class Truth:
 
 
 def simulated_recording(seed: int = 0) -> tuple[Recording, Truth]:
-    """Ninety seconds of ``time``, ``mag_x``, ``mag_y``, ``mag_z`` at 50 Hz, and the truth behind them.
+    """Ninety seconds of ``time``, ``mag_x``, ``mag_y``, ``mag_z`` at 50 Hz, and their true parameters.
 
-    A hand turns the sensor through all directions in a field of 48 µT; a loudspeaker is carried past it. The sensor
-    has an offset, unequal gains, cross-axis coupling, white noise and a resolution of 0.15 µT.
+    A hand turns the sensor through all directions in a field of 48 µT while a loudspeaker is carried past it. The
+    sensor has an offset, unequal gains, cross-axis coupling, white noise and a resolution of 0.15 µT.
 
     Example:
         >>> recording, truth = simulated_recording()
@@ -73,10 +75,10 @@ def simulated_recording(seed: int = 0) -> tuple[Recording, Truth]:
 
 
 def concealed_recording(seed: int = 0) -> Recording:
-    """A minute of ``time``, ``mag_x`` to ``mag_z``, ``current`` and ``temperature`` at 20 Hz, with something hidden.
+    """A minute of ``time``, ``mag_x`` to ``mag_z``, ``current`` and ``temperature`` at 20 Hz, with a hidden effect.
 
-    The same sensor beside a cable, whose current adds :data:`FIELD_PER_AMPERE`: less than the noise, and one sample in
-    twenty is an outlier. The temperature rises and does nothing.
+    The same sensor is next to a cable, whose current adds :data:`FIELD_PER_AMPERE`, less than the noise. One sample in
+    twenty is an outlier. The temperature rises without an effect.
 
     Example:
         >>> concealed_recording().names

@@ -1,4 +1,4 @@
-"""Intervals of time in which rejected samples stand close together."""
+"""Time intervals in which most samples are rejected."""
 
 from __future__ import annotations
 
@@ -13,26 +13,31 @@ if TYPE_CHECKING:
 __all__ = ["RejectedInterval", "disturbed_intervals"]
 
 _WINDOW_SECONDS = 0.25
+"""Length of the window around a sample, in s."""
+
 _JOIN_SECONDS = 1.0
-_FEWEST = 5  # samples of a window, at least
+"""Longest gap in s between two intervals that are joined."""
+
+_FEWEST = 5
+"""Fewest samples of a window."""
 
 
 class RejectedInterval(NamedTuple):
-    """From the first to the last rejected sample, in s."""
+    """Times of the first and the last rejected sample, in s."""
 
     start: float
     end: float
 
 
 def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"]) -> tuple[RejectedInterval, ...]:
-    """Where at least half of the samples within a quarter of a second (five samples at least) are rejected.
+    """Intervals in which at least half of the samples within a quarter of a second (at least 5) are rejected.
 
-    Intervals less than a second apart are one. Scattered rejected samples, as heavy-tailed noise has them, belong
-    to none. Where the time begins anew, as between the experiments of one table, an interval ends.
+    Intervals less than a second apart are joined. Scattered rejected samples, as in heavy-tailed noise, belong to no
+    interval. An interval ends where the time restarts, as between the runs of a table.
 
     Args:
-        time: in s, ascending but for such new beginnings.
-        rejected: which samples were rejected.
+        time: in s, ascending within each run.
+        rejected: mask of the rejected samples.
 
     Example:
         >>> time = torch.arange(1000) / 50.0
@@ -56,7 +61,7 @@ def _in_one_run(time: Tensor, rejected: Tensor, half: int, join: float) -> list[
     count = torch.cat([torch.zeros(1, dtype=torch.int64), rejected.long().cumsum(0)])
     index = torch.arange(len(time))
     low, high = (index - half).clamp(min=0), (index + half + 1).clamp(max=len(time))
-    # windows at the ends are compared with their full width, so that one sample there is no disturbance
+    # windows at the ends count as full windows, so that a single sample there is not a disturbance
     dense = (count[high] - count[low]) >= half + 1
     hits = (dense & rejected).nonzero().squeeze(-1)
     found: list[RejectedInterval] = []

@@ -1,4 +1,4 @@
-"""Columns that a caller gives: checked, and out of a data frame."""
+"""Check the columns that a caller gives, and take them from a data frame."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from mkc_torch.recording.formats.cells import renamed
 __all__ = ["EXPERIMENT", "FrameColumns", "checked_columns", "columns_of_frame", "table_of_frame"]
 
 EXPERIMENT = "experiment"
-"""The column that says which samples belong together; the one in which text is welcome."""
+"""Name of the column that numbers the runs; the only column in which text is accepted."""
 
 
 class FrameColumns(NamedTuple):
-    """What a data frame holds of a recording."""
+    """Columns, labels and warnings of a data frame."""
 
     columns: dict[str, Tensor]
     labels: dict[str, tuple[str, ...]]
@@ -30,14 +30,14 @@ class FrameColumns(NamedTuple):
 
 
 def checked_columns(columns: Mapping[str, Data], name: str) -> dict[str, Tensor]:
-    """Columns as real tensors of one length >= 1.
+    """Convert columns to real tensors of equal length >= 1.
 
     Args:
         columns: name to values, tensors or arrays.
-        name: of the recording, for messages.
+        name: name of the recording, for messages.
 
     Raises:
-        RecordingError: they are none, or a name is unusable.
+        RecordingError: no columns, no samples, unequal lengths, values that are not real numbers, or a bad name.
     """
     where = f"{name}: " if name else ""
     if not columns:
@@ -52,17 +52,17 @@ def checked_columns(columns: Mapping[str, Data], name: str) -> dict[str, Tensor]
     return given
 
 
-def columns_of_frame(frame: Any, names: Mapping[str, str], asked: Collection[str], name: str) -> FrameColumns:
-    """The columns of a data frame that hold numbers, NaN where there is no value.
+def columns_of_frame(frame: Any, names: Mapping[str, str], required: Collection[str], name: str) -> FrameColumns:
+    """The numeric columns of a data frame, with NaN for missing values.
 
     Args:
-        frame: of pandas or polars.
-        names: for each name a column is to get, the name it has.
-        asked: names beside those of ``names`` under which something else than numbers is an error.
-        name: of the recording, for messages.
+        frame: a frame of pandas or polars.
+        names: new name to the name in the frame.
+        required: further required columns; a required column without numbers is an error.
+        name: name of the recording, for messages.
 
     Raises:
-        RecordingError: no frame, columns of the same name or of none, or no numbers where they are needed.
+        RecordingError: not a frame, duplicate or missing column names, or no numbers where they are needed.
         MissingColumnError: ``names`` has a column that the frame does not have.
     """
     where = f"{name}: " if name else ""
@@ -76,7 +76,7 @@ def columns_of_frame(frame: Any, names: Mapping[str, str], asked: Collection[str
             columns[key] = numbers
         elif key == EXPERIMENT:
             columns[key], labels[key] = _numbered(series)
-        elif key in asked or key in names or _some_number(series):
+        elif key in required or key in names or _some_number(series):
             raise _refused(numbers, where)
         else:
             warnings.append(f"Column `{key}` holds no numbers and is left out.")
@@ -86,10 +86,10 @@ def columns_of_frame(frame: Any, names: Mapping[str, str], asked: Collection[str
 
 
 def table_of_frame(frame: Any, name: str) -> Table:
-    """A data frame as a file's table: its columns as series of polars, to the last digit.
+    """Convert a data frame to a table of polars series, without loss of digits.
 
     Raises:
-        RecordingError: no frame, one without rows, or columns without names.
+        RecordingError: not a frame, a frame without rows, or columns without names.
         ImportError: polars is not installed.
     """
     where = f"{name}: " if name else ""
@@ -102,11 +102,14 @@ def table_of_frame(frame: Any, name: str) -> Table:
 def _table(frame: Any, where: str) -> Table:
     if not is_frame(frame):
         raise RecordingError(
-            f"{where}expected a DataFrame but got {format_value(frame)}; columns are Recording({{...}})."
+            f"{where}expected a DataFrame but got {format_value(frame)}; make a recording of columns by "
+            "Recording({...})."
         )
     found = _with_index(frame)
     if nameless := [label for label, _ in found if not isinstance(label, str)]:
-        raise RecordingError(f"{where}the columns of a frame need names of text but one is {nameless[0]!r}; rename it.")
+        raise RecordingError(
+            f"{where}the column names of a frame must be text but got {nameless[0]!r}; rename that column."
+        )
     return Table([label.strip() for label, _ in found], [series for _, series in found], range(len(frame)), "row")
 
 
@@ -115,7 +118,7 @@ def _polars_series(series: Any) -> Any:
     if isinstance(series, package.Series):
         return series
     kind = getattr(series.dtype, "kind", "O")
-    if kind in "mM":  # with a zone too, in UTC then
+    if kind in "mM":  # with a time zone: in UTC
         return package.Series(series.to_numpy(dtype=f"{'datetime' if kind == 'M' else 'timedelta'}64[ns]"))
     if kind in "iuf" and absent(series) is None:
         return package.Series(np.asarray(series.to_numpy()))
@@ -123,13 +126,15 @@ def _polars_series(series: Any) -> Any:
     if isinstance(numbers, Tensor):
         return package.Series(numbers.numpy())
     return package.Series(
-        [None if one is None or one != one else str(one) for one in _cells(series)], dtype=package.String
+        [None if cell is None or cell != cell else str(cell) for cell in _cells(series)], dtype=package.String
     )
 
 
 def _checked(key: object, values: object, where: str) -> Tensor:
     if not isinstance(key, str) or not key or key != key.strip() or any(end in key for end in "\r\n"):
-        raise RecordingError(f"{where}{key!r} cannot name a column: one line of text, no spaces around it.")
+        raise RecordingError(
+            f"{where}{key!r} cannot name a column; use a single line of text without spaces around it."
+        )
     if is_array(values) and not is_frame(values):
         values = _numbers(key, values)
         if isinstance(values, TypeError):
@@ -143,7 +148,7 @@ def _checked(key: object, values: object, where: str) -> Tensor:
 
 
 def _numbers(key: str, values: object) -> Tensor | TypeError:
-    """The numbers of a column, NaN where one is missing, or why it has none."""
+    """The numbers of a column, with NaN for missing values, or the error if it is not numeric."""
     try:
         return torch.from_numpy(numbers_of(f"column `{key}`", values, math.nan))
     except TypeError as error:
@@ -156,7 +161,7 @@ def _refused(error: TypeError, where: str) -> RecordingError:
 
 
 def _with_index(frame: Any) -> list[tuple[Any, Any]]:
-    """The columns of a frame, and its index where that has a name of its own."""
+    """The columns of a frame, and its index if it has a name of its own."""
     columns = list(series_of(frame))
     index = getattr(frame, "index", None)
     label = getattr(index, "name", None)
@@ -166,19 +171,19 @@ def _with_index(frame: Any) -> list[tuple[Any, Any]]:
 
 
 def _numbered(series: Any) -> tuple[Tensor, tuple[str, ...]]:
-    """Labels as 0, 1, … in the order of appearance, NaN where there is none, and the labels."""
-    cells = [None if one is None or isinstance(one, float) else str(one).strip() for one in _cells(series)]
+    """Number labels 0, 1, … in the order of appearance, with NaN for missing labels; returns numbers and labels."""
+    cells = [None if cell is None or isinstance(cell, float) else str(cell).strip() for cell in _cells(series)]
     numbers = {label: float(i) for i, label in enumerate(dict.fromkeys(cell for cell in cells if cell))}
     return torch.tensor([numbers.get(cell or "", math.nan) for cell in cells], dtype=torch.float64), tuple(numbers)
 
 
 def _some_number(series: Any) -> bool:
-    """Whether there are numbers among what is none."""
-    return any(isinstance(one, (int, float, np.number)) and one == one for one in _cells(series))
+    """Whether some cell of a column is a number."""
+    return any(isinstance(cell, (int, float, np.number)) and cell == cell for cell in _cells(series))
 
 
 def _cells(series: Any) -> list[Any]:
-    """What stands in a column, None where nothing does."""
+    """The cells of a column, with None for missing values."""
     cells = np.asarray(series.to_numpy()).tolist()
     gone = absent(series)
-    return cells if gone is None else [None if none else one for one, none in zip(cells, gone, strict=True)]
+    return cells if gone is None else [None if missing else cell for cell, missing in zip(cells, gone, strict=True)]

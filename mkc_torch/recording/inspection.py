@@ -1,4 +1,4 @@
-"""What is in a file: its topics and columns, their rates, gaps and units, and what would be read of it."""
+"""Inspect a file: its topics and columns, their rates, gaps and units, and the magnetometers that would be read."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from mkc_torch.recording.runs import restarts
 
 __all__ = ["ColumnSeen", "FileSeen", "SensorSeen", "TopicSeen", "inspect_file"]
 
-_GAP = 10.0  # in median intervals
+_GAP = 10.0  # longest interval that is not a gap, in median intervals
 
 
 @dataclass(frozen=True)
 class ColumnSeen:
-    """A column as it stands in a file.
+    """A column of a file.
 
     Attributes:
-        name: in the file.
-        kind: numbers, whole numbers, time stamps, text, or empty.
-        unit: that the file says; empty where it says none.
-        looks_like: the name that a recording has for it; empty where it is not known.
-        missing: how many of its cells hold no value.
+        name: its name in the file.
+        kind: "numbers", "whole numbers", "time stamps", "text" or "empty".
+        unit: the unit that the file states; empty if it states none.
+        looks_like: the canonical name of the column; empty if it is not recognised.
+        missing: number of cells without a value.
     """
 
     name: str
@@ -50,16 +50,16 @@ class TopicSeen:
     """A table of a file.
 
     Attributes:
-        name: empty where a file holds one alone.
-        rows: how many.
-        columns: of it.
-        time: its column of time; empty where there is none.
-        seconds: from the first to the last time of its longest run, in s; None without a time.
-        rate: samples a second, by the median interval, in Hz; None without a time.
-        gaps: intervals of more than ten median ones.
-        longest_gap: in s; 0 without any.
-        runs: how often its time starts, at least 1.
-        warnings: sentences about what was skipped while it was read.
+        name: name of the topic; empty if the file holds a single table.
+        rows: number of rows.
+        columns: its columns.
+        time: name of its time column; empty if there is none.
+        seconds: duration of its longest run, in s; None without a time.
+        rate: sampling rate by the median interval, in Hz; None without a time.
+        gaps: number of intervals longer than ten median intervals.
+        longest_gap: in s; 0 without gaps.
+        runs: number of runs, at least 1.
+        warnings: what was skipped while the table was read.
     """
 
     name: str
@@ -76,13 +76,13 @@ class TopicSeen:
 
 @dataclass(frozen=True)
 class SensorSeen:
-    """A magnetometer, and what is read with it.
+    """A magnetometer, and the columns that are read with it.
 
     Attributes:
-        name: by which ``--sensor`` takes it; empty where there is one alone.
-        topic: that it is in.
-        columns: for each name that a column gets, the name it has in the file.
-        units: that the file says, by the new names.
+        name: its name for ``--sensor``; empty if the file has a single magnetometer.
+        topic: name of its topic.
+        columns: new name to the name in the file.
+        units: units that the file states, by new name.
     """
 
     name: str
@@ -93,13 +93,13 @@ class SensorSeen:
 
 @dataclass(frozen=True)
 class FileSeen:
-    """What is in a file.
+    """The contents of a file.
 
     Attributes:
-        path: of it.
+        path: path of the file.
         topics: its tables.
-        sensors: the magnetometers that are recognised.
-        question: why none is taken without being named, and the option that does it; empty where there is no question.
+        sensors: the recognised magnetometers.
+        question: why no magnetometer can be chosen, and the option that names it; empty if the choice is clear.
     """
 
     path: Path
@@ -109,11 +109,11 @@ class FileSeen:
 
 
 def inspect_file(path: Path) -> FileSeen:
-    """Look at a file.
+    """Inspect a file.
 
     Raises:
-        RecordingError: no file of a known kind, or a damaged or empty one.
-        FileNotFoundError: no such file.
+        RecordingError: the file is of an unknown kind, damaged or empty.
+        FileNotFoundError: there is no such file.
 
     Example:
         >>> import tempfile
@@ -141,7 +141,7 @@ def inspect_file(path: Path) -> FileSeen:
 
 
 def _topic(topic: Topic, raw: Topic) -> TopicSeen:
-    """What is seen of a topic: its columns as they stand in the file, the time as it is read."""
+    """Summarise a topic: the columns of the raw file, and the time as it is read."""
     table = topic.table
     columns = tuple(
         _column(raw, name, series) for name, series in zip(raw.table.names, raw.table.series, strict=True) if name
@@ -187,10 +187,10 @@ def _times(series: Any, unit: str) -> np.ndarray | None:
 
 
 def _column(topic: Topic, name: str, series: Any) -> ColumnSeen:
-    said = meaning(name)
-    unit = topic.units.get(name) or split_unit(name)[1] or ("" if said is None else said.unit)
+    known = meaning(name)
+    unit = topic.units.get(name) or split_unit(name)[1] or ("" if known is None else known.unit)
     kind, missing = _kind(series)
-    return ColumnSeen(name, kind, unit, "" if said is None or kind == "text" else said.column, missing)
+    return ColumnSeen(name, kind, unit, "" if known is None or kind == "text" else known.column, missing)
 
 
 def _kind(series: Any) -> tuple[str, int]:
@@ -198,12 +198,12 @@ def _kind(series: Any) -> tuple[str, int]:
     if series.dtype.is_temporal():
         return "time stamps", int(series.null_count())
     numbers, bad = as_numbers(series)
-    none = int((numbers.is_null() & ~bad).sum())
-    if none == len(series):
-        return "empty", none
+    missing = int((numbers.is_null() & ~bad).sum())
+    if missing == len(series):
+        return "empty", missing
     if bad.any():
         first = str(series[int(bad.arg_max())])
-        return "time stamps" if series.dtype == package.String and is_stamp(first) else "text", none
+        return "time stamps" if series.dtype == package.String and is_stamp(first) else "text", missing
     values = numbers.drop_nulls().drop_nans()
     whole = bool((values == values.round(0)).all()) and len(values) > 0
-    return "whole numbers" if whole else "numbers", none
+    return "whole numbers" if whole else "numbers", missing

@@ -1,4 +1,4 @@
-"""Columns of a log's other topics at the times of its magnetometer."""
+"""Resample the columns of a log's other topics at the times of its magnetometer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mkc_torch.recording.clock import ClockError, TimeAxis, clock_of
 from mkc_torch.recording.conversions import converted, quantity_of
 from mkc_torch.recording.formats.base import Topic, counted, listed
 from mkc_torch.recording.formats.cells import as_numbers
-from mkc_torch.recording.recognise import recorded_beside, time_column
+from mkc_torch.recording.recognise import companion_columns, time_column
 from mkc_torch.recording.unit_words import conversion
 
 if TYPE_CHECKING:
@@ -20,28 +20,28 @@ if TYPE_CHECKING:
 __all__ = ["ResampledColumns", "interpolated", "join_topics"]
 
 _GAP = 10.0
-"""Median intervals of a topic over which nothing is interpolated."""
+"""Longest interval, in median intervals of a topic, across which values are interpolated."""
 
 
 class ResampledColumns(NamedTuple):
-    """Columns at the magnetometer's times, NaN where there is no value, and sentences about them."""
+    """Columns at the magnetometer's times, with NaN for missing values, and warnings."""
 
     columns: dict[str, np.ndarray]
     warnings: list[str]
 
 
 def join_topics(topics: Sequence[Topic], own: int, clock: TimeAxis, there: set[str]) -> ResampledColumns:
-    """Gyroscope, accelerometer, attitude, temperature and current of other topics, linear between their samples.
+    """Interpolate gyroscope, accelerometer, attitude, temperature and current of other topics linearly.
 
     Args:
-        topics: of the file.
-        own: number of the magnetometer's.
-        clock: of the magnetometer.
-        there: columns that its topic has itself.
+        topics: topics of the file.
+        own: index of the magnetometer's topic.
+        clock: times of the magnetometer.
+        there: names of the columns that its topic already has.
     """
     columns: dict[str, np.ndarray] = {}
     warnings: list[str] = []
-    for number, names, units in recorded_beside(topics, own):
+    for number, names, units in companion_columns(topics, own):
         topic = topics[number]
         mine = {new: old for new, old in names.items() if new not in there and new not in columns}
         other = _clock(topic)
@@ -64,9 +64,9 @@ def join_topics(topics: Sequence[Topic], own: int, clock: TimeAxis, there: set[s
             found = found / np.linalg.norm(found, axis=-1, keepdims=True)
         missing = int(np.isnan(found).any(-1).sum())
         columns |= dict(zip(mine, found.T, strict=True))
-        none = f"; {counted(missing, 'sample')} outside of its times or in its gaps have none" if missing else ""
+        without = f"; {counted(missing, 'sample')} outside of its times or in its gaps have no value" if missing else ""
         warnings.append(
-            f"{listed(mine)}: of topic `{topic.name}`, linear between its samples at the magnetometer's times{none}."
+            f"{listed(mine)}: of topic `{topic.name}`, interpolated linearly at the magnetometer's times{without}."
         )
     return ResampledColumns(columns, warnings)
 
@@ -74,11 +74,11 @@ def join_topics(topics: Sequence[Topic], own: int, clock: TimeAxis, there: set[s
 def interpolated(
     at: Float[np.ndarray, " N"], times: Float[np.ndarray, " M"], values: Float[np.ndarray, "M k"]
 ) -> Float[np.ndarray, "N k"]:
-    """Values at other times, linear between samples; NaN outside of them, and over more than ten median intervals.
+    """Interpolate linearly; NaN outside of the samples, and in gaps of more than ten median intervals.
 
     Args:
-        at: the times, in s.
-        times: of the values, in any order; those that repeat count once.
+        at: times at which values are needed, in s.
+        times: times of the values in s, in any order; repeated times count once.
         values: a row for each time.
 
     Example:
@@ -113,7 +113,7 @@ def _clock(topic: Topic) -> TimeAxis | None:
 
 
 def _on_one_axis(clock: TimeAxis, other: TimeAxis) -> tuple[np.ndarray, np.ndarray]:
-    """Times of two topics, in s from one moment on."""
+    """Times of two topics in s, with a common origin."""
     if clock.ticks is None or other.ticks is None:
         return clock.seconds, other.seconds
     begin = clock.ticks[int(np.isfinite(clock.seconds).argmax())]
@@ -125,7 +125,7 @@ def _from(clock: TimeAxis, ticks: np.ndarray, begin: np.int64) -> np.ndarray:
 
 
 def _one_sign(quaternions: np.ndarray) -> np.ndarray:
-    """Quaternions of which neighbours lie on one side: q and -q are one rotation."""
+    """Choose the signs of quaternions so that the dot products of neighbours are not negative."""
     dots = (quaternions[1:] * quaternions[:-1]).sum(-1)
     signs = np.concatenate([[1.0], np.cumprod(np.where(dots < 0.0, -1.0, 1.0))])
     return quaternions * signs[:, None]

@@ -1,4 +1,4 @@
-"""A time that a table holds in two columns, a date and a time of the day or seconds and a part of one, as one."""
+"""Join a time that is split into two columns: date and time of day, or seconds and fraction."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _PARTS = {
     "usec": 6, "usecs": 6, "microsec": 6, "microsecs": 6, "microseconds": 6, "tv_usec": 6, "us": 6,
     "msec": 3, "msecs": 3, "millisec": 3, "millisecs": 3, "milliseconds": 3, "ms": 3,
 }  # fmt: skip
-"""Names of what is left of a second, and the digits that it has."""
+"""Names of fractions of a second, and their number of digits."""
 
 _UNITS = {9: "ns", 6: "us", 3: "ms"}
 _NAME = re.compile(r"^(.*?[._/ ]|)([A-Za-z]+|tv_[a-z]+)(\s*[\[(].*[\])])?$")
 
 
 def with_joined_times(topics: Sequence[Topic], named: Iterable[str] = ()) -> list[Topic]:
-    """The topics, with a time of two columns as one column ``time``, or of the stem that both names share.
+    """Join a time of two columns into a column ``time``, or of the stem that both names share.
 
-    Joined are a column of dates and one of times of the day, and ROS's ``sec`` and ``nanosec``, ``secs`` and ``nsecs``,
-    or C's ``tv_sec`` and ``tv_usec``, where all of the second are whole and less than a second.
+    This joins a date column and a time-of-day column, and ROS's ``sec`` and ``nanosec``, ``secs`` and ``nsecs``, or
+    C's ``tv_sec`` and ``tv_usec`` if all fractions are whole numbers less than a second.
 
     Args:
-        topics: of a file.
-        named: columns that the caller names, which stay as they are.
+        topics: topics of a file.
+        named: columns that the caller names, which stay unchanged.
 
     Example:
         >>> import polars as pl
@@ -64,15 +64,15 @@ def _with_parts(topic: Topic) -> Topic:
             digits = _PARTS[part[2]]
             ticks = _ticks(table.series[i], table.series[k], digits)
             stem = re.sub(r"[._/ ]+$", "", table.names[i].strip()[: len(whole[1])])
-            said = meaning(stem) if stem else None
-            name = stem if said is not None and said.quantity == "time" else "time"
+            known = meaning(stem) if stem else None
+            name = stem if known is not None and known.quantity == "time" else "time"
             if ticks is not None and name not in table.names:
                 return _joined(topic, (i, k), name, ticks, _UNITS[digits])
     return topic
 
 
 def _ticks(whole: Any, part: Any, digits: int) -> Any | None:
-    """Seconds and parts of one as a whole number of parts; None where they are no such numbers."""
+    """Combine seconds and their fractions to whole numbers of the small unit; None for other numbers."""
     package = polars()
     found = []
     for series in (whole, part):
@@ -93,7 +93,7 @@ def _ticks(whole: Any, part: Any, digits: int) -> Any | None:
 
 
 def _with_date(topic: Topic) -> Topic:
-    """Dates and times of the day are known by what they hold: each has one column alone, or they stand side by side."""
+    """Join the only column of dates and the only column of times of day, recognised by their cells."""
     table = topic.table
     if any(series.dtype.is_temporal() for series in table.series):
         return topic
@@ -107,19 +107,21 @@ def _with_date(topic: Topic) -> Topic:
     return _joined(topic, (date, day), name, joined, "")
 
 
-def _holds(series: Any, is_one: Any) -> bool:
+def _holds(series: Any, matches: Any) -> bool:
     if series.dtype != polars().String:
         return False
     known = series.drop_nulls()
     known = known.filter(known.str.strip_chars() != "")
-    return len(known) > 0 and all(is_one(known[row]) for row in {0, len(known) // 2, len(known) - 1})
+    return len(known) > 0 and all(matches(known[row]) for row in {0, len(known) // 2, len(known) - 1})
 
 
 def _joined(topic: Topic, places: tuple[int, int], name: str, series: Any, unit: str) -> Topic:
     table = topic.table
-    told = f"Columns `{table.names[places[0]]}` and `{table.names[places[1]]}` are joined into one time."
+    warning = f"Columns `{table.names[places[0]]}` and `{table.names[places[1]]}` are joined into a single time."
     kept = [i for i in range(len(table.names)) if i not in places]
     names = [name, *(table.names[i] for i in kept)]
-    units = {key: one for key, one in topic.units.items() if key in names and key != name}
+    units = {key: own for key, own in topic.units.items() if key in names and key != name}
     joined = Table(names, [series, *(table.series[i] for i in kept)], table.lines, table.line)
-    return topic._replace(table=joined, units=units | ({name: unit} if unit else {}), warnings=(*topic.warnings, told))
+    return topic._replace(
+        table=joined, units=units | ({name: unit} if unit else {}), warnings=(*topic.warnings, warning)
+    )

@@ -1,4 +1,4 @@
-"""A table's own columns beside new ones: text, times and numbers as they stand in the file."""
+"""Write a file's own columns together with new columns, with text, times and numbers as in the file."""
 
 from __future__ import annotations
 
@@ -18,63 +18,63 @@ from mkc_torch.recording.row_sensors import with_row_sensors
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["write_beside"]
+__all__ = ["write_with_columns"]
 
 _LEADING_ZERO = r"^\s*[+-]?0\d"
-"""Of digits that are a name rather than a number, such as 007."""
+"""Pattern of digits that are a name rather than a number, such as 007."""
 
 
-def write_beside(
+def write_with_columns(
     source: Path, path: Path, columns: Mapping[str, Tensor], *, topic: int = 0, overwrite: bool = False
 ) -> tuple[str, ...]:
-    """Write the columns of a file, in its order, with others: in the place of one of that name, or after all.
+    """Write the columns of a file in their order, with further columns replaced by name or appended.
 
-    What is text in the file is written as it is, to the last digit. Into a Parquet file numbers go as numbers, and
-    what comes from one keeps its type; into text, times go as ISO 8601. Columns without a name keep having none.
+    Text of the file is written unchanged, to the last digit. A Parquet target receives numbers as numbers, and columns
+    of a Parquet source keep their types; a text target receives times as ISO 8601. Columns without a name stay so.
 
     Args:
         source: the file that was read.
-        path: the target; its ending says the format.
+        path: the target; its ending selects the format.
         columns: name to values, (N,) for the N rows of the file.
-        topic: number of the topic, where the file holds several.
+        topic: index of the topic if the file holds several.
         overwrite: replace an existing file.
 
     Returns:
-        The names of what was written.
+        The names of the written columns.
 
     Raises:
-        RecordingError: the source is no table, or an ending that is not known.
+        RecordingError: the source is not a table, or the ending is unknown.
         FileExistsError: the target exists and ``overwrite`` is False.
     """
     check_ending(path)
     topics = read_topics(source)
     if any(len(values) != len(topics[min(topic, len(topics) - 1)].table.lines) for values in columns.values()):
-        topics = with_row_sensors(topics)  # those of one sensor, where rows are of several
+        topics = with_row_sensors(topics)  # the rows of a single sensor
     table = topics[topic].table
     of_text, as_text = (file.suffix.lower() in CSV.endings for file in (source, path))
-    told: dict[str, Any] = {}
+    written: dict[str, Any] = {}
     for name, series in zip(table.names, table.series, strict=True):
-        while not name and name in told:
-            name += " "  # blanks tell several without a name apart, and are none when it is read
-        told[name] = _texts(series) if as_text else _typed(series) if of_text else series
-    told |= {name: values.numpy() for name, values in columns.items()}
-    write_atomically(path, encoded(path, told), overwrite=overwrite)
-    return tuple(told)
+        while not name and name in written:
+            name += " "  # blanks make empty names unique and are stripped on reading
+        written[name] = _texts(series) if as_text else _typed(series) if of_text else series
+    written |= {name: values.numpy() for name, values in columns.items()}
+    write_atomically(path, encoded(path, written), overwrite=overwrite)
+    return tuple(written)
 
 
 def _typed(series: Any) -> Any:
-    """A column of text for a file that has types: as it is, but for one that holds numbers alone."""
+    """Convert a text column that holds only numbers to numbers, for a file with types."""
     package = polars()
     numbers, bad = as_numbers(series)
     if bad.any() or series.str.contains(_LEADING_ZERO).any() or numbers.is_null().all():
         return series
     whole = series.str.strip_chars().cast(package.Int64, strict=False)
-    # beyond 2^53 a float has not all digits of a whole number, such as a time stamp in ns
+    # beyond 2^53 a float loses digits of a whole number, such as a time stamp in ns
     return whole if whole.null_count() == numbers.null_count() else numbers
 
 
 def _texts(series: Any) -> np.ndarray:
-    """The text of each cell, empty where there is none."""
+    """The text of each cell, empty for missing values."""
     package = polars()
     if series.dtype == package.Float64:
         cells = [None if value is None else repr(value) for value in series.to_list()]

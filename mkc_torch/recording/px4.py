@@ -1,4 +1,4 @@
-"""What PX4's own messages say: their columns have fixed units, and a device's number says what kind it is."""
+"""PX4's sensor messages: the fixed units of their columns, and the sensor type in the device id."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from mkc_torch.recording.formats.base import Table
 __all__ = ["PX4_UNITS", "is_px4_magnetometer", "is_px4_message"]
 
 PX4_UNITS: Mapping[str, str] = MappingProxyType({"time": "us", "mag": "gauss"})
-"""Of ``timestamp`` and of ``sensor_mag`` (msg/SensorMag.msg of PX4: "time since system start (microseconds)", "in
+"""Units of ``timestamp`` and ``sensor_mag`` (msg/SensorMag.msg of PX4: "time since system start (microseconds)", "in
 Gauss")."""
 
-_SIGNS = {"timestamp", "timestamp_sample", "device_id"}
-"""Columns that a message of a sensor of PX4 has, and hardly another table all three."""
+_MESSAGE_COLUMNS = {"timestamp", "timestamp_sample", "device_id"}
+"""Columns that together identify a sensor message of PX4."""
 
 _MAGNETOMETERS = {0x01, *range(0x03, 0x0C), 0x0D, 0x0E, 0x0F, 0x43, 0x45, 0x62, 0x88, 0xE5}
-"""Types DRV_MAG_DEVTYPE_* of src/drivers/drv_sensor.h."""
+"""Magnetometer types DRV_MAG_DEVTYPE_* of src/drivers/drv_sensor.h."""
 
 
 def is_px4_message(names: Sequence[str]) -> bool:
-    """Whether a table has the columns of a message that a sensor of PX4 sends, as ``ulog2csv`` exports it.
+    """Whether a table has the columns of a PX4 sensor message, as ``ulog2csv`` exports it.
 
     Example:
         >>> is_px4_message(["timestamp", "timestamp_sample", "device_id", "x", "y", "z"])
         True
     """
-    return set(names) >= _SIGNS
+    return set(names) >= _MESSAGE_COLUMNS
 
 
 def is_px4_magnetometer(table: Table) -> bool:
-    """Whether every row of such a message is of a magnetometer, by the type that is part of the device's number.
+    """Whether all rows of a PX4 sensor message come from magnetometers, by the type in ``device_id``.
 
     Bits 16 to 23 of ``device_id`` are the type (src/lib/drivers/device/Device.hpp of PX4, ``DeviceStructure``).
     """

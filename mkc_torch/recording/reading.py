@@ -1,4 +1,4 @@
-"""A file as the columns of a recording: recognised, in this library's units, with its runs told apart."""
+"""Read a file into columns: recognise them, convert their units, and number the runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from torch import Tensor
 from mkc_torch.recording.choice import ColumnChoice, choose
 from mkc_torch.recording.clock import ClockError, TimeAxis, clock_of
 from mkc_torch.recording.clock_faults import interleaved, spread
-from mkc_torch.recording.conversions import DEFAULT_UNITS, Units, converted, in_units, said_units, units_told
+from mkc_torch.recording.conversions import (
+    DEFAULT_UNITS,
+    Units,
+    converted,
+    in_units,
+    stated_units,
+    unit_conversion_warnings,
+)
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Table, Topic, counted, listed
 from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
@@ -25,28 +32,28 @@ from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["ASKED", "LoadedTable", "read_file", "reading_of"]
+__all__ = ["REQUIRED_COLUMNS", "LoadedTable", "read_file", "reading_of"]
 
-ASKED = frozenset({*DEFAULT_UNITS, EXPERIMENT})
-"""Columns that are wanted wherever they are, so that text in them is an error."""
+REQUIRED_COLUMNS = frozenset({*DEFAULT_UNITS, EXPERIMENT})
+"""Required columns: text in any of them is an error."""
 
 _MAG = ("mag_x", "mag_y", "mag_z")
 
 _SHOWN = 5
-"""Runs whose first rows a sentence names."""
+"""Most runs whose first row a warning lists."""
 
 
 class LoadedTable(NamedTuple):
-    """What a file holds of a recording.
+    """Columns, units and warnings of a file.
 
     Attributes:
         columns: name to values, (N,).
-        units: of columns, where they differ from those that their names have.
-        labels: what the numbers of ``experiment`` stand for.
-        warnings: sentences about what was recognised, converted, skipped and left out.
-        topic: number of the topic that was read.
-        sensor: name of the magnetometer, where the file has several.
-        said: columns whose unit the file or the caller says.
+        units: units of the columns that are not in the default unit of their name.
+        labels: labels of the numbers in ``experiment``.
+        warnings: what was recognised, converted, skipped and left out.
+        topic: index of the topic that was read.
+        sensor: name of the magnetometer if the file holds several, else empty.
+        with_stated_unit: columns whose unit the file or the caller states.
     """
 
     columns: dict[str, Tensor]
@@ -55,12 +62,12 @@ class LoadedTable(NamedTuple):
     warnings: list[str]
     topic: int
     sensor: str
-    said: frozenset[str]
+    with_stated_unit: frozenset[str]
 
 
 def read_file(
     path: Path,
-    asked: Collection[str],
+    required: Collection[str],
     *,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -72,23 +79,24 @@ def read_file(
 
     Args:
         path: the file.
-        asked: columns that are wanted wherever they are, so that text in them is an error.
-        columns, units, sensor, recognise: as :meth:`mkc_torch.recording.Recording.read` takes them.
-        topics: the file's tables, where they have been read already.
+        required: required columns; text in any of them is an error.
+        columns, units, sensor, recognise: as in :meth:`mkc_torch.recording.Recording.read`.
+        topics: the file's tables if they have been read already.
 
     Raises:
-        RecordingError, MissingColumnError, FileNotFoundError, ImportError: as there.
+        RecordingError, MissingColumnError, FileNotFoundError, ImportError: as in
+            :meth:`mkc_torch.recording.Recording.read`.
     """
     topics = read_topics(path) if topics is None else topics
     if recognise and not set(_MAG) & set(columns or {}):
         topics = with_row_sensors(topics)
-    return reading_of(path, topics, asked, columns=columns, units=units, sensor=sensor, recognise=recognise)
+    return reading_of(path, topics, required, columns=columns, units=units, sensor=sensor, recognise=recognise)
 
 
 def reading_of(
     path: Path,
     topics: Sequence[Topic],
-    asked: Collection[str],
+    required: Collection[str],
     *,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -96,16 +104,16 @@ def reading_of(
     recognise: bool = True,
     what: str = "file",
 ) -> LoadedTable:
-    """Read the tables of a file, or of a data frame.
+    """Convert the tables of a file or of a data frame to columns.
 
     Args:
-        path: what they are called in messages.
+        path: the name in error messages.
         topics: the tables.
-        asked, columns, units, sensor, recognise: as :func:`read_file` takes them.
-        what: file or frame.
+        required, columns, units, sensor, recognise: as in :func:`read_file`.
+        what: "file" or "frame", for error messages.
 
     Raises:
-        RecordingError, MissingColumnError: as :func:`read_file`.
+        RecordingError, MissingColumnError: as in :func:`read_file`.
     """
     topics = with_joined_times(topics, (columns or {}).values())
     choice = choose(path, topics, columns or {}, sensor, recognise=recognise)
@@ -113,14 +121,14 @@ def reading_of(
     table = topic.table
     taken, warnings = renamed(table, choice.columns, path, what)
     warnings = [*topic.warnings, *choice.warnings, *warnings]
-    said = said_units(choice, topic, taken)
-    if not recognise:  # the caller knows what the columns are; a clock's unit is none of its business
-        said = {name: unit for name, unit in said.items() if name == "time"}
-    known = in_units(path, taken, said, units or {})
+    stated = stated_units(choice, topic, taken)
+    if not recognise:  # only the time is still converted
+        stated = {name: unit for name, unit in stated.items() if name == "time"}
+    known = in_units(path, taken, stated, units or {})
     values: dict[str, Tensor] = {}
     labels: dict[str, list[str]] = {}
     clock = None
-    wanted = {*asked, *(columns or {})}
+    wanted = {*required, *(columns or {})}
     for name, series in taken.items():
         if name == "time":
             clock = _clock(path, table, series, known)
@@ -137,8 +145,8 @@ def reading_of(
                 continue
             else:
                 raise text_error(path, table, name, series, int(bad.arg_max()))
-        elif told := missing_warning(table, name, series):
-            warnings.append(told)
+        elif warning := missing_warning(table, name, series):
+            warnings.append(warning)
         values[name] = torch.tensor(
             converted(series, numbers, known.conversions.get(name)).fill_null(math.nan).to_numpy()
         )
@@ -153,16 +161,16 @@ def reading_of(
             values["time"] = torch.tensor(slow[0])
             clock = clock.spread(slow[0])
             warnings.append(
-                f"The clock stands still over up to {slow[1]} samples; samples of one time were spread evenly up to "
-                "the next."
+                f"Up to {slow[1]} samples share a time stamp; their times were spread evenly up to the next stamp."
             )
-    if choice.sensor is not None and (turns := interleaved(torch.stack([values[name] for name in _MAG], -1).numpy())):
+    if choice.sensor is not None and (period := interleaved(torch.stack([values[name] for name in _MAG], -1).numpy())):
         warnings.append(
-            f"Every row is far from the one before and near to that {turns} rows before: rows of {turns} sensors "
-            "seem to take turns. Write them into files of their own, or say by a column `sensor` which a row is of."
+            f"Each row is far from the row before it and close to the row {period} rows before it: rows of {period} "
+            "sensors seem to take turns. Write each sensor to its own file, or add a column `sensor` that names the "
+            "sensor of each row."
         )
-    warnings += _taken_told(choice, taken)
-    warnings += units_told(known, values)
+    warnings += _recognised_warnings(choice, taken)
+    warnings += unit_conversion_warnings(known, values)
     if choice.sensor is not None and clock is not None and len(topics) > 1:
         more = join_topics(topics, choice.topic, clock, set(values))
         values |= {name: torch.tensor(column) for name, column in more.columns.items()}
@@ -170,11 +178,11 @@ def reading_of(
     warnings += _add_runs(values, table, topic.restarts, clock)
     own = {name: unit for name, unit in known.labels.items() if name in values}
     which = "" if choice.sensor is None else choice.sensor.name
-    return LoadedTable(values, own, labels, warnings, choice.topic, which, known.said & set(values))
+    return LoadedTable(values, own, labels, warnings, choice.topic, which, known.with_stated_unit & set(values))
 
 
 def _clock(path: Path, table: Table, series: Any, known: Units) -> TimeAxis | None:
-    """The time of a table; None where it is to be read as any other column."""
+    """Parse the time of a table; None if the time has a unit of its own and is read like any other column."""
     if known.labels.get("time"):
         return None
     try:
@@ -183,49 +191,50 @@ def _clock(path: Path, table: Table, series: Any, known: Units) -> TimeAxis | No
         raise text_error(path, table, "time", series, error.row, str(error)) from None
 
 
-def _taken_told(choice: ColumnChoice, taken: Mapping[str, Any]) -> list[str]:
-    """Sentences about columns that were recognised under other names."""
-    told = []
+def _recognised_warnings(choice: ColumnChoice, taken: Mapping[str, Any]) -> list[str]:
+    """Return the warnings about columns that were recognised under other names."""
+    warnings = []
     for quantity in dict.fromkeys(name.split("_")[0] for name in choice.found):
         new = [name for name in choice.found if name.split("_")[0] == quantity and name in taken]
         if new:
             old = [choice.found[name] for name in new]
             are = "Columns {} are" if len(new) > 1 else "Column {} is"
-            told.append(f"{are.format(listed(old))} taken as {listed(new)}.")
-    return told
+            warnings.append(f"{are.format(listed(old))} taken as {listed(new)}.")
+    return warnings
 
 
-def _add_runs(values: dict[str, Tensor], table: Table, again: Sequence[int], clock: TimeAxis | None) -> list[str]:
-    """Number the runs where the time starts again, or the header stands again where there is no time; and tell it.
+def _add_runs(
+    values: dict[str, Tensor], table: Table, repeated_headers: Sequence[int], clock: TimeAxis | None
+) -> list[str]:
+    """Add the column ``experiment`` where the time restarts, and return the warnings.
 
-    A time that was converted is counted from the first sample of its run.
+    Without a time, a run starts at each repeated header. A converted time starts at 0 s in each run.
     """
-    told = [] if clock is None or not clock.told else [_clock_told(clock)]
+    warnings = [] if clock is None or not clock.format else [_clock_warning(clock)]
     if EXPERIMENT in values:
         _count_from_first(values, clock, [])
-        return told
-    begins = list(again) if clock is None else restarts(values["time"].numpy())
+        return warnings
+    begins = list(repeated_headers) if clock is None else restarts(values["time"].numpy())
     _count_from_first(values, clock, begins)
     if not begins:
-        return told
+        return warnings
     number = np.zeros(len(table.lines))
     number[begins] = 1.0
     values[EXPERIMENT] = torch.tensor(1.0 + number.cumsum())
     rows = ", ".join(f"row {row + 1} ({table.line} {table.lines[row]})" for row in begins[:_SHOWN])
     more = f" and {len(begins) - _SHOWN} more" if len(begins) > _SHOWN else ""
-    what = "The time starts again" if clock is not None else "The header stands again, and there is no time,"
-    told.append(
-        f"{what} at {rows}{more}: {counted(len(begins) + 1, 'run')}, which the column `{EXPERIMENT}` tells apart."
-    )
-    return told
+    what = "The time starts again" if clock is not None else "There is no time, and the header is repeated"
+    count = counted(len(begins) + 1, "run")
+    warnings.append(f"{what} at {rows}{more}: {count}, numbered in the column `{EXPERIMENT}`.")
+    return warnings
 
 
-def _clock_told(clock: TimeAxis) -> str:
-    return f"The times are {clock.told}; they are counted in seconds from the first sample on."
+def _clock_warning(clock: TimeAxis) -> str:
+    return f"The times are {clock.format}; they were converted to seconds from the first sample."
 
 
 def _count_from_first(values: dict[str, Tensor], clock: TimeAxis | None, begins: Sequence[int]) -> None:
-    if clock is None or not clock.told:
+    if clock is None or not clock.format:
         return
     seconds = clock.seconds.copy()
     for begin, end in zip([0, *begins], [*begins, len(seconds)], strict=True):

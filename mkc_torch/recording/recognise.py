@@ -1,4 +1,4 @@
-"""Which columns of a file are what: the magnetometers in it, and what belongs to each."""
+"""Recognise the magnetometers in a file, and the columns that belong to each."""
 
 from __future__ import annotations
 
@@ -11,25 +11,28 @@ from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["RecognisedColumns", "SensorColumns", "candidates", "recognised", "recorded_beside", "time_column"]
+__all__ = ["RecognisedColumns", "SensorColumns", "candidates", "companion_columns", "recognised", "time_column"]
 
 _MAG = ("mag_x", "mag_y", "mag_z")
 _SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
 _ROS = "magnetic_field"
-"""Of sensor_msgs/MagneticField of ROS, "Measurements in Teslas", which has a covariance beside it."""
+"""Field of ROS's sensor_msgs/MagneticField, "Measurements in Teslas"."""
+
 _OF_ROS = (f"{_ROS}_covariance", "header.stamp", "header.seq", "frame_id", "rosbagTimestamp")
+"""Further columns by which a ROS message is recognised."""
+
 _DERIVED = {"vehicle_magnetometer": "sensor_mag", "sensor_combined": "sensor_mag"}
-"""PX4's topics that repeat a sensor's own."""
+"""PX4 topics that repeat a sensor's topic, and that topic."""
 
 
 class SensorColumns(NamedTuple):
-    """A magnetometer in a file, and what was recorded beside it.
+    """A magnetometer in a file, and the columns recorded with it.
 
     Attributes:
-        name: by which it is chosen; empty where a file has one alone.
-        topic: number of its topic.
-        columns: for each name that a column is to have, the name it has in the topic.
-        units: of these columns by their new names, where the file says them.
+        name: the name by which it is chosen; empty if the file has a single magnetometer.
+        topic: index of its topic.
+        columns: new name to the name in the topic.
+        units: units that the file states, by new name.
     """
 
     name: str
@@ -39,13 +42,12 @@ class SensorColumns(NamedTuple):
 
 
 class RecognisedColumns(NamedTuple):
-    """What was recognised in a file.
+    """The magnetometers recognised in a file.
 
     Attributes:
-        sensors: its magnetometers.
-        several: whether they are several of one kind; else, where there is more than one, nobody can tell which is
-            meant.
-        left_out: sentences about topics that only repeat others.
+        sensors: the magnetometers.
+        several: True if they are distinct sensors; if False, more than one entry means an ambiguous choice.
+        left_out: warnings about topics that only repeat others.
     """
 
     sensors: tuple[SensorColumns, ...]
@@ -54,7 +56,7 @@ class RecognisedColumns(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Columns of one vector, or of one number: axis to column, and the unit."""
+    """The columns and units of a vector by axis, or of a scalar by the empty axis."""
 
     sensor: str
     columns: dict[str, str]
@@ -63,14 +65,14 @@ class _Group(NamedTuple):
 
 
 def recognised(topics: Sequence[Topic], file: str = "") -> RecognisedColumns:
-    """The magnetometers in a file's topics, by the names of columns and topics, and of the file.
+    """Recognise the magnetometers in a file by the names of columns, topics and the file.
 
-    A column that has a name of a recording's own is what it says. Columns x, y, z are a magnetometer's where the topic,
-    the file, or other columns say so. Axes are complete or nothing.
+    Columns with canonical names are taken as they are. Columns x, y, z belong to a magnetometer if the name of the
+    topic or file, or other columns, show it. A magnetometer has all three axes.
 
     Args:
-        topics: of the file.
-        file: its name without the ending.
+        topics: topics of the file.
+        file: name of the file without its ending.
 
     Example:
         >>> from mkc_torch.recording.formats.base import Table
@@ -98,7 +100,7 @@ def recognised(topics: Sequence[Topic], file: str = "") -> RecognisedColumns:
 
 
 def candidates(topic: Topic) -> list[dict[str, str]]:
-    """Three columns each that differ by x, y, z alone and may be a magnetometer's; for a question to the user.
+    """Triples of columns that differ only by x, y, z and may be a magnetometer, for an error message.
 
     Example:
         >>> from mkc_torch.recording.formats.base import Table
@@ -116,13 +118,13 @@ def candidates(topic: Topic) -> list[dict[str, str]]:
 
 
 def _is_other(name: str) -> bool:
-    """Whether a name says that it is of another sensor."""
-    said = meaning(name)
-    return said is not None and said.quantity != "mag"
+    """Whether a name belongs to another sensor."""
+    known = meaning(name)
+    return known is not None and known.quantity != "mag"
 
 
 def _numbered(names: Sequence[str]) -> list[dict[str, str]]:
-    """Columns of one name that end with 0, 1, 2 or 1, 2, 3."""
+    """Triples of columns with equal names that end with 0, 1, 2 or 1, 2, 3."""
     stems: dict[tuple[str, str], dict[int, str]] = {}
     for name in names:
         if found := re.fullmatch(r"(.*?)(\d+)([\])]?)", name):
@@ -135,11 +137,11 @@ def _numbered(names: Sequence[str]) -> list[dict[str, str]]:
 
 
 def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
-    """The column of a topic that holds its time, and the unit where the file says it; None where there is none.
+    """The time column of a topic and its unit, empty if unknown; None if there is no time column.
 
     Args:
-        topic: of a file.
-        weak: take a column ``t`` too.
+        topic: a topic of a file.
+        weak: accept a column ``t`` too.
 
     Example:
         >>> from mkc_torch.recording.formats.base import Table
@@ -148,24 +150,24 @@ def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
     """
     found = []
     for place, name in enumerate(topic.table.names):
-        said = meaning(name) if name else None
-        if said is None or said.quantity != "time" or not (weak or said.sure):
+        known = meaning(name) if name else None
+        if known is None or known.quantity != "time" or not (weak or known.sure):
             continue
         rank = next(
-            (i for i, one in enumerate(("time", "timestamp", "header_stamp")) if said.sensor == one),
-            3 if said.sure else 4,
+            (i for i, usual in enumerate(("time", "timestamp", "header_stamp")) if known.sensor == usual),
+            3 if known.sure else 4,
         )
-        found.append((rank, place, name, _unit_of(topic, name, said.unit)))
+        found.append((rank, place, name, _unit_of(topic, name, known.unit)))
     if not found:
         return None
     _, _, name, unit = min(found)
     return name, unit
 
 
-def recorded_beside(topics: Sequence[Topic], own: int) -> list[tuple[int, dict[str, str], dict[str, str]]]:
-    """What topics beside a magnetometer's hold: number of the topic, new names to its own, and units that are said.
+def companion_columns(topics: Sequence[Topic], own: int) -> list[tuple[int, dict[str, str], dict[str, str]]]:
+    """Recognised columns of the topics other than the magnetometer's: topic index, new name to name, and units.
 
-    Of several topics of one quantity, the one whose number is that of the magnetometer's is first, then in their order.
+    A topic with the same trailing number as the magnetometer's topic comes first, then the order of the file.
     """
     last = re.search(r"\d*$", topics[own].name)
     mine = last[0] if last else ""
@@ -176,18 +178,18 @@ def recorded_beside(topics: Sequence[Topic], own: int) -> list[tuple[int, dict[s
     return [
         (number, columns, units)
         for number in order
-        for columns, units in _beside([*_groups(topics[number]), *_by_topic(topics[number])], "", set())
+        for columns, units in _companions([*_groups(topics[number]), *_by_topic(topics[number])], "", set())
     ]
 
 
 def _by_topic(topic: Topic) -> list[tuple[str, _Group]]:
-    """The gyroscope or accelerometer whose columns are x, y, z and whose topic says what it is."""
+    """The gyroscope or accelerometer with columns x, y, z, recognised by the name of its topic."""
     axes = {name.lower(): name for name in topic.table.names if name.lower() in ("x", "y", "z")}
-    said = meaning(f"{topic.name}_x") if len(axes) == 3 else None
-    if said is None or said.quantity not in ("gyro", "accel"):
+    known = meaning(f"{topic.name}_x") if len(axes) == 3 else None
+    if known is None or known.quantity not in ("gyro", "accel"):
         return []
     units = {axis: _unit_of(topic, name, "") for axis, name in axes.items()}
-    return [(said.quantity, _Group(said.sensor, axes, units, True))]
+    return [(known.quantity, _Group(known.sensor, axes, units, True))]
 
 
 def _with(name: str, place: int, letter: str) -> str:
@@ -197,13 +199,15 @@ def _with(name: str, place: int, letter: str) -> str:
 def _unit_of(topic: Topic, name: str, unit: str) -> str:
     if topic.units.get(name) or unit:
         return topic.units.get(name) or unit
-    if name.rpartition(".")[0].endswith(_ROS) and any(sign in one for one in topic.table.names for sign in _OF_ROS):
+    if name.rpartition(".")[0].endswith(_ROS) and any(
+        part in column for column in topic.table.names for part in _OF_ROS
+    ):
         return "tesla"
     return PX4_UNITS["time"] if name.startswith("timestamp") and is_px4_message(topic.table.names) else ""
 
 
 def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
-    """The magnetometers of a topic by its columns; by its name, or the file's, where the columns are x, y, z."""
+    """The magnetometers of a topic, by its columns; columns x, y, z count by the name of the topic or file."""
     groups = [group for quantity, group in _groups(topic) if quantity == "mag"]
     if any(group.sure for group in groups):
         return groups
@@ -213,10 +217,10 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
     px4 = is_px4_magnetometer(topic.table)
     parent = _parent(topic, [name for name, _ in axes.values()])
     if len(axes) == 3 and parent:
-        unit = "tesla" if parent == _ROS and any(sign in topic.table.names for sign in _OF_ROS) else ""
-        units = {axis: one or unit for axis, (_, one) in axes.items()}
+        unit = "tesla" if parent == _ROS and any(part in topic.table.names for part in _OF_ROS) else ""
+        units = {axis: own or unit for axis, (_, own) in axes.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
-    if len(axes) == 3 and (px4 or is_about_magnetometer(known) or all(_is_magnetic(one) for _, one in axes.values())):
+    if len(axes) == 3 and (px4 or is_about_magnetometer(known) or all(_is_magnetic(unit) for _, unit in axes.values())):
         units = {axis: _unit_of(topic, name, unit) for axis, (name, unit) in axes.items()}
         if is_px4_message(topic.table.names):
             units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
@@ -225,12 +229,12 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
 
 
 def _is_magnetic(unit: str) -> bool:
-    """Whether a unit is one of a magnetic field, and of no acceleration, as g may be."""
+    """Whether a unit is a unit of a magnetic field and not of an acceleration (g may be both)."""
     return bool(unit) and conversion("mag", unit) is not None and conversion("accel", unit) is None
 
 
 def _parent(topic: Topic, axes: Sequence[str]) -> str:
-    """The column without values before x, y, z, by which flattened ROS messages name what these are of."""
+    """The empty column before x, y, z that names their field in a flattened ROS message; empty if there is none."""
     names = topic.table.names
     places = [names.index(name) for name in axes]
     if len(places) != 3 or sorted(places) != list(range(min(places), min(places) + 3)) or min(places) == 0:
@@ -243,19 +247,19 @@ def _parent(topic: Topic, axes: Sequence[str]) -> str:
 
 
 def _groups(topic: Topic) -> list[tuple[str, _Group]]:
-    """The complete vectors and the single numbers of a topic, each with its quantity."""
+    """The complete vectors and the scalars of a topic, each with its quantity."""
     found: dict[tuple[str, str, bool], _Group] = {}
     for name in topic.table.names:
-        said = meaning(name) if name else None
-        if said is None or said.quantity == "time":
+        known = meaning(name) if name else None
+        if known is None or known.quantity == "time":
             continue
-        key = (said.quantity, said.sensor, said.sure)
-        group = found.setdefault(key, _Group(said.sensor, {}, {}, said.sure))
-        if said.axis in group.columns:  # two spellings of one name
-            group.columns[said.axis] = ""
+        key = (known.quantity, known.sensor, known.sure)
+        group = found.setdefault(key, _Group(known.sensor, {}, {}, known.sure))
+        if known.axis in group.columns:  # two spellings of the same name
+            group.columns[known.axis] = ""
             continue
-        group.columns[said.axis] = name
-        group.units[said.axis] = _unit_of(topic, name, said.unit)
+        group.columns[known.axis] = name
+        group.units[known.axis] = _unit_of(topic, name, known.unit)
     return [
         (quantity, group)
         for (quantity, _, _), group in found.items()
@@ -266,14 +270,14 @@ def _groups(topic: Topic) -> list[tuple[str, _Group]]:
 def _without_derived(
     topics: Sequence[Topic], found: list[tuple[int, _Group]]
 ) -> tuple[list[tuple[int, _Group]], tuple[str, ...]]:
-    """Leave out what PX4 derives from sensors that are there themselves."""
+    """Leave out topics that PX4 derives from sensors whose own topics are in the file."""
     kinds = {number: re.sub(r"_?\d+$", "", topics[number].name) for number, _ in found}
     gone = {number for number, kind in kinds.items() if _DERIVED.get(kind) in kinds.values()}
-    told = tuple(
-        f"Topic `{topics[number].name}` is left out: it is made of `{_DERIVED[kinds[number]]}`, which is there."
+    warnings = tuple(
+        f"Topic `{topics[number].name}` is left out: it is derived from `{_DERIVED[kinds[number]]}`, which is read."
         for number in sorted(gone)
     )
-    return [(number, group) for number, group in found if number not in gone], told
+    return [(number, group) for number, group in found if number not in gone], warnings
 
 
 def _is_own(group: _Group) -> bool:
@@ -281,7 +285,7 @@ def _is_own(group: _Group) -> bool:
 
 
 def _names(topics: Sequence[Topic], found: Sequence[tuple[int, _Group]]) -> list[str]:
-    """A name for each sensor: of its topic, where that has one sensor alone, else of its columns, or of both."""
+    """Name each sensor by its topic, its columns, or both if the topic holds several sensors."""
     numbers = [number for number, _ in found]
     names = []
     for number, group in found:
@@ -300,16 +304,16 @@ def _sensor(topics: Sequence[Topic], number: int, group: _Group, name: str) -> S
     if (time := time_column(topic)) is not None:
         columns["time"] = time[0]
         units |= {"time": time[1]} if time[1] else {}
-    for beside in _beside(_groups(topic), group.sensor, set(columns.values())):
-        columns |= beside[0]
-        units |= beside[1]
+    for names, their_units in _companions(_groups(topic), group.sensor, set(columns.values())):
+        columns |= names
+        units |= their_units
     return SensorColumns(name, number, columns, units)
 
 
-def _beside(
+def _companions(
     groups: Iterable[tuple[str, _Group]], sensor: str, taken: set[str]
 ) -> Iterable[tuple[dict[str, str], dict[str, str]]]:
-    """What else a topic holds: of several of a quantity the one that goes by the sensor's number, or none."""
+    """Yield columns and units of the other quantities; of several groups, the group with the sensor's number."""
     number = re.search(r"\d*$", sensor)
     mine = number[0] if number else ""
     by_quantity: dict[str, list[_Group]] = {}

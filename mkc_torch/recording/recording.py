@@ -1,4 +1,4 @@
-"""Recordings: tables of named, timed, unit-bearing columns."""
+"""Recordings: tables of named columns with units and times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mkc_torch.recording.conversions import DEFAULT_UNITS
 from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, counted, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
-from mkc_torch.recording.reading import ASKED, read_file, reading_of
+from mkc_torch.recording.reading import REQUIRED_COLUMNS, read_file, reading_of
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.shown import TablePreview
 
@@ -27,25 +27,26 @@ if TYPE_CHECKING:
 
 __all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError", "write_table"]
 
-_GAP = 10.0  # in median intervals
+_GAP = 10.0
+"""Longest interval, in median intervals, that is not a gap."""
 
 
 class Recording(TablePreview):
-    """A table of named columns of equal length: what a sensor, or a simulator, wrote down.
+    """A table of named columns of equal length, as a sensor or a simulator wrote it.
 
-    It does not change: each operation gives a new recording, and says in ``warnings`` what it dropped.
+    A recording is immutable: each operation returns a new recording, whose ``warnings`` list what was dropped.
 
     Args:
-        columns: name to values, 1-D tensors or NumPy arrays of one length >= 1, which are copied to the CPU as float64;
-            or a DataFrame, whose columns keep their names and numbers; :meth:`from_frame` recognises them.
-        name: what the recording is called in messages and reports; a file's is its stem.
-        units: units of columns, beside or instead of the default ones: ``time`` s; ``mag_*`` and ``field_*`` µT;
+        columns: name to values: 1-D tensors or NumPy arrays of equal length >= 1, copied to the CPU as float64;
+            or a DataFrame, whose columns keep their names and numbers (:meth:`from_frame` recognises and converts).
+        name: name in messages and reports; for a file, the stem of its path.
+        units: column to unit; these override the defaults: ``time`` s; ``mag_*`` and ``field_*`` µT;
             ``gyro_*`` rad/s; ``accel_*`` m/s²; ``position_*`` m; ``q_*`` 1; ``temperature`` °C; ``current`` A.
-        warnings: sentences about what was found or dropped.
-        labels: for a column of whole numbers 0, 1, …, what each number stands for.
+        warnings: what was found or dropped, a sentence each.
+        labels: for a column of whole numbers 0, 1, …, the label of each number.
 
     Raises:
-        RecordingError: no columns, no samples, lengths that differ, an unusable name, a unit of no column.
+        RecordingError: no columns, no samples, unequal lengths, an unusable name, or a unit of an unknown column.
 
     Example:
         >>> recording = Recording({"time": torch.tensor([0.0, 0.1]), "mag_x": torch.tensor([20.0, 21.0])})
@@ -66,7 +67,7 @@ class Recording(TablePreview):
     ) -> None:
         units, labels = units or {}, labels or {}
         if is_frame(columns):
-            frame = columns_of_frame(columns, {}, ASKED, name)
+            frame = columns_of_frame(columns, {}, REQUIRED_COLUMNS, name)
             columns, labels, warnings = frame.columns, frame.labels | dict(labels), (*frame.warnings, *warnings)
         given = checked_columns(cast("Mapping[str, Data]", columns), name)
         for column in (*units, *labels):
@@ -92,32 +93,32 @@ class Recording(TablePreview):
     ) -> Recording:
         """Read a table from a file: text (``.csv``, ``.tsv``, ``.txt``), Parquet (``.parquet``), or a log.
 
-        Text is read in any dialect that can be told with certainty. A magnetometer, what stands beside it, and the time
-        are recognised by their columns' names, and converted where the name or the format says the unit. A time that
-        starts again begins a new run, in the column ``experiment``. An empty cell and ``nan`` become NaN; so do ``NA``,
-        ``n/a`` and ``null``. Columns of text alone that nobody asked for are left out; in the column ``experiment``
-        text is numbered, and ``labels`` has it. ``warnings`` tells all of this.
+        Separators, decimals and encodings of text are detected. A magnetometer, the sensors recorded with it and the
+        time are recognised by the names of their columns, and converted if the name or the format states the unit.
+        Where the time starts again, a new run begins; the column ``experiment`` numbers the runs. Empty cells, ``nan``,
+        ``NA``, ``n/a`` and ``null`` become NaN. Columns of text are left out unless ``columns`` names them. Text in the
+        column ``experiment`` is numbered, with the text in ``labels``. ``warnings`` reports all of this.
 
         Args:
             path: the file.
-            columns: for each name a column is to get, the name it has in the file: ``{"mag_x": "mx"}``.
-            units: of quantities, or of columns, that are to be converted: ``{"mag": "gauss", "time": "us"}``. A unit of
-                the magnetometer that is not known, such as counts, is its name and converts nothing.
-            sensor: which magnetometer, where a file holds several.
-            recognise: False to leave the columns, but for the time, under the names that they have.
+            columns: new name to the name in the file: ``{"mag_x": "mx"}``.
+            units: quantity or column to the unit it is converted from: ``{"mag": "gauss", "time": "us"}``. An unknown
+                unit of the magnetometer, such as counts, is only a label: nothing is converted.
+            sensor: the magnetometer to read if the file holds several.
+            recognise: False keeps the column names of the file and recognises only the time.
 
         Returns:
-            The recording, with its rows as they are in the file.
+            The recording, with its rows in the order of the file.
 
         Raises:
-            RecordingError: a file that is no such table: of an unknown kind, empty, without header or rows, with lines
-                of different length, columns of the same name, text among numbers, or several magnetometers.
+            RecordingError: the file is not a readable table: of an unknown kind, empty, without header or rows, with
+                lines of different length, columns of the same name, text among numbers, or several magnetometers.
             MissingColumnError: ``columns`` or ``units`` names a column that the file does not have.
-            FileNotFoundError: no such file.
-            ImportError: the reader's library is not installed.
+            FileNotFoundError: there is no such file.
+            ImportError: the library that reads this format is not installed.
         """
         path = Path(path)
-        found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, recognise=recognise)
+        found = read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, sensor=sensor, recognise=recognise)
         return cls(found.columns, name=path.stem, units=found.units, warnings=found.warnings, labels=found.labels)
 
     @classmethod
@@ -131,19 +132,19 @@ class Recording(TablePreview):
         sensor: str | None = None,
         recognise: bool = True,
     ) -> Recording:
-        """The columns of a DataFrame of pandas or polars, recognised, converted and told as :meth:`read` does a file's.
+        """Convert a DataFrame of pandas or polars, with the recognition, conversion and warnings of :meth:`read`.
 
-        Missing values become NaN, stamps seconds from the first sample on. An index that has a name, such as ``time``,
-        is a column too. Polars is needed, of a pandas frame too.
+        Missing values become NaN; time stamps become seconds from the first sample. A named index, such as ``time``,
+        is a column too. Polars is needed for pandas frames too.
 
         Args:
             frame: the table.
-            columns: for each name a column is to get, the name it has in the frame: ``{"mag_x": "mx"}``.
-            name: what the recording is called.
-            units, sensor, recognise: as :meth:`read` takes them.
+            columns: new name to the name in the frame: ``{"mag_x": "mx"}``.
+            name: name of the recording.
+            units, sensor, recognise: as in :meth:`read`.
 
         Raises:
-            RecordingError: a frame without rows or numbers, columns of the same name or of none, text or times where
+            RecordingError: a frame without rows or numbers, duplicate or missing column names, text or times where
                 numbers are needed, or several magnetometers.
             MissingColumnError: ``columns`` or ``units`` names a column that the frame does not have.
             ImportError: polars is not installed.
@@ -168,7 +169,7 @@ class Recording(TablePreview):
         found = reading_of(
             Path(name or "the frame"),
             topics,
-            ASKED,
+            REQUIRED_COLUMNS,
             columns=columns,
             units=units,
             sensor=sensor,
@@ -193,22 +194,22 @@ class Recording(TablePreview):
 
     @property
     def units(self) -> Mapping[str, str]:
-        """The unit of each column; empty where it is unknown."""
+        """The unit of each column; empty if it is unknown."""
         return MappingProxyType(self._units)
 
     @property
     def labels(self) -> Mapping[str, tuple[str, ...]]:
-        """What the numbers 0, 1, … of a column stand for, where they stand for something."""
+        """For each labelled column, the labels of its numbers 0, 1, …."""
         return MappingProxyType(self._labels)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences about what was found or dropped, from the file on."""
+        """What was found or dropped since the file was read, a sentence each."""
         return self._warnings
 
     @property
     def time(self) -> Float[Tensor, " N"] | None:
-        """The column ``time`` in seconds; None if there is none."""
+        """The column ``time`` in seconds; None if there is no such column."""
         return self._columns.get("time")
 
     def __len__(self) -> int:
@@ -226,7 +227,7 @@ class Recording(TablePreview):
         """The named columns side by side, as a new tensor.
 
         Raises:
-            MissingColumnError: one of them is not there; the message lists those that are.
+            MissingColumnError: a column does not exist; the message lists the existing columns.
 
         Example:
             >>> Recording({"a": torch.zeros(4), "b": torch.ones(4)}).stack("b", "a")[0]
@@ -241,11 +242,14 @@ class Recording(TablePreview):
         return self.stack("mag_x", "mag_y", "mag_z")
 
     def finite(self, *names: str) -> Recording:
-        """The rows in which the named columns (all columns, if none is named) are finite; ``warnings`` counts the rest.
+        """The rows in which the named columns are finite; ``warnings`` counts the dropped rows.
+
+        Args:
+            names: columns to check; all columns if empty.
 
         Raises:
-            MissingColumnError: one of the columns is not there.
-            RecordingError: no row is left.
+            MissingColumnError: a column does not exist.
+            RecordingError: no row remains.
 
         Example:
             >>> Recording({"a": torch.tensor([1.0, torch.nan, torch.inf])}).finite("a").warnings
@@ -269,12 +273,11 @@ class Recording(TablePreview):
         return self.rows(keep, dropped)
 
     def sorted_by_time(self) -> Recording:
-        """The samples in the order of their times, each time once.
+        """The samples sorted by time, with one sample per time.
 
-        The sort is stable and of samples at exactly the same time the first is kept. ``warnings`` counts what was
-        out of order, repeated, or without a finite time, and tells of gaps longer than ten median intervals. Where
-        there is a column ``experiment``, each experiment has its own clock: they follow one another in the order
-        of their first appearance.
+        The sort is stable; of samples with the same time the first is kept. ``warnings`` counts samples out of order,
+        repeated times, samples without a finite time, and gaps longer than ten median intervals. With a column
+        ``experiment``, each run is sorted by its own clock, and the runs keep the order of their first appearance.
 
         Raises:
             MissingColumnError: there is no column ``time``.
@@ -301,17 +304,18 @@ class Recording(TablePreview):
             a, b = table[twin], table[original]
             differ = int(((a != b) & ~(np.isnan(a) & np.isnan(b))).any(-1).sum())
             found.append(
-                f"Dropped {len(twin)} of {len(timed)} samples that repeat the time of an earlier one, "
+                f"Dropped {len(twin)} of {len(timed)} samples that repeat the time of an earlier sample, "
                 f"{differ} of them with other values."
             )
         found += timed._gaps(time[kept], group[kept])
         return timed.rows(torch.from_numpy(kept), *found)
 
     def rows(self, chosen: Tensor, *warnings: str) -> Recording:
-        """The chosen rows, and the sentences that say why beside those there are.
+        """The chosen rows, as a new recording.
 
         Args:
-            chosen: a boolean for each row, or the numbers of rows in the order that they are to have.
+            chosen: boolean mask (N,), or row indices in the new order.
+            warnings: sentences to add to the recording's warnings.
 
         Example:
             >>> Recording({"a": torch.tensor([1.0, 2.0, 3.0])}).rows(torch.tensor([2, 0]))["a"]
@@ -326,9 +330,9 @@ class Recording(TablePreview):
         )
 
     def experiments(self) -> dict[str, Recording]:
-        """The parts of the table that the column ``experiment`` separates, by label, in the order of appearance.
+        """The runs of the table by the label of the column ``experiment``, in the order of appearance.
 
-        Without that column the whole is the one part, under the recording's own name.
+        Without that column the only run is the whole table, under the recording's name.
 
         Example:
             >>> table = Recording({"experiment": torch.tensor([1, 1, 2]), "time": torch.tensor([0.0, 0.1, 0.0])})
@@ -363,7 +367,7 @@ class Recording(TablePreview):
         return self.rows(keep, f"Dropped {int((~keep).sum())} of {len(self)} samples without a finite time.")
 
     def _experiment_numbers(self) -> np.ndarray:
-        """For each sample 0, 1, … in the order in which the experiments first appear."""
+        """Run index 0, 1, … of each sample, (N,), in the order of first appearance."""
         if EXPERIMENT not in self:
             return np.zeros(len(self), dtype=np.int64)
         _, first, inverse = np.unique(self[EXPERIMENT].numpy(), return_index=True, return_inverse=True)
@@ -401,34 +405,35 @@ def write_table(
     labels: Mapping[str, Sequence[str]] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write columns to a file, whole or not at all, such that :meth:`Recording.read` gives the same float64 back.
+    """Write columns to a file atomically; :meth:`Recording.read` returns the same float64 values.
 
     Args:
-        path: the target; its ending says the format, ``.csv``, ``.tsv``, ``.txt`` (a CSV) or ``.parquet``.
-        columns: as :class:`Recording` takes them; ``recording.columns`` for a recording.
-        labels: of columns of whole numbers 0, 1, …, what each stands for and is written instead; ``recording.labels``.
+        path: the target; its ending selects the format: ``.csv``, ``.tsv``, ``.txt`` (a CSV) or ``.parquet``.
+        columns: as in :class:`Recording`; ``recording.columns`` for a recording.
+        labels: for a column of whole numbers 0, 1, …, the label of each, which is written instead;
+            ``recording.labels`` for a recording.
         overwrite: replace an existing file.
 
     Raises:
-        RecordingError: columns that are no table, or an ending that is not known.
+        RecordingError: the columns are not a table, or the ending is unknown.
         FileExistsError: the file exists and ``overwrite`` is False.
     """
     path = Path(path)
     check_ending(path)
     table = Recording(columns, name=path.name)
     known = labels or {}
-    told = {
+    encodable = {
         name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
         for name, values in table.columns.items()
     }
-    if EXPERIMENT in told and EXPERIMENT not in known:
-        told[EXPERIMENT] = _whole(told[EXPERIMENT])
-    data = encoded(path, told)
+    if EXPERIMENT in encodable and EXPERIMENT not in known:
+        encodable[EXPERIMENT] = _whole(encodable[EXPERIMENT])
+    data = encoded(path, encodable)
     write_atomically(path, data, overwrite=overwrite)
 
 
 def _whole(numbers: np.ndarray) -> np.ndarray:
-    """Numbers of experiments, 1 and not 1.0, where all of them are whole."""
+    """Run numbers as integers (1, not 1.0) if all of them are whole."""
     whole = np.isfinite(numbers) & (np.abs(numbers) < 2**53) & (numbers == np.round(numbers))
     return numbers.astype(np.int64) if whole.all() else numbers
 
@@ -436,6 +441,6 @@ def _whole(numbers: np.ndarray) -> np.ndarray:
 def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:
     where = f"{recording}: " if recording else ""
     return MissingColumnError(
-        f"{where}there is no column `{name}`; there are {listed(present)}. If it is there under another name, say so "
+        f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name "
         f'with `--columns {name}=...` (in Python `columns={{"{name}": "..."}}`).'
     )

@@ -1,4 +1,4 @@
-"""A table whose rows are of several sensors, one of which a column names, as a table for each."""
+"""Split a table whose rows come from several sensors, named by a column, into a table for each sensor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SENSOR = {
     "compass",
     "magid",
 }
-"""Names of columns that say of which sensor a row is."""
+"""Names of columns that identify the sensor of a row."""
 
 _KIND = {
     "id",
@@ -39,19 +39,22 @@ _KIND = {
     "addr",
     "address",
 }
-"""Names that may say something else too, and count where the rows take turns."""
+"""Names of columns that may identify the sensor of a row; they count only if the sensors alternate."""
 
 _TURNS = 0.2
-"""Share of rows with another value than the row before from which rows take turns."""
+"""Smallest share of rows that differ from the row before if sensors alternate."""
 
-_MOST, _FEWEST = 16, 9
-"""Sensors that a table has at most, and rows of each at least: an ellipsoid needs nine."""
+_MOST = 16
+"""Most sensors of a table."""
+
+_FEWEST = 9
+"""Fewest rows of a sensor; an ellipsoid needs nine."""
 
 
 def with_row_sensors(topics: Sequence[Topic]) -> list[Topic]:
-    """The topics; a file's one table, where a column says of which sensor a row is, as a topic for each sensor.
+    """Split a file's only table into a topic for each sensor if a column identifies the sensor of each row.
 
-    That is so where the table has a magnetometer's columns, or x, y, z and a value such as ``MAG``.
+    The table must have a magnetometer's columns, or columns x, y, z and a sensor such as ``MAG``.
 
     Example:
         >>> import polars as pl
@@ -76,7 +79,7 @@ def with_row_sensors(topics: Sequence[Topic]) -> list[Topic]:
 
 
 def _labels(series: Any) -> Any | None:
-    """What stands in a column as text; None where it is no column of a few values that come often."""
+    """The cells of a column as text; None unless the column has a few values that occur often."""
     package = polars()
     if series.dtype.is_float() or series.dtype.is_nested() or series.dtype.is_temporal():
         return None
@@ -93,8 +96,8 @@ def _take_turns(labels: Any) -> bool:
 
 
 def _axes(names: Sequence[str]) -> list[str]:
-    said = {name: meaning(name) for name in names if name}
-    return [name for name, one in said.items() if one is not None and one.quantity == "mag"]
+    meanings = {name: meaning(name) for name in names if name}
+    return [name for name, known in meanings.items() if known is not None and known.quantity == "mag"]
 
 
 def _are_sensors(names: Sequence[str], values: Sequence[str]) -> bool:
@@ -104,20 +107,20 @@ def _are_sensors(names: Sequence[str], values: Sequence[str]) -> bool:
 
 
 def _part(topic: Topic, column: str, labels: Any, value: str, values: Sequence[str]) -> Topic:
-    """The rows of one sensor; the axes of one that is no magnetometer are no magnetometer's."""
+    """The rows of a sensor; if it is not a magnetometer, its axes are renamed to x, y, z."""
     rows = labels == value
     table = topic.table
-    called = [_called(column, one) for one in values]
+    called = [_called(column, other) for other in values]
     kept = [i for i, name in enumerate(table.names) if name != column]
     names = [table.names[i] for i in kept]
-    said = meaning(f"{value}_x")
-    if said is not None and said.quantity != "mag":
+    known = meaning(f"{value}_x")
+    if known is not None and known.quantity != "mag":
         axes = dict(zip(_axes(names), "xyz", strict=False))
         names = [axes.get(name, name) for name in names]
     lines = [line for line, taken in zip(table.lines, rows.to_list(), strict=True) if taken]
-    told = f"The column `{column}` says of which sensor a row is: {listed(called)}."
+    warning = f"The column `{column}` identifies the sensor of each row: {listed(called)}."
     part = Table(names, [table.series[i].filter(rows) for i in kept], lines, table.line)
-    return Topic(_called(column, value), part, topic.units, (*topic.warnings, told))
+    return Topic(_called(column, value), part, topic.units, (*topic.warnings, warning))
 
 
 def _called(column: str, value: str) -> str:

@@ -1,4 +1,4 @@
-"""Runs of a recording: where its time starts again."""
+"""Find the runs of a recording: where its time starts again."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ if TYPE_CHECKING:
 __all__ = ["restarts"]
 
 _FEWEST = 3
-"""Samples that a run has at least."""
+"""Fewest samples of a run."""
 
 _BACK = 10.0
-"""Median intervals by which a time falls back at least where it starts again: less is jitter."""
+"""Smallest fall of the time at a new run, in median intervals; a smaller fall is jitter."""
 
 _BEGINNING = 0.1
-"""Share of a run, from its first sample on, to which a time falls that starts again."""
+"""First share of a run's duration; the time of a new run falls back into it."""
 
 _OVERLAP = 20
-"""Samples of each of two runs that lie between one another's in time, from which they are two wherever one begins."""
+"""Fewest interleaved samples of each of two runs that make them separate wherever the second run starts."""
 
 _MANY = 0.05
-"""Share of backward steps from which the rows are in no order, and nothing starts again."""
+"""Largest share of backward steps; with more, the rows are unordered and contain no runs."""
 
 
 def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
-    """The rows at which a new run begins, without the first.
+    """The rows at which a new run begins, without row 0.
 
-    A run begins where the time falls to near the beginning of the run before it, or below; and where it falls into
-    the midst of it and samples of both lie between one another's. A block of rows that fills a hole was only written
-    late, and single samples that step back are jitter.
+    A run begins where the time falls back to near the start of the run before it, or earlier. A run also begins where
+    the time falls into the middle of the run before it and the samples of both interleave. A block of rows that fills
+    a gap was only written late, and single samples that step back are jitter.
 
     Args:
-        time: in any unit, in the order of the rows; NaN where there is none.
+        time: in any unit, in the order of the rows; NaN where the time is missing.
 
     Example:
         >>> restarts(np.concatenate([np.arange(23.0, 43.0), np.arange(22.5, 42.5)]))
@@ -63,7 +63,7 @@ def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
 
 
 def _begins(before: np.ndarray, after: np.ndarray, interval: float) -> bool:
-    """Whether what comes after a step back is a run of its own."""
+    """Whether the samples after a step back are a new run."""
     if min(len(before), len(after)) < _FEWEST:
         return False
     high, begin = float(before.max()), float(before[0])

@@ -1,4 +1,4 @@
-"""A recording in a line, and as a table in a notebook."""
+"""Show a recording as a line, and as a table in a notebook."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from mkc_torch._support.html_table import html_table
 
 __all__ = ["TablePreview"]
 
-_MOST_COLUMNS, _MOST_WARNINGS = 30, 6
+_MOST_COLUMNS = 30
+_MOST_WARNINGS = 6
 
 
 class TablePreview:
-    """How a table of named columns shows itself."""
+    """``repr`` and HTML table of a table of named columns."""
 
     __slots__ = ()
 
@@ -56,6 +57,6 @@ def _count(columns: Mapping[str, Tensor]) -> int:
 def _row(name: str, values: Tensor, unit: str) -> tuple[str, ...]:
     finite = values[values.isfinite()]
     missing = len(values) - len(finite)
-    told = (finite.min(), finite.median(), finite.max()) if len(finite) else ()
-    numbers = [f"{float(one):.5g}".replace("-", "−") for one in told] or ["", "", ""]
+    statistics = (finite.min(), finite.median(), finite.max()) if len(finite) else ()
+    numbers = [f"{float(value):.5g}".replace("-", "−") for value in statistics] or ["", "", ""]
     return (name, unit, *numbers, f"{missing:,}" if missing else "")

@@ -1,4 +1,4 @@
-"""Dates and times as people and spreadsheets write them, as ISO 8601."""
+"""Convert dates and times, as people and spreadsheets write them, to ISO 8601."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _ISO = re.compile(r"\d{4}-?\d\d-?\d\d([T ].*)?|\d{1,2}:\d\d(:.*)?")
 
 
 def as_iso(cells: Sequence[str | None]) -> list[str | None] | None:
-    """Stamps as ISO 8601; what is none stays as it is. None where nothing has to be done.
+    """Convert stamps to ISO 8601; other cells stay unchanged. None if nothing has to be converted.
 
-    Read are ``2024/05/03``, ``03.05.2024``, ``5/3/2024``, ``03-May-2024``, hours with AM and PM, and minutes with
-    seconds, ``59:58.5``, as spreadsheets write times that they cut. Of ``5/3/2024`` day or month is first, whichever
-    makes real dates of all cells, and where both do, lets them lie closer together; where they are all of one day that
-    changes nothing of the time between them.
+    Formats: ``2024/05/03``, ``03.05.2024``, ``5/3/2024``, ``03-May-2024``, hours with AM and PM, and minutes with
+    seconds, ``59:58.5``, as spreadsheets write truncated times. In ``5/3/2024`` the day or the month comes first,
+    whichever makes all cells valid dates; if both do, whichever gives the shorter time span. If all cells have the
+    same date, the order does not change time differences.
 
     Example:
         >>> as_iso(["03.05.2024 9:00:00", "3.5.2024 10:00:00"])
@@ -36,10 +36,10 @@ def as_iso(cells: Sequence[str | None]) -> list[str | None] | None:
     if not known or all(_ISO.fullmatch(cell) and not _HALF.fullmatch(cell) for cell in known):
         return None
     first_is_day = _first_is_day(known)
-    return [None if cell is None else _one(cell, first_is_day) for cell in cells]
+    return [None if cell is None else _stamp_as_iso(cell, first_is_day) for cell in cells]
 
 
-def _one(cell: str, first_is_day: bool) -> str:
+def _stamp_as_iso(cell: str, first_is_day: bool) -> str:
     if found := _YEAR_FIRST.fullmatch(cell):
         year, month, day, clock = found.groups()
     elif found := _NAMED.fullmatch(cell):
@@ -48,8 +48,8 @@ def _one(cell: str, first_is_day: bool) -> str:
             return cell
         month = str(_MONTHS.index(word.lower()) + 1)
     elif found := _YEAR_LAST.fullmatch(cell):
-        day, sign, month, year, clock = found.groups()
-        if sign == "/" and not first_is_day:
+        day, separator, month, year, clock = found.groups()
+        if separator == "/" and not first_is_day:
             day, month = month, day
     elif _MINUTES.fullmatch(cell):
         minutes, _, seconds = cell.partition(":")
@@ -64,7 +64,7 @@ def _one(cell: str, first_is_day: bool) -> str:
 
 
 def _clock(text: str) -> str:
-    """A time of the day with two digits of the hour, from 0 to 23."""
+    """A time of the day with a two-digit hour from 0 to 23."""
     half = _HALF.fullmatch(text.strip())
     if half is None:
         return re.sub(r"^(\d):", r"0\1:", text.strip())

@@ -1,4 +1,4 @@
-"""Several recordings of one system as one table, whose column ``experiment`` keeps their runs apart."""
+"""Join several recordings of a system into a table, whose column ``experiment`` numbers their runs."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from mkc_torch.recording.recording import Recording
 __all__ = ["Clock", "join_recordings", "joint_name", "recording_names"]
 
 Clock = Literal["own", "restart", "follow"]
-"""What the time of a run does beside the run before it: nothing, begin again, or continue after its end."""
+"""How the times of consecutive runs are arranged: unchanged, restarting, or following each other."""
 
 _MOST_NAMED = 3
-"""Recordings that a joint name lists; more are counted."""
+"""Most recordings that a joint name lists; further recordings are counted."""
 
 _PAUSE_INTERVALS = 10.0
-"""Median sampling intervals between two runs that follow one another, at least."""
+"""Smallest pause between two consecutive runs, in median sampling intervals."""
 
 _PAUSE_SECONDS = 10.0
-"""Seconds between two runs that follow one another, at least: no turn is followed over as long."""
+"""Smallest pause between two consecutive runs, in s; turns are not tracked across such a pause."""
 
 
 def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -> Recording:
-    """The rows of several recordings, one after the other, with their runs numbered in the column ``experiment``.
+    """Concatenate recordings, with their runs numbered in the column ``experiment``.
 
-    A run is called by the name of its recording, with its own label behind it where the recording holds several. One
-    recording without runs is returned as it is. A clock that is moved is told in ``warnings``.
+    The label of a run is the name of its recording, followed by its own label if the recording holds several runs. A
+    single recording without runs is returned unchanged. ``warnings`` lists the runs whose times were shifted.
 
     Args:
-        recordings: of the same columns in the same units, in any order of columns.
-        clock: "own" leaves all times as they are; "restart" lets a run that begins after the end of the one before it
-            begin at the first sample's time of that one, so that the time falls back from each run to the next;
-            "follow" moves a run that begins before the end of the one before it behind that end.
+        recordings: recordings with the same columns in the same units; the order of columns may differ.
+        clock: "own" leaves all times unchanged; "restart" shifts a run that begins after the end of the previous run
+            to the start time of that run, so that the time falls back from each run to the next; "follow" shifts a
+            run that begins before the end of the previous run to after that end.
 
     Raises:
-        RecordingError: there is none, or columns, units or labels differ; the message says which.
+        RecordingError: no recordings, or their columns, units or labels differ; the message lists the differences.
 
     Example:
         >>> bench = Recording({"time": torch.tensor([0.0, 0.5]), "speed": torch.zeros(2)}, name="bench")
@@ -52,15 +52,15 @@ def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -
         [0.0, 0.5, 0.0, 0.5]
     """
     if not recordings:
-        raise RecordingError("there is no recording to diagnose; give one at least.")
+        raise RecordingError("there is no recording to diagnose; give at least one.")
     names = recording_names(recordings)
     _refuse_differences(recordings, names)
     if len(recordings) == 1 and EXPERIMENT not in recordings[0]:
         return recordings[0]
     parts = [
-        (f"{name}/{label}" if EXPERIMENT in one else name, part)
-        for name, one in zip(names, recordings, strict=True)
-        for label, part in one.experiments().items()
+        (f"{name}/{label}" if EXPERIMENT in recording else name, part)
+        for name, recording in zip(names, recordings, strict=True)
+        for label, part in recording.experiments().items()
     ]
     times, moved = _times([part for _, part in parts], clock)
     columns = {name: torch.cat([part[name] for _, part in parts]) for name in parts[0][1].names}
@@ -73,8 +73,12 @@ def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -
         name=joint_name(names),
         units={name: unit for name, unit in first.units.items() if name != EXPERIMENT},
         warnings=(
-            *(f"{name}: {text}" for name, one in zip(names, recordings, strict=True) for text in one.warnings),
-            *_moves_told([label for label, _ in parts], moved),
+            *(
+                f"{name}: {text}"
+                for name, recording in zip(names, recordings, strict=True)
+                for text in recording.warnings
+            ),
+            *_shift_warnings([label for label, _ in parts], moved),
         ),
         labels={
             **{name: labels for name, labels in first.labels.items() if name != EXPERIMENT},
@@ -84,7 +88,7 @@ def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -
 
 
 def joint_name(names: Sequence[str]) -> str:
-    """What several recordings are called together.
+    """The joint name of several recordings.
 
     Example:
         >>> joint_name(["a", "b"]), joint_name(["a", "b", "c", "d", "e"])
@@ -95,10 +99,10 @@ def joint_name(names: Sequence[str]) -> str:
 
 
 def recording_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """A name for each, no two alike."""
+    """A unique name for each recording."""
     names: list[str] = []
-    for number, one in enumerate(recordings, start=1):
-        plain = one.name or f"recording {number}"
+    for number, recording in enumerate(recordings, start=1):
+        plain = recording.name or f"recording {number}"
         name, count = plain, 1
         while name in names:
             count += 1
@@ -118,7 +122,7 @@ def _refuse_differences(recordings: Sequence[Recording], names: Sequence[str]) -
         ]
         if lacking:
             raise RecordingError(
-                f"{name} and {names[0]} cannot be diagnosed together, for their columns differ: {'; '.join(lacking)}. "
+                f"{name} and {names[0]} cannot be diagnosed together; their columns differ: {'; '.join(lacking)}. "
                 "Rename columns, or leave out those that only some of the recordings have."
             )
         for column in sorted(own):
@@ -126,8 +130,8 @@ def _refuse_differences(recordings: Sequence[Recording], names: Sequence[str]) -
             if unit != their_unit:
                 raise RecordingError(
                     f"{name} and {names[0]} cannot be diagnosed together: the column `{column}` is in "
-                    f"{their_unit or 'no unit'} in {name} and in {unit or 'no unit'} in {names[0]}. Convert one of "
-                    "them."
+                    f"{their_unit or 'no unit'} in {name} and in {unit or 'no unit'} in {names[0]}. Convert one "
+                    "of the two."
                 )
             if first.labels.get(column) != other.labels.get(column):
                 raise RecordingError(
@@ -137,7 +141,7 @@ def _refuse_differences(recordings: Sequence[Recording], names: Sequence[str]) -
 
 
 def _times(parts: Sequence[Recording], clock: Clock) -> tuple[list[Tensor] | None, list[float]]:
-    """The times of the runs, and by how many seconds each was moved; None where there is no time."""
+    """The times of the runs, and the shift of each in s; None if there is no time."""
     if parts[0].time is None:
         return None, []
     times: list[Tensor] = []
@@ -151,7 +155,7 @@ def _times(parts: Sequence[Recording], clock: Clock) -> tuple[list[Tensor] | Non
 
 
 def _moved_by(before: Tensor, time: Tensor, clock: Clock) -> float:
-    """Seconds by which a run is moved that comes after another one."""
+    """The shift in s of a run that follows another run."""
     known, own = before[before.isfinite()], time[time.isfinite()]
     if clock == "own" or not len(known) or not len(own):
         return 0.0
@@ -165,10 +169,10 @@ def _moved_by(before: Tensor, time: Tensor, clock: Clock) -> float:
     return end + max(_PAUSE_INTERVALS * interval, _PAUSE_SECONDS) - first
 
 
-def _moves_told(labels: Sequence[str], moved: Sequence[float]) -> list[str]:
+def _shift_warnings(labels: Sequence[str], moved: Sequence[float]) -> list[str]:
     return [
-        f"The time of {label} is counted {abs(by):.6g} s {'later' if by > 0 else 'earlier'} than its clock says, to "
-        "keep the runs apart."
+        f"The time of {label} is counted {abs(by):.6g} s {'later' if by > 0 else 'earlier'} than its clock, to "
+        "separate the runs."
         for label, by in zip(labels, moved, strict=False)
         if by
     ]

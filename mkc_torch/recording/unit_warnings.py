@@ -1,4 +1,4 @@
-"""Columns whose size does not fit their unit: named, never converted."""
+"""Warn about columns whose magnitude does not fit their unit; nothing is converted."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from mkc_torch.recording.unit_words import conversion
 __all__ = ["RECORDED", "converted_from", "field_size", "field_warning", "likely_unit", "time_warning", "unit_warnings"]
 
 RECORDED = "recorded units"
-"""What measurements are in whose size does not fit the unit that they were taken for."""
+"""Unit label of measurements whose magnitude does not fit their assumed unit."""
 
 _AXES = "xyz"
 
 _FIELD = (10.0, 200.0)
-"""The Earth's field in µT is 22 to 67; iron nearby and a sensor's gains change it."""
+"""Plausible range of a measured field, in µT; the Earth's field is 22 to 67, iron nearby and gains change it."""
 
 _EARTH = (20.0, 70.0)
+"""Range of the Earth's field, in µT."""
 
 _GUESSES = (
     (1e-5, 1e-4, "tesla (1 T = 1000000 µT)", "tesla"),
@@ -31,22 +32,33 @@ _GUESSES = (
     (200.0, 1000.0, "milligauss (10 mG = 1 µT)", "mG"),
     (2e4, 1e5, "nanotesla (1000 nT = 1 µT)", "nT"),
 )
+"""Lower and upper bound of a field's numerical value, likely unit in words, and its spelling for ``--convert mag=``."""
 
+_FEWEST = 20
+"""Fewest samples from which a centre is estimated."""
 
-_FEWEST, _ENOUGH, _REWEIGHTED = 20, 1000, 20
-"""Fewest samples that a centre is sought from, how many of more, and how often they are weighed anew."""
+_ENOUGH = 1000
+"""Most samples from which a centre is estimated."""
+
+_REWEIGHTED = 20
+"""Iterations of the reweighted sphere fit."""
 
 _LARGER = 1.2
-_SCATTER, _ASIDE = 0.25, 0.7
-"""Scatter of the distances from a centre, as a share of them, and length of the mean of the directions, up to which a
-sensor turned about that centre: one that hardly turns shows its field and its offset as one."""
+"""Largest ratio of a sphere's radius to the median field; a larger sphere passes through outliers."""
+
+_SCATTER = 0.25
+"""Largest scatter of the distances from the centre, as a share of the radius, of a sensor that turned."""
+
+_ASIDE = 0.7
+"""Largest length of the mean direction from the centre of a sensor that turned; without turns, field and offset cannot
+be separated."""
 
 _TIMES = ((1e3, "ms", 1e-3), (1e6, "µs", 1e-6), (math.inf, "ns", 1e-9))
-"""Up to which interval a time is taken for one in which unit: fifty samples a second are in the midst of it."""
+"""Upper bound of the sampling interval in units of ``time``, the likely unit, and its size in s."""
 
 
 def unit_warnings(recording: Recording) -> tuple[str, ...]:
-    """A sentence for each group of columns that looks as if it were in another unit than the recording says.
+    """A warning for each group of columns that seems to be in another unit than the recording states.
 
     Example:
         >>> import torch
@@ -79,9 +91,9 @@ def _field(recording: Recording) -> str | None:
 
 
 def field_size(recording: Recording) -> float | None:
-    """Length of the field, without a large offset of the sensor where its turns tell the two apart.
+    """Typical magnitude of the field, without a large sensor offset if the sensor turned enough to separate them.
 
-    In the unit of ``mag_x``; None where an axis is missing, or all of its samples.
+    In the unit of ``mag_x``; None if an axis or all samples are missing.
 
     Example:
         >>> import torch
@@ -97,7 +109,7 @@ def field_size(recording: Recording) -> float | None:
     away = field - center
     distance = torch.linalg.vector_norm(away, dim=-1)
     radius = float(distance.median())
-    # an offset makes the length larger; a sphere that is larger itself goes through outliers
+    # an offset increases the length; a larger sphere passes through outliers
     if not 0.0 < radius < _LARGER * length or float(torch.linalg.vector_norm(center)) < 0.5 * radius:
         return length
     scatter = float(robust_scale(distance.unsqueeze(-1) - radius)) / radius
@@ -106,7 +118,7 @@ def field_size(recording: Recording) -> float | None:
 
 
 def _center(field: Tensor) -> Tensor:
-    """Of the sphere nearest to most samples, as near to their median as they leave it open."""
+    """Centre of a robustly fitted sphere, (3,); directions that are not determined stay at the median."""
     middle = field.median(0).values
     away = field - middle
     size = torch.linalg.vector_norm(away, dim=-1).median()
@@ -120,33 +132,33 @@ def _center(field: Tensor) -> Tensor:
     for _ in range(_REWEIGHTED):
         root = weight.sqrt().unsqueeze(-1)
         known = torch.linalg.pinv(root * regressors, rtol=1e-6) @ (root[:, 0] * square)
-        left = (square - regressors @ known).abs()
-        weight = (1.0 + (left / (2.0 * left.median()).clamp(min=1e-12)).square()).reciprocal().square()
+        residual = (square - regressors @ known).abs()
+        weight = (1.0 + (residual / (2.0 * residual.median()).clamp(min=1e-12)).square()).reciprocal().square()
     return middle + size * known[:3]
 
 
 def converted_from(recording: Recording) -> str:
-    """The unit that the magnetometer was converted from; empty where it was not.
+    """The unit that the magnetometer was converted from; empty if it was not converted.
 
     Example:
         >>> import torch
-        >>> told = ("`mag_x`, `mag_y`, `mag_z`: converted from gauss, as the file says, to µT.",)
-        >>> converted_from(Recording({"mag_x": torch.zeros(3)}, warnings=told))
+        >>> warnings = ("`mag_x`, `mag_y`, `mag_z`: converted from gauss, as the file says, to µT.",)
+        >>> converted_from(Recording({"mag_x": torch.zeros(3)}, warnings=warnings))
         'gauss'
     """
     found = [re.match(r"`mag_x`.*: converted from (\S+), ", sentence) for sentence in recording.warnings]
-    return next((one[1] for one in found if one), "")
+    return next((match[1] for match in found if match), "")
 
 
 def field_warning(size: float, unit: str, what: str, numbers: str, before: str = "") -> str | None:
-    """A sentence about a field that is in another unit than is said; None where it may be right.
+    """A warning about a field in another unit than stated; None if the unit is plausible.
 
     Args:
-        size: of the field.
-        unit: that is said; any but µT is believed.
-        what: the subject and verb of the sentence.
-        numbers: what is in the columns' own unit.
-        before: the unit that was said, and that the columns were converted from.
+        size: magnitude of the field.
+        unit: the stated unit; units other than µT are not checked.
+        what: subject and verb of the sentence.
+        numbers: which results are in the columns' own unit.
+        before: the stated unit that the columns were converted from; empty if they were not converted.
 
     Example:
         >>> field_warning(46.0, "µT", "radius is", "offset") is None
@@ -158,14 +170,18 @@ def field_warning(size: float, unit: str, what: str, numbers: str, before: str =
         return None
     if before:
         option = _other_unit(size, before)
-        mend = f"; say `--unit mag={option}` if that is what they are in" if option else ""
+        remedy = f"; if so, give it: `--convert mag={option}`" if option else ""
         return (
-            f"The {what} {_shown(size)} µT, which is not the size of the Earth's field, since the columns "
-            f"were converted from {before}; they may be in another unit than was said{mend}."
+            f"The {what} {_shown(size)} µT, which is not the size of the Earth's field, after the columns "
+            f"were converted from {before}; they may be in another unit than stated{remedy}."
         )
     guess = _guess(size)
     likely = "these may be raw counts" if guess is None else f"in {guess[0]} it would be"
-    option = "name the unit with `--unit`, or" if guess is None else f"say `--unit mag={guess[1]}` if it is, or"
+    option = (
+        "give the unit with `--convert` or `--unit-label`, or"
+        if guess is None
+        else f"if that is the unit, give `--convert mag={guess[1]}`, or"
+    )
     return (
         f"The {what} {_shown(size)} µT, which is not the size of the Earth's field; {likely}. Nothing was converted: "
         f"{option} convert the columns; {numbers} are in the columns' own unit."
@@ -173,7 +189,7 @@ def field_warning(size: float, unit: str, what: str, numbers: str, before: str =
 
 
 def _other_unit(size: float, before: str) -> str:
-    """The unit in which the numbers would be the Earth's field; empty where there is none."""
+    """The unit in which the numbers would be the Earth's field; empty if no unit fits."""
     known = conversion("mag", before)
     raw = size / float(known.factor) if known is not None else math.nan
     for option in ("uT", "gauss", "mG", "nT", "tesla", "mT"):
@@ -184,13 +200,13 @@ def _other_unit(size: float, before: str) -> str:
 
 
 def likely_unit(size: float) -> tuple[str, str] | None:
-    """The unit in which a field would be the Earth's, that is not so in µT; None where it is, or where none fits.
+    """The unit in which an implausible field would be the Earth's; None if µT is plausible or no unit fits.
 
     Args:
-        size: of the field, taken for µT.
+        size: magnitude of the field, taken as µT.
 
     Returns:
-        The unit in words, and as ``--unit mag=`` takes it.
+        The unit in words, and its spelling for ``--convert mag=``.
 
     Example:
         >>> likely_unit(0.5), likely_unit(50.0), likely_unit(7000.0)
@@ -209,7 +225,7 @@ def _rate(recording: Recording) -> str | None:
         return None
     return (
         f"The gyroscope turns at about {size:.3g} rad/s, faster than a hand or a vehicle; it may be in °/s. Nothing "
-        "was converted: say `--unit gyro=deg/s` if it is."
+        "was converted: if it is, give `--convert gyro=deg/s`."
     )
 
 
@@ -219,12 +235,12 @@ def _acceleration(recording: Recording) -> str | None:
         return None
     return (
         f"The accelerometer measures about {size:.3g} m/s² instead of 9.8; it may be in g. "
-        "Nothing was converted: say `--unit accel=g` if it is."
+        "Nothing was converted: if it is, give `--convert accel=g`."
     )
 
 
 def time_warning(recording: Recording) -> str | None:
-    """A sentence about times of a sensor that are not in seconds; None where they may be.
+    """A warning about times of a sensor that are not in seconds; None if seconds are plausible.
 
     Example:
         >>> import torch
@@ -243,10 +259,10 @@ def time_warning(recording: Recording) -> str | None:
     return (
         f"The samples lie {_shown(interval)} s apart by the column `time`, which looks like {unit} "
         f"({_shown(1.0 / (interval * seconds))} samples a second then). Nothing was converted: "
-        f"say `--unit time={option}` if it is."
+        f"if it is, give `--convert time={option}`."
     )
 
 
 def _shown(value: float) -> str:
-    """Three digits, all digits of a large number where they are not too many."""
+    """Format a value with three digits, without an exponent below 1e9."""
     return f"{float(f'{value:.3g}'):.0f}" if 1e3 <= value < 1e9 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Units as people write them, and what a number in one is in the unit that a quantity has here."""
+"""Spellings of units, and their conversion to the canonical unit of a quantity."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ CANONICAL: Mapping[str, str] = MappingProxyType(
         "q": "1",
     }
 )
-"""The unit of each quantity that a recording knows by name."""
+"""Canonical unit of each quantity."""
 
 
 class Conversion(NamedTuple):
-    """From a unit to that of the quantity: ``value * factor + shift``.
+    """Conversion to the canonical unit: ``value * factor + shift``.
 
     Attributes:
-        unit: as it is told, ``gauss``.
-        factor: without a rounding of its own where it is a power of ten.
+        unit: name of the unit in messages, such as ``gauss``.
+        factor: exact factor.
         shift: added after the factor is applied.
     """
 
@@ -42,7 +42,7 @@ class Conversion(NamedTuple):
 
     @property
     def power(self) -> int | None:
-        """The factor as a power of ten; None where it is none, or something is added."""
+        """The exponent if the conversion is a power of ten, else None."""
         if self.shift:
             return None
         for power in range(-12, 13):
@@ -97,11 +97,11 @@ _EVERY = {word for units in _WORDS.values() for _, words in units.values() for w
 
 
 def conversion(quantity: str, text: str) -> Conversion | None:
-    """What a unit of a quantity is; None where it is not known.
+    """Find the conversion of a unit; None if the unit is unknown.
 
     Args:
         quantity: a key of :data:`CANONICAL`.
-        text: the unit as somebody wrote it.
+        text: the unit as written in a file or by a user.
 
     Example:
         >>> conversion("mag", "mGauss").unit, conversion("time", "us").factor, conversion("mag", "counts")
@@ -115,7 +115,7 @@ def conversion(quantity: str, text: str) -> Conversion | None:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit of some quantity, in brackets or not; ``counts`` and the like too.
+    """Whether a text is a unit of any quantity, with or without brackets; ``counts`` and similar labels too.
 
     Example:
         >>> [is_unit(text) for text in ("[uT]", "°/s", "(LSB)", "mag_x", "1")]
@@ -127,20 +127,19 @@ def is_unit(text: str) -> bool:
 
 _LABELS = {"counts", "count", "lsb", "raw", "adc", "1", "v", "volt", "volts", "mv", "pa", "hpa", "mbar", "%", "deg",
            "°", "rad", "hz", "rpm", "m/s", "km/h", "w", "n", "nm", "kg", "j"}  # fmt: skip
-"""Units of other things, by which a row of units is known as one."""
+"""Units of other quantities, by which a row of units is recognised."""
 
 
 def known_units(quantity: str) -> str:
-    """The units of a quantity that are converted, for a sentence."""
+    """The known units of a quantity, as text for a message."""
     return ", ".join(_WORDS.get(quantity, {}))
 
 
 def _tidied(text: str) -> str:
-    """A unit's spelling without what differs between hands: micro signs, blanks, raised digits, capitals.
+    """Normalise the spelling of a unit: micro signs, blanks, superscripts, capitals.
 
-    A µ that was read in another encoding than it was written in is one: æT, ÂµT, �T.
-
-    Nothing is measured in megatesla or megaseconds, so that capitals say nothing.
+    A µ may be garbled by a wrong encoding: æT, ÂµT, �T. Capitals carry no information because megatesla and
+    megaseconds do not occur.
     """
     text = text.strip().replace("μ", "u").replace("µ", "u").replace("º", "°").replace("²", "^2").replace("⁻¹", "^-1")
     text = text.replace("⁻²", "^-2").replace("·", "*").replace("⋅", "*").replace("**", "^")

@@ -1,4 +1,4 @@
-"""Reports a user reads: one HTML page each, pictures within, nothing loaded from elsewhere. Needs the ``cli`` extra."""
+"""Reports as self-contained HTML pages. Needs the ``cli`` extra."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HOMES = {
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        # templates and pictures take half a second to import, and many a command needs the wording alone
+        # importing templates and figures takes half a second; many commands need only the texts
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

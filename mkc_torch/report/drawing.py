@@ -1,4 +1,4 @@
-"""How a picture becomes an element of a page."""
+"""Convert figures to SVG elements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["svg"]
 
 
 def svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an SVG element; its ids get a prefix, so that several can stand on one page."""
+    """Return the figure as an SVG element; ids get the prefix ``name``, so that a page can contain several."""
     FigureCanvasSVG(figure)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})

@@ -1,4 +1,4 @@
-"""How every report becomes a page: its template, and the words that all templates have."""
+"""Render templates of reports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["render"]
 
 
 def render(template: str, **values: Any) -> str:
-    """A page from a template of this package; what a value holds is escaped unless it is markup."""
+    """Render a template of this package; values are escaped unless they are markup."""
     environment = Environment(
         loader=PackageLoader("mkc_torch.report"),
         autoescape=select_autoescape(["html", "html.j2"]),
@@ -30,7 +30,7 @@ def render(template: str, **values: Any) -> str:
 
 
 def _coded(text: str) -> Markup:
-    """A sentence in which what stands between backticks is set as code."""
+    """Set the text between backticks as code."""
     parts = [escape(part) for part in text.split("`")]
     if len(parts) % 2 == 0:
         return escape(text)

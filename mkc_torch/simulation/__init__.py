@@ -1,4 +1,4 @@
-"""Simulations: what predicts a recording, with ports through which an effect can act on it."""
+"""Simulations of recordings, with ports at which effects can act."""
 
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.fmu import FmuError, fmu_class, load_fmu

@@ -1,4 +1,4 @@
-"""The residual on the way of one fit: each answer begins with the one before it."""
+"""The residual during a fit: each evaluation starts from the previous one."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
 __all__ = ["CompiledResidual", "Continuation", "Meaning", "ResidualTangents", "compiled_residual", "is_plain"]
 
 Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
-"""The simulation's own parameters and the changes at its ports, by the parameters of a fit."""
+"""Maps the parameters of a fit to the simulation's own parameters and the changes at its ports."""
 
 _MOST_KEPT = 64
-"""Answers of a way that are kept: a fit comes back to one of its last ones."""
+"""Number of past evaluations that are kept, because a fit returns to one of the last."""
 
 
 class ResidualTangents(NamedTuple):
-    """Derivatives of a residual by the parameters of a fit, and what an answer nearby begins with."""
+    """Derivatives of a residual by the parameters of a fit, and the start of evaluations nearby."""
 
     rows: Float[Tensor, "p N m"]
     nearby: Nearby
 
 
 class CompiledResidual(Protocol):
-    """A residual with derivatives of its own: those of the simulation to rounding, for less."""
+    """A residual with its own derivatives, equal to those of the simulation up to rounding, but faster."""
 
     def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
-        """As :meth:`PreparedSimulation.answer`."""
+        """The residual; see :meth:`PreparedSimulation.answer`."""
         ...
 
     def tangents(self, parameters: Float[Tensor, " p"], near: Nearby) -> ResidualTangents | None:
-        """Derivatives where the answer is ``near``; None where the simulation itself has to be differentiated."""
+        """Derivatives at the evaluation ``near``; None where the simulation itself must be differentiated."""
         ...
 
 
@@ -48,34 +48,34 @@ class _Compilable(Protocol):
     """A prepared simulation that can compile its residual."""
 
     def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:
-        """The residual by ``size`` parameters; None where it cannot be compiled."""
+        """The residual as a function of ``size`` parameters; None where it cannot be compiled."""
         ...
 
 
 def compiled_residual(prepared: PreparedSimulation, meaning: Meaning, size: int) -> CompiledResidual | None:
-    """The compiled residual of a simulation; None where there is none.
+    """The compiled residual of a simulation; None where it cannot be compiled.
 
     Args:
         prepared: the simulation.
-        meaning: of the parameters.
+        meaning: meaning of the parameters.
         size: number of parameters.
     """
     return prepared.compiled(meaning, size) if isinstance(prepared, _Compilable) else None
 
 
 def is_plain(parameters: Tensor) -> bool:
-    """Whether nothing is differentiated by these parameters."""
+    """Whether no derivative by these parameters is being computed."""
     return not (parameters.requires_grad or is_wrapped(parameters) or functorch_is_active())
 
 
 class Continuation:
-    """A function of a fit's parameters that remembers the answers on the way of that fit, and of no other.
+    """The residual as a function of a fit's parameters; it remembers the evaluations of this fit only.
 
     Args:
         prepared: the simulation.
-        meaning: the simulation's own parameters and the changes at its ports, by those of the fit.
-        near: what the first answer begins with.
-        compiled: returns the compiled residual; default that of the simulation.
+        meaning: maps the fit's parameters to the simulation's parameters and the changes at its ports.
+        near: start of the first evaluation.
+        compiled: returns the compiled residual; default the simulation's.
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class Continuation:
         self._last_key = b""
 
     def __call__(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
-        """The residual."""
+        """The residual, recording minus simulation."""
         check_deadline()
         if is_wrapped(parameters):
             return self._prepared.answer(*self._meaning(parameters), self._last).residual
         key = _key(parameters)
-        # what was found on the way is not always found again from elsewhere
+        # a solution that was found is not always found again from another start
         near = self._last if key == self._last_key else self._known.get(key, self._last)
         residual, nearby = self._answer(parameters, near)
         if nearby is not None:
@@ -109,7 +109,7 @@ class Continuation:
         return residual
 
     def tangents(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "p N m"] | None:
-        """Derivatives of the residual, a row for each parameter; None where they have to be found another way."""
+        """Derivatives of the residual, a row per parameter; None where they must be computed in another way."""
         compiled = self._compiled_for(parameters) if is_plain(parameters) else None
         if compiled is None:
             return None
@@ -124,7 +124,7 @@ class Continuation:
         return found.rows
 
     def near(self, parameters: Float[Tensor, " p"]) -> Nearby | None:
-        """What an answer at these parameters begins with: the one that was found there, or else the last one."""
+        """The start of an evaluation at these parameters: the solution that was found there, else the last solution."""
         last = None if self._last is None else self._last.bare
         return self._known.get(_key(parameters), last)
 

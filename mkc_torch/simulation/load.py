@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 __all__ = ["SimulationFileError", "base_class", "file_of", "load_simulation", "raised_in"]
 
 _PREFIX = "_simulation_"
-"""Of the modules that files are loaded as."""
+"""Prefix of the names of modules that are loaded from files."""
 
 
 class SimulationFileError(ValueError):
-    """A file of a simulation that cannot be used; the text says why, with the lines in which its code raised."""
+    """A simulation file that cannot be used; the message states why, with the user's part of a traceback."""
 
 
 def load_simulation(source: str) -> Simulation:
-    """The simulation that ``FILE.py:NAME`` names: a class, which is called without arguments, or an instance.
+    """Load the simulation ``FILE.py:NAME``: a class, which is called without arguments, or an instance.
 
-    The file is run, as a script would be: it can import modules beside it, and those of the folder it is called in.
-    ``MODEL.fmu`` is the simulation in an FMU, whose binary is run.
+    The file is run like a script: it can import modules from its folder and from the current folder. ``MODEL.fmu`` is
+    the simulation in an FMU, whose binary is run.
 
     Raises:
-        SimulationFileError: no such file or name, a file or class that raises, or something that is no simulation.
-        FmuError: an FMU that cannot be used.
-        ImportError: of an FMU, FMPy is not installed.
+        SimulationFileError: no such file or name, a file or class that raises, or an object that is not a simulation.
+        FmuError: the FMU cannot be used.
+        ImportError: FMPy is not installed, which an FMU requires.
 
     Example:
         >>> load_simulation("nowhere.py:Pendulum")
@@ -59,7 +59,9 @@ def load_simulation(source: str) -> Simulation:
         try:
             found = found()
         except Exception as error:
-            raise SimulationFileError(f"{path}: {name}() raised an error of its own.\n{_told(error, path)}") from None
+            raise SimulationFileError(
+                f"{path}: {name}() raised an error of its own.\n{_user_traceback(error, path)}"
+            ) from None
     if not _is_simulation(found):
         raise SimulationFileError(
             f"{path}: `{name}` is no simulation, for it has no `prepare`; derive it from mkc_torch.simulation.Dynamics "
@@ -69,12 +71,12 @@ def load_simulation(source: str) -> Simulation:
 
 
 def base_class(source: str, file: str) -> type[Any]:
-    """The class that a ``corrected.py`` corrects, from the file it was defined in, which is run.
+    """The class that a ``corrected.py`` corrects; its file is run.
 
     Args:
-        source: ``FILE.py:NAME``, by the way from the folder of ``file``. Where that has been moved the file is sought
-            beside ``file``, then in the folder of the call.
-        file: the one that asks, its ``__file__``.
+        source: ``FILE.py:NAME`` relative to the folder of ``file``; if the file has moved, it is searched in the folder
+            of ``file``, then in the current folder.
+        file: ``__file__`` of the calling file.
 
     Raises:
         SimulationFileError: there is no such file or class, or the file raises.
@@ -85,23 +87,23 @@ def base_class(source: str, file: str) -> type[Any]:
         mkc_torch.simulation.load.SimulationFileError: results/corrected.py: it corrects Pendulum of ...
     """
     path, name = _parts(source)
-    asking = Path(file).resolve()
-    places = [asking.parent / path, asking.parent / path.name, Path.cwd() / path.name]
-    there = [one for one in places if one.is_file() and one.resolve() != asking]
-    if not there:
+    caller = Path(file).resolve()
+    places = [caller.parent / path, caller.parent / path.name, Path.cwd() / path.name]
+    found = [place for place in places if place.is_file() and place.resolve() != caller]
+    if not found:
         raise SimulationFileError(
             f"{file}: it corrects {name} of {path.name}, which is neither at {path.as_posix()} from there, nor beside "
             f"it, nor in the folder of the call; put {path.name} beside it."
         )
-    module = _module(there[0].resolve())
+    module = _module(found[0].resolve())
     kind = getattr(module, name, None)
     if not isinstance(kind, type):
-        raise SimulationFileError(f"{there[0]}: it defines no class `{name}`, which {file} corrects.")
+        raise SimulationFileError(f"{found[0]}: it defines no class `{name}`, which {file} corrects.")
     return kind
 
 
 def file_of(kind: type) -> Path | None:
-    """The file that a class was loaded from by :func:`load_simulation`; None for any other class.
+    """The file from which :func:`load_simulation` loaded a class; None for any other class.
 
     Example:
         >>> file_of(dict)
@@ -111,10 +113,10 @@ def file_of(kind: type) -> Path | None:
 
 
 def raised_in(source: str, error: BaseException) -> SimulationFileError | None:
-    """What to tell of an error that the code of ``FILE.py:NAME`` raised while it simulated; None for another's error.
+    """The error to report if the code of ``FILE.py:NAME`` raised ``error`` while simulating; None for other errors.
 
     Example:
-        >>> raised_in("my.py:Pendulum", ValueError("of somebody else's"))
+        >>> raised_in("my.py:Pendulum", ValueError("raised elsewhere"))
     """
     if _is_fmu(source):
         return None
@@ -122,7 +124,7 @@ def raised_in(source: str, error: BaseException) -> SimulationFileError | None:
     frames = traceback.extract_tb(error.__traceback__)
     if not any(_same(frame.filename, path) for frame in frames):
         return None
-    return SimulationFileError(f"{path}: {name} raised an error of its own.\n{_told(error, path)}")
+    return SimulationFileError(f"{path}: {name} raised an error of its own.\n{_user_traceback(error, path)}")
 
 
 def _is_fmu(source: str) -> bool:
@@ -146,15 +148,15 @@ def _module(path: Path) -> ModuleType:
     sys.modules[module.__name__] = module
     _loading.append(module.__name__)
     try:
-        with _beside(path), _not_itself(path):
+        with _importing_from_folder(path), _not_itself(path):
             spec.loader.exec_module(module)
-    except SimulationFileError:  # of the file of a base class
+    except SimulationFileError:  # from the file of a base class
         del sys.modules[module.__name__]
         raise
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise SimulationFileError(
-            f"{path}: the file raised an error of its own.\n{_told(error, path)}{_where_to_call(error)}"
+            f"{path}: the file raised an error of its own.\n{_user_traceback(error, path)}{_where_to_call(error)}"
         ) from None
     finally:
         _loading.pop()
@@ -162,7 +164,7 @@ def _module(path: Path) -> ModuleType:
 
 
 def _free_name(path: Path) -> str:
-    """A name for a file's module, not that of one that asks for it: a corrected.py may correct another corrected.py."""
+    """A module name for a file, unlike those being loaded: a corrected.py may correct another corrected.py."""
     name = f"{_PREFIX}{path.stem}"
     while name in _loading:
         name += "_"
@@ -170,22 +172,23 @@ def _free_name(path: Path) -> str:
 
 
 _loading: list[str] = []
-"""Modules that are being loaded, each for the one before it."""
+"""Names of the modules being loaded, each imported by the previous one."""
 
 
 def _where_to_call(error: BaseException) -> str:
-    """Advice where a module is missing, such as the one with the class that a corrected.py corrects."""
+    """The remedy for a missing module, such as the file of the class that a corrected.py corrects; else empty."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return ""
     name = error.name.partition(".")[0]
     return (
-        f"\nModules are sought beside the file and in the folder of the call: put {name}.py there, or call from there."
+        f"\nModules are searched in the folder of the file and in the current folder: put {name}.py there, or change "
+        "the folder."
     )
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[None]:
-    """The file's folder is searched for modules first, then the one that the command was given in."""
+def _importing_from_folder(path: Path) -> Iterator[None]:
+    """Search modules in the file's folder first, then in the current folder, within the block."""
     folders = [str(path.resolve().parent), str(Path.cwd())]
     sys.path[:0] = folders
     try:
@@ -215,7 +218,7 @@ class _Others(MetaPathFinder):
 
 @contextmanager
 def _not_itself(path: Path) -> Iterator[None]:
-    """A corrected.py that was made of another corrected.py imports the other one."""
+    """Let a corrected.py of another corrected.py import that file instead of itself, within the block."""
     known = sys.modules.get(path.stem)
     itself = known is not None and _same(getattr(known, "__file__", None) or "", path)
     if itself:
@@ -228,8 +231,8 @@ def _not_itself(path: Path) -> Iterator[None]:
         sys.meta_path.remove(finder)
 
 
-def _told(error: BaseException, path: Path) -> str:
-    """The user's own part of a traceback."""
+def _user_traceback(error: BaseException, path: Path) -> str:
+    """The user's part of a traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [k for k, frame in enumerate(frames) if _same(frame.filename, path)]
     lines = traceback.format_list(frames[own[0] :] if own else [])
@@ -241,7 +244,7 @@ def _same(filename: str, path: Path) -> bool:
 
 
 def _own(value: object, module: ModuleType) -> bool:
-    """Whether a value of a module is a simulation that was defined there."""
+    """Whether a value of a module is a simulation defined there."""
     kind = value if isinstance(value, type) else type(value)
     return _is_simulation(value) and kind.__module__ == module.__name__
 

@@ -1,4 +1,4 @@
-"""What a user's functions are given: values as attributes, by their names."""
+"""Arguments of a user's functions: values as attributes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Names"]
 
 
 class Names(SimpleNamespace):
-    """Values by name; one that is not there is an error that lists those that are.
+    """Values as attributes; the error of a missing name lists the names.
 
     Example:
         >>> Names(climb=1.0).clmb

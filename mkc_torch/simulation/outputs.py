@@ -1,4 +1,4 @@
-"""Ports at what a simulation without states puts out: one for each column, and one for all of them."""
+"""Ports at the outputs of a simulation without states: a port for each output, and a port for all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["ALL", "changed_outputs", "output_ports", "output_signals"]
 
 ALL = "all outputs"
-"""The port of all columns together, whose kind is "outputs"; that of one is called ``output NAME``."""
+"""Name of the port of all outputs together, of kind "outputs"; the port of an output is named ``output NAME``."""
 
 
 def output_ports(
@@ -30,15 +30,15 @@ def output_ports(
     fixed: Collection[str] = (),
     run: Int[Tensor, " N"] | None = None,
 ) -> dict[str, Port]:
-    """The ports of columns.
+    """The ports of outputs.
 
     Args:
-        channels: their names.
-        units: of each.
-        unit: of all of them; empty where they differ.
-        measured: for the sizes of what passes.
-        fixed: those whose zero no parameter of the simulation moves; they have the part "fixed zero".
-        run: of each sample's run; None where the simulation knows of no runs.
+        channels: names of the outputs.
+        units: unit of each output.
+        unit: common unit; empty where the units differ.
+        measured: the recorded outputs, for the sizes of the signals.
+        fixed: outputs that no parameter of the simulation shifts; they have the part "fixed zero".
+        run: number of each sample's run; None where the simulation has no runs.
 
     Example:
         >>> ports = output_ports(("angle",), {"angle": "rad"}, "rad", torch.ones(5, 1))
@@ -48,7 +48,7 @@ def output_ports(
     angles = [_is_angle(name, units[name], measured[:, k]) for k, name in enumerate(channels)]
     alike = len(channels) > 1 and len({units[name] for name in channels}) == 1
     joined = dict.fromkeys([SEVERAL, *["angle"] * all(angles)], channels[0]) if alike else {}
-    port = Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)
+    port = Port(tuple(channels), unit, allows_drift=True, kind="outputs", run=run)
     ports = {ALL: replace(port, parts=joined, part_units=dict.fromkeys(joined, unit))}
     for k, name in enumerate(channels):
         known = ["fixed zero"] * (name in fixed) + ["angle"] * angles[k]
@@ -66,16 +66,16 @@ def output_ports(
 
 
 def _is_angle(name: str, unit: str, values: Float[Tensor, " N"]) -> bool:
-    """Whether an output is the angle of a joint: by its unit, or where that is not known by its name and its range."""
+    """Whether an output is a joint angle: by its unit, or without a unit by its name and its range."""
     return kind_of(unit, name) == "angle" and (bool(unit) or float(values.abs().max()) <= _TURN)
 
 
 _TURN = 6.3
-"""Largest angle in rad of a joint that no unit tells of."""
+"""Largest joint angle in rad of an output without a unit."""
 
 
 def changed_outputs(outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes) -> Float[Tensor, "N m"]:
-    """The outputs with what effects add: first to each column, then to all."""
+    """The outputs with the changes by effects: first at each output, then at all outputs."""
     outputs = _each_changed(outputs, channels, changes)
     return outputs + changes[ALL](outputs) if ALL in changes else outputs
 
@@ -83,7 +83,7 @@ def changed_outputs(outputs: Float[Tensor, "N m"], channels: Sequence[str], chan
 def output_signals(
     outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes
 ) -> dict[str, Float[Tensor, "N k"]]:
-    """What passes through the ports."""
+    """The signals at the ports."""
     own = {f"output {name}": outputs[:, [k]] for k, name in enumerate(channels)}
     return {ALL: _each_changed(outputs, channels, changes)} | own
 

@@ -1,4 +1,4 @@
-"""Offsets of outputs that are another one in each recording, where several recordings share one simulation."""
+"""Offsets of outputs per recording, where several recordings share a simulation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["OwnOffset", "determined_offsets"]
 
 _DETERMINED = 0.01
-"""Share of an offset's column that the other parameters have to leave, for the offset to be fitted beside them."""
+"""Share of an offset's column that must be independent of the other parameters for the offset to be fitted."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class OwnOffset:
     Attributes:
         output: name of the output.
         recording: number of the recording, from 0.
-        name: of the parameter.
+        name: name of the parameter.
     """
 
     output: str
@@ -36,47 +36,47 @@ class OwnOffset:
 def determined_offsets(
     tangents: Float[Tensor, "N m p"], outputs: Sequence[str], recording: Int[Tensor, " N"], names: Sequence[str]
 ) -> tuple[OwnOffset, ...]:
-    """The offsets that can be told from the simulation's own parameters and first states.
+    """The offsets that are identifiable next to the simulation's own parameters and initial states.
 
-    The offset of a position and its first value are one and the same where nothing depends on the position; such an
-    offset is left at 0. Where the simulation has an offset of its own that all recordings share, the first recording's
-    is left at 0, and the others are counted from there.
+    The offset of a position is indistinguishable from its initial value where nothing depends on the position; such an
+    offset stays 0. Where the simulation has an offset parameter that all recordings share, the offset of the first
+    recording stays 0, and the others are relative to it.
 
     Args:
-        tangents: of the residual by the simulation's parameters, first states included.
+        tangents: derivatives of the residual by the simulation's parameters, including initial states.
         outputs: names of the m outputs.
         recording: number of each sample's recording.
-        names: of the recordings.
+        names: names of the recordings.
 
     Example:
-        A line through the origin, in two recordings, leaves room for both offsets; a line with an intercept for one:
+        In two recordings, a line through the origin allows both offsets; a line with an intercept allows one:
 
         >>> x, run = torch.linspace(0.0, 1.0, 8, dtype=torch.float64).repeat(2), torch.arange(2).repeat_interleave(8)
-        >>> [one.name for one in determined_offsets(x[:, None, None], ("y",), run, ("a", "b"))]
+        >>> [offset.name for offset in determined_offsets(x[:, None, None], ("y",), run, ("a", "b"))]
         ['offset of y in a', 'offset of y in b']
         >>> line = torch.stack([x, torch.ones_like(x)], -1).unsqueeze(1)
-        >>> [one.name for one in determined_offsets(line, ("y",), run, ("a", "b"))]
+        >>> [offset.name for offset in determined_offsets(line, ("y",), run, ("a", "b"))]
         ['offset of y in b']
     """
     known = _orthonormal(tangents.flatten(0, 1))
     found = []
     for k, output in enumerate(outputs):
-        # the last ones first, so that it is the first recording that the others are counted from
+        # in reverse order, so that the first recording is the reference
         for number in range(len(names) - 1, -1, -1):
             column = torch.zeros_like(tangents[..., 0])
             column[recording == number, k] = 1.0
             unit = column.flatten() / torch.linalg.vector_norm(column)
-            left = unit - known @ (known.T @ unit)
-            length = torch.linalg.vector_norm(left)
+            remainder = unit - known @ (known.T @ unit)
+            length = torch.linalg.vector_norm(remainder)
             if float(length) > _DETERMINED:
-                known = torch.cat([known, (left / length).unsqueeze(-1)], -1)
+                known = torch.cat([known, (remainder / length).unsqueeze(-1)], -1)
                 found.append(OwnOffset(output, number, f"offset of {output} in {names[number]}"))
     order = {output: k for k, output in enumerate(outputs)}
-    return tuple(sorted(found, key=lambda one: (order[one.output], one.recording)))
+    return tuple(sorted(found, key=lambda offset: (order[offset.output], offset.recording)))
 
 
 def _orthonormal(columns: Float[Tensor, "R p"]) -> Float[Tensor, "R q"]:
-    """A basis of what columns span, each measured by its own length."""
+    """An orthonormal basis of the span of the normalised columns."""
     length = torch.linalg.vector_norm(columns, dim=0)
     scaled = columns[:, length > 0] / length[length > 0]
     left, size, _ = torch.linalg.svd(scaled, full_matrices=False)

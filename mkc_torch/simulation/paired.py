@@ -1,4 +1,4 @@
-"""A simulator as a black box: the columns that it wrote beside those that were recorded."""
+"""A simulator as a black box: its output columns compared with recorded columns."""
 
 from __future__ import annotations
 
@@ -23,38 +23,44 @@ if TYPE_CHECKING:
 __all__ = ["Paired", "PairedCorrection", "PreparedPaired"]
 
 RATE = 5e-5
-"""Standard deviation of the rate between two clocks: 50 ppm, of quartz that nothing steadies."""
+"""Prior standard deviation of the relative rate of two clocks: 50 ppm, of free-running quartz oscillators."""
 
 _NOT_KEYS = frozenset({"time", "experiment"})
 _FREE = 2.0
+"""Largest clock offset and rate, in prior standard deviations."""
+
 _SAME = 1e-9
+"""Largest difference of two equal columns, over the range of the recorded column."""
+
 _FEWEST = 2
+"""Fewest simulated moments in a run."""
 
 _HELD = 1e8
-"""Precision of what is held, over that of a clock."""
+"""Prior precision of a clock parameter that is held at 0, over its usual precision."""
 
 
 class Paired:
-    """What a simulator wrote, compared with a recording in all columns that both have, at the recording's times.
+    """The output of a simulator, compared with a recording in all common columns, at the recording's times.
 
-    Between the simulator's moments its columns go along cubic polynomials. The two clocks may differ: by an offset, of
-    each run, with a standard deviation of half a sampling interval, and by a rate of 50 ppm. Both are fitted, to twice
-    that at most; what is more is no matter of clocks and is found as ``delay`` or ``clock_drift``. Beside a delay of
-    all outputs the clocks' offset is 0, in the mean of all runs, and beside a drift their rate, so that what is found
-    is all of it and holds in another recording. A column that is the same in both is an input of the simulator and not
-    compared, but can drive effects.
+    Between the simulator's moments its columns are interpolated by cubic polynomials. The two clocks may differ by an
+    offset in each run, with a standard deviation of half a sampling interval, and by a rate, of 50 ppm. Both are fitted
+    up to twice that; larger differences are not errors of clocks and are found as ``delay`` or ``clock_drift``. With a
+    delay of all outputs the mean clock offset of the runs is held at 0, with a drift the clock rate, so that the effect
+    is complete and valid in another recording. A column that is the same in both tables is an input of the simulator:
+    it is not compared, but can drive effects.
 
     Args:
-        simulated: with ``time``; a column ``experiment`` tells runs apart by the same labels as the recording's.
-        outputs: the columns to compare; None for all that both have.
-        offset: standard deviation of the clocks' offset in s; None for half an interval of the recording.
-        rate: standard deviation of their rate.
+        simulated: the simulator's output with ``time``; a column ``experiment`` separates runs by the same labels as
+            the recording's.
+        outputs: columns to compare; None for all common columns.
+        offset: standard deviation of the clock offset in s; None for half a sampling interval of the recording.
+        rate: standard deviation of the clock rate, as a share.
 
     Attributes:
-        joins_experiments: True: one fit takes all runs.
+        joins_experiments: True: all runs are fitted jointly.
 
     Raises:
-        TypeError: what is no recording, or text in place of names of columns.
+        TypeError: ``simulated`` is not a recording, or ``outputs`` is a string.
         MissingColumnError: there is no ``time``.
         ValueError: a standard deviation that is not positive, or outputs without a column.
 
@@ -92,14 +98,14 @@ class Paired:
 
     @property
     def columns(self) -> frozenset[str]:
-        # what turns out to be an input may drive effects: the columns of a recording are known in `prepare` alone
+        # inputs of the simulator may drive effects; they are only known in `prepare`
         return _NOT_KEYS
 
     def prepare(self, recording: Recording) -> PreparedPaired:
-        """The simulator's columns beside a recording's.
+        """The simulator's output together with a recording.
 
         Raises:
-            TypeError: what is no recording.
+            TypeError: ``recording`` is not a recording.
             MissingColumnError: the recording has no ``time``, or lacks a column of ``outputs``.
             SimulationError: no column, no run or no time in common.
         """
@@ -110,7 +116,7 @@ class Paired:
         return PreparedPaired(self, table, shared, curve)
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
-        """What was simulated for a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        """The simulator's output with corrections for a new recording; see :class:`mkc_torch.simulation.Correction`."""
         return PairedCorrection(self, state, recording)
 
     def _shared(self, recording: Recording) -> tuple[str, ...]:
@@ -130,7 +136,7 @@ class Paired:
 
 
 class PreparedPaired(ClosedForm):
-    """The columns of a simulator with the recording that answers them."""
+    """The output of a simulator together with a recording."""
 
     def __init__(self, system: Paired, recording: Recording, shared: tuple[str, ...], curve: _Curve) -> None:
         self.system, self.name = system, system.name
@@ -150,9 +156,9 @@ class PreparedPaired(ClosedForm):
         kept = [k for k, name in enumerate(shared) if name not in same]
         self.channels = tuple(shared[k] for k in kept)
         self.measured, self.curve = measured[:, kept], curve.columns(kept)
-        # the compared columns go, so that they do not drive effects on themselves
-        left = {name: values for name, values in recording.columns.items() if name not in self.channels}
-        self.recording = _copied(recording, left)
+        # without the compared columns, so that they do not drive effects on themselves
+        others = {name: values for name, values in recording.columns.items() if name not in self.channels}
+        self.recording = _copied(recording, others)
         self._units = {name: recording.units[name] for name in self.channels}
         units = set(self._units.values())
         self.unit = units.pop() if len(units) == 1 else ""
@@ -161,7 +167,7 @@ class PreparedPaired(ClosedForm):
         width = interval / 2.0 if system.offset is None else system.offset
         spread = [width] * len(curve.runs) + [system.rate]
         self._since = _since_begin(self.time, curve)
-        offsets = [f"clock offset of {one}" if one else "clock offset" for one in curve.runs]
+        offsets = [f"clock offset of {label}" if label else "clock offset" for label in curve.runs]
         self.parameter_names = (*offsets, "clock rate")
         self._spread = sizes = self.time.new_tensor(spread)
         self.prior: GaussianPrior | None = GaussianPrior(torch.zeros_like(sizes), sizes.square().reciprocal())
@@ -175,8 +181,8 @@ class PreparedPaired(ClosedForm):
             for name in same
         )
 
-    def prior_beside(self, settled: Collection[str]) -> GaussianPrior:
-        """What is known of the clocks beside effects that settle their mean ``"offset"`` or their ``"rate"``."""
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior:
+        """The prior of the clocks, given effects that replace their mean ``"offset"`` or their ``"rate"``."""
         runs = len(self.curve.runs)
         known = self._spread.square().reciprocal()
         precision = torch.diag(known)
@@ -206,13 +212,13 @@ class PreparedPaired(ClosedForm):
 
 
 class PairedCorrection:
-    """A simulator's columns for a new recording, with the effects in them, by the clocks that were fitted.
+    """A simulator's output for a new recording, with effects and with the fitted clocks.
 
     Args:
-        system: what the simulator wrote for the new recording.
-        state: of the fitted one: ``channels``, the columns that were compared, and ``clocks``, the most that each clock
-            may be off; without that, as in older files, the clocks count as one.
-        recording: with its times and drivers; the compared columns need not be there.
+        system: the simulator's output for the new recording.
+        state: state of the fitted simulation: ``channels``, the compared columns, and ``clocks``, the largest error of
+            each clock parameter; without it, as in older files, the clocks have no error.
+        recording: the times and drivers; the compared columns are not required.
 
     Raises:
         MissingColumnError: no ``time``, or a column that was not simulated.
@@ -234,7 +240,7 @@ class PairedCorrection:
         self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels, run)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        """The simulated columns with the effects; the clocks' offset is the mean of that of the fitted runs."""
+        """The simulated columns with the effects; the clock offset is the mean over the fitted runs."""
         at = self.time
         if len(self._most):
             clock = _clocks(theta, self._most)
@@ -245,13 +251,14 @@ class PairedCorrection:
 
 @dataclass(frozen=True)
 class _Curve:
-    """What was simulated, as cubic polynomials between its moments, for the samples of a recording.
+    """The simulator's output as piecewise cubic polynomials, for the samples of a recording.
 
     Attributes:
-        time, values, slopes: of the S moments, run after run.
-        number: (S,) of each moment's run.
-        run: (N,), of each sample's run; ``runs`` are their labels.
+        time, values, slopes: (S,), (S, m), (S, m), at the S simulated moments, run after run.
+        number: (S,), number of each moment's run.
+        run: (N,), number of each sample's run.
         low, high: (N,), first and last moment of that run.
+        runs: labels of the runs.
     """
 
     time: Float[Tensor, " S"]
@@ -265,11 +272,11 @@ class _Curve:
 
     def at(self, time: Float[Tensor, " N"]) -> Float[Tensor, "N m"]:
         """Values at one moment for each sample."""
-        # on an axis where runs follow one another
-        least = self.time.min()
-        span = self.time.max() - least + 1.0
-        within = (time.detach() - least).clamp(0.0, float(span) - 0.5)
-        after = torch.searchsorted(self.number * span + self.time - least, self.run * span + within, right=True)
+        # on a common axis where runs follow one another
+        origin = self.time.min()
+        span = self.time.max() - origin + 1.0
+        within = (time.detach() - origin).clamp(0.0, float(span) - 0.5)
+        after = torch.searchsorted(self.number * span + self.time - origin, self.run * span + within, right=True)
         left = torch.minimum(torch.maximum(after - 1, self.low), self.high - 1)
         step = (self.time[left + 1] - self.time[left]).unsqueeze(-1)
         x = (time - self.time[left]).unsqueeze(-1) / step
@@ -279,43 +286,43 @@ class _Curve:
         return self.values[left] + x * (begin + x * (3.0 * rise - 2.0 * begin - end + x * (begin + end - 2.0 * rise)))
 
     def kept(self, rows: Bool[Tensor, " N"]) -> _Curve:
-        """For some of the samples."""
+        """The curve for some of the samples."""
         return replace(self, run=self.run[rows], low=self.low[rows], high=self.high[rows])
 
     def columns(self, kept: Sequence[int]) -> _Curve:
-        """Some of the columns."""
+        """The curve of some of the columns."""
         return replace(self, values=self.values[:, kept], slopes=self.slopes[:, kept])
 
 
 def _clocks(theta: Float[Tensor, " p"], most: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-    """Offsets and rate, by a curve that levels off: at a hard bound a fit of what goes the same way would get stuck."""
+    """Clock offsets and rate, limited smoothly: at a hard bound a fit of an equivalent effect would get stuck."""
     return most * torch.tanh(theta / most)
 
 
 def _since_begin(time: Float[Tensor, " N"], curve: _Curve) -> Float[Tensor, " N"]:
-    """Time since the first sample of each one's run."""
+    """Time since the first sample of each sample's run."""
     first = time.new_full((len(curve.runs),), torch.inf).scatter_reduce(0, curve.run, time, "amin")
     return time - first[curve.run]
 
 
 def _met(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Recording, _Curve]:
-    """The samples whose times were simulated, with the curve."""
+    """The samples at simulated times, and the curve."""
     inside, curve = _found(simulated, recording, names)
     if bool(inside.all()):
         return recording, curve
-    told = (
+    warning = (
         f"{int((~inside).sum())} of {len(recording)} samples lie outside the times that were simulated, "
         f"{_range(simulated)}, and are left out."
     )
     columns = {name: values[inside] for name, values in recording.columns.items()}
-    return _copied(recording, columns, told), curve.kept(inside)
+    return _copied(recording, columns, warning), curve.kept(inside)
 
 
 def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Bool[Tensor, " N"], _Curve]:
-    """Which samples lie within the simulated times of their run, and the curve.
+    """The mask of the samples within the simulated times of their run, and the curve.
 
     Raises:
-        SimulationError: a run was not simulated, or none of its samples.
+        SimulationError: a run was not simulated, or no sample of a run is within the simulated times.
     """
     time = recording["time"]
     number, labels = _runs(simulated)
@@ -348,7 +355,7 @@ def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -
 
 
 def _slopes(time: Float[Tensor, " S"], values: Float[Tensor, "S m"], number: Int[Tensor, " S"]) -> Float[Tensor, "S m"]:
-    """Of the parabola through each moment and its neighbours; at the ends of a run, of the straight line."""
+    """Slopes of the parabola through each moment and its neighbours; at the ends of a run, of the straight line."""
     step = time.diff().unsqueeze(-1)
     same = (number.diff() == 0).unsqueeze(-1)
     slope = torch.where(same, values.diff(dim=0) / torch.where(same, step, 1.0), 0.0)
@@ -360,7 +367,7 @@ def _slopes(time: Float[Tensor, " S"], values: Float[Tensor, "S m"], number: Int
 
 
 def _runs(recording: Recording) -> tuple[Int[Tensor, " N"], list[str]]:
-    """Number of each sample's run, in the order of their appearance, and the runs' labels."""
+    """Number of each sample's run, in order of appearance, and the labels of the runs."""
     if "experiment" not in recording:
         return torch.zeros(len(recording), dtype=torch.long), [""]
     names = recording.labels.get("experiment", ())

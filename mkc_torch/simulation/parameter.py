@@ -1,4 +1,4 @@
-"""A parameter of a simulation, and the error of one that cannot be computed."""
+"""Parameters of simulations, and the error of a simulation that cannot be computed."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ __all__ = ["Parameter", "SimulationError", "known_parameters"]
 
 
 class SimulationError(ValueError):
-    """A simulation that cannot be computed; the sentence says where and why."""
+    """A simulation that cannot be computed; the message states where and why."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a simulation, which is fitted.
+    """A fitted parameter of a simulation.
 
     Attributes:
-        value: to start from.
-        lower, upper: least and greatest value.
-        unit: for reports.
+        value: start value of the fit.
+        lower, upper: bounds.
+        unit: unit in reports.
 
     Raises:
-        TypeError: a value or a bound is no number, or the unit no text.
+        TypeError: a value or a bound is not a number, or the unit is not a string.
         ValueError: the value is not finite or out of its bounds, or ``lower`` exceeds ``upper``.
 
     Example:
@@ -46,7 +46,7 @@ class Parameter:
             checked_number(name, bound, -math.inf, math.inf, "[]", "it is infinite for no bound")
         if self.lower > self.upper:
             raise ValueError(
-                f"Expected argument `lower` to be at upper `upper` but got {self.lower} and {self.upper}; swap them."
+                f"Expected argument `lower` to be at most `upper` but got {self.lower} and {self.upper}; swap them."
             )
         if not self.lower <= self.value <= self.upper:
             raise ValueError(
@@ -57,16 +57,23 @@ class Parameter:
 
 
 def known_parameters(name: str, parameters: Mapping[str, float | Parameter]) -> dict[str, Parameter]:
-    """The parameters of the simulation of that name, numbers made into some.
+    """The parameters of a simulation as :class:`Parameter`.
+
+    Args:
+        name: name of the simulation, for errors.
+        parameters: name to parameter or start value.
 
     Raises:
-        SimulationError: they are no mapping, or one is no number.
+        SimulationError: ``parameters`` is not a mapping, or a value is not a number.
     """
     if not isinstance(parameters, Mapping):
         raise SimulationError(
-            f"{name}: `parameters` should be names with their values, {{'gain': 1.0}}, but is {format_value(parameters)}."
+            f"{name}: `parameters` should be names with their values, {{'gain': 1.0}}, but is "
+            f"{format_value(parameters)}."
         )
-    return {key: one if isinstance(one, Parameter) else _made(name, key, one) for key, one in parameters.items()}
+    return {
+        key: value if isinstance(value, Parameter) else _made(name, key, value) for key, value in parameters.items()
+    }
 
 
 def _made(name: str, key: str, value: float) -> Parameter:

@@ -1,4 +1,4 @@
-"""What the diagnosis asks of a simulation: parameters, a residual, and ports through which physics can be added."""
+"""The interface of simulations to the diagnosis: parameters, a residual, and ports at which effects act."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ __all__ = [
 ]
 
 Change = Callable[[Tensor], Tensor]
-"""What effects add at a port, (N, c), as a function of the signal that passes through it.
+"""The change at a port, (N, c), as a function of the signal there.
 
-At a port with memory a signal can have more components, the internal states; what is added then has more channels,
-their rates.
+At a port with memory the signal can have more components, the internal states; the change then has more channels, their
+rates.
 """
 
 Changes = Mapping[str, Change]
@@ -50,7 +50,7 @@ Changes = Mapping[str, Change]
 
 @dataclass(frozen=True)
 class FreeChange:
-    """A change that is the same whatever passes through the port: nobody needs to simulate the signal for it."""
+    """A change that does not depend on the signal, which then need not be simulated."""
 
     of: Change
 
@@ -60,12 +60,12 @@ class FreeChange:
 
 @dataclass(frozen=True)
 class SignalTimes:
-    """The moments at which a port's signal is simulated, G of them, where they are not the recording's samples.
+    """The G moments at which a port's signal is simulated, where they are not the recording's samples.
 
     Attributes:
-        time: (G,) in s.
-        before, after: (G,), the samples that a moment lies between.
-        share: (G,), how far it is from the one to the other, 0 to 1.
+        time: (G,), in s.
+        before, after: (G,), the samples before and after each moment.
+        share: (G,), position of the moment between these samples, 0 to 1.
     """
 
     time: Float[Tensor, " G"]
@@ -74,17 +74,17 @@ class SignalTimes:
     share: Float[Tensor, " G"]
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
-        """Values of the samples, at these moments."""
+        """Values of the samples, interpolated to these moments."""
         share = self.share.reshape(-1, *[1] * (values.dim() - 1))
         return torch.lerp(values[self.before], values[self.after], share)
 
 
 class SignalSizes(NamedTuple):
-    """How large values are: a typical and the largest absolute one, and the lowest and the highest.
+    """Sizes of values: the typical and the largest absolute value, the lowest and the highest value.
 
     Example:
         >>> SignalSizes.of(torch.tensor([-3.0, 1.0, 2.0]))
-        Sizes(typical=2.0, largest=3.0, lowest=-3.0, highest=2.0)
+        SignalSizes(typical=2.0, largest=3.0, lowest=-3.0, highest=2.0)
     """
 
     typical: float
@@ -94,9 +94,9 @@ class SignalSizes(NamedTuple):
 
     @classmethod
     def of(cls, values: Float[Tensor, " N"]) -> SignalSizes:
-        """Of these values; the typical one is the median."""
+        """The sizes of these values; the typical absolute value is the median."""
         size = values.abs()
-        return cls(*(float(one) for one in (size.median(), size.amax(), values.amin(), values.amax())))
+        return cls(*(float(value) for value in (size.median(), size.amax(), values.amin(), values.amax())))
 
 
 @dataclass(frozen=True)
@@ -104,18 +104,18 @@ class Port:
     """A place in a simulation where an effect adds to a signal.
 
     Attributes:
-        channels: what the components are called that are added to.
-        unit: of what is added.
-        wanders: whether noise that wanders in time may enter here too; the noise model allows for it then.
-        pointwise: whether a change of one sample changes the residual of that sample alone.
-        kind: an effect is tried at every port of its kind; default the port's own name.
-        carries: the components of the signal that passes; default the channels.
-        parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
-        part_units, sizes: of the parts.
-        clock: when; None for the recording's samples.
-        run: number of each moment's run; None where the simulation knows of no runs.
-        memory: names of the internal states that an effect here may bring, and the state whose first value each begins
-            with; empty for 0.
+        channels: names of the changed components.
+        unit: unit of the change.
+        allows_drift: whether the noise model allows for drift at this port.
+        pointwise: whether a change of a sample changes the residual of this sample only.
+        kind: an effect is tried at every port of its kind; default the port's name.
+        carries: names of the signal's components; default the channels.
+        parts: roles of the signal's components, such as ``{"own": "speed", "position": "angle"}``.
+        part_units, sizes: units and sizes of the parts.
+        clock: moments of the signal; None for the recording's samples.
+        run: number of each moment's run; None where the simulation has no runs.
+        memory: names of the internal states that an effect here may have, with the state whose initial value each
+            takes; empty for the initial value 0.
 
     Example:
         >>> sensor = Port(("mag_x", "mag_y", "mag_z"), "µT", kind="sensor")
@@ -125,7 +125,7 @@ class Port:
 
     channels: tuple[str, ...]
     unit: str
-    wanders: bool = False
+    allows_drift: bool = False
     pointwise: bool = True
     kind: str = ""
     carries: tuple[str, ...] = ()
@@ -137,9 +137,9 @@ class Port:
     memory: Mapping[str, str] = field(default_factory=dict)
 
     def in_series(self, name: str) -> bool:
-        """Whether effects at this port, called ``name``, act in series, each on the output of the one before.
+        """Whether effects at this port, named ``name``, act in series, each on the output of the previous effect.
 
-        Effects on an input or an output are parts of one signal chain; forces on a rate add up.
+        Effects on an input or an output are in a signal chain; forces on a rate add up.
 
         Example:
             >>> Port(("u",), "V", kind="input").in_series("input u"), Port(("v",), "m/s²").in_series("rate of v")
@@ -148,15 +148,15 @@ class Port:
         return (self.kind or name) in ("input", "output", "outputs")
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
-        """Values of the samples, at the moments of this port's signal."""
+        """Values of the samples, interpolated to the moments of this port's signal."""
         return values if self.clock is None else self.clock.at(values)
 
 
 class Nearby(Protocol):
-    """What a simulation begins an answer with that is near one it has found, such as a trajectory.
+    """The start of an evaluation near a known evaluation, such as a trajectory.
 
     Attributes:
-        bare: the same without what can be computed from it again.
+        bare: the same without derived data that can be recomputed.
     """
 
     @property
@@ -164,12 +164,12 @@ class Nearby(Protocol):
 
 
 class Answer(NamedTuple):
-    """The residual of a simulation, and what one at parameters nearby can begin with.
+    """The residual of a simulation, and a start for evaluations at parameters nearby.
 
     Attributes:
-        residual: (N, m), recording less prediction; NaN where the simulation has no answer.
-        nearby: what :meth:`PreparedSimulation.answer` takes as ``near``; None where there is nothing, as inside of a
-            transform, or for a simulation in closed form.
+        residual: (N, m), recording minus prediction; NaN where the simulation has no solution.
+        nearby: the argument ``near`` of :meth:`PreparedSimulation.answer`; None inside of a transform, and for a
+            simulation in closed form.
     """
 
     residual: Float[Tensor, "N m"]
@@ -177,11 +177,11 @@ class Answer(NamedTuple):
 
 
 class ClosedForm(ABC):
-    """A prepared simulation that is a formula: it needs nothing to begin with."""
+    """A prepared simulation in closed form, which needs no start for its evaluation."""
 
     @abstractmethod
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
-        """Recording less prediction."""
+        """The residual, recording minus prediction."""
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:  # noqa: ARG002
         """The residual; see :meth:`PreparedSimulation.answer`."""
@@ -189,21 +189,21 @@ class ClosedForm(ABC):
 
 
 class PreparedSimulation(Protocol):
-    """A simulation together with the recording that answers it: N samples, m residual channels, p parameters.
+    """A simulation together with a recording: N samples, m residual channels, p parameters.
 
     Attributes:
-        name: of the simulation, as ``diagnosis.json`` gives it.
-        channels, unit: of the residual.
-        parameter_names: of the p parameters.
-        prior: what is known of the parameters beforehand; None if nothing.
-        bounds: least and greatest values of the parameters, (p,) each; None if all are free.
+        name: name of the simulation in ``diagnosis.json``.
+        channels, unit: names of the residual's channels, and their unit.
+        parameter_names: names of the p parameters.
+        prior: prior of the parameters; None for no prior.
+        bounds: lower and upper bounds of the parameters, (p,) each; None for no bounds.
         recording: the samples in use, in the order of time.
-        time: in s; the sample's number where the recording has no time.
-        ports: where effects can act.
-        independent: for each channel, whether its noise is independent of the error that the ports' signals have; where
-            it is not, an effect that follows the signal would seem to be there.
-        warnings: sentences about what the recording leaves undetermined.
-        state: constants, beside the parameters, that a :class:`Correction` needs; what JSON can hold.
+        time: (N,), in s; the number of the sample where the recording has no time.
+        ports: name to port, where effects can act.
+        independent: for each channel, whether its noise is independent of the error of the ports' signals; where it is
+            not, an effect that follows the signal would be a false alarm.
+        warnings: sentences about what the recording does not determine.
+        state: constants that a :class:`Correction` needs in addition to the parameters; JSON-serialisable.
     """
 
     @property
@@ -232,51 +232,51 @@ class PreparedSimulation(Protocol):
     def state(self) -> Mapping[str, object]: ...
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
-        """A robust guess of the parameters, from the samples in ``rows`` (all, if None).
+        """A robust start of the parameters, from the samples in ``rows``; None for all samples.
 
         Raises:
-            NoFitError: those samples do not determine them.
+            NoFitError: these samples do not determine the parameters.
         """
         ...
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
-        """Recording less prediction, with ``changes[port](signal)`` added to what passes through the ports.
+        """The residual, recording minus prediction, with ``changes[port](signal)`` added to the signals at the ports.
 
-        It depends on its arguments alone.
+        The result depends only on the arguments.
 
         Args:
             theta: the parameters.
-            changes: what effects add at each port.
-            near: of an answer to parameters and changes nearby, from which this one is found; None for none.
+            changes: the change at each port.
+            near: start of the evaluation, from an evaluation at parameters and changes nearby; None for no start.
         """
         ...
 
     def signals(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "G k"]]:
-        """What passes through each port: what an effect that depends on the signal is a function of."""
+        """The signal at each port, for effects that depend on it."""
         ...
 
 
 @runtime_checkable
 class Clocked(Protocol):
-    """A prepared simulation with clocks of its own among its parameters, where an effect can be the same thing."""
+    """A prepared simulation with clock parameters, which an effect can be equivalent to."""
 
-    def prior_beside(self, settled: Collection[str]) -> GaussianPrior:
-        """What is known of the parameters beside effects that settle a part of the clocks.
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior:
+        """The prior of the parameters, given effects that are equivalent to clock parameters.
 
         Args:
-            settled: "offset", "rate" or both; it is held, so that the effect has all of it.
+            settled: "offset", "rate" or both; these clock parameters are held at 0, so that the effect is complete.
         """
         ...
 
 
 @runtime_checkable
 class Beginning(Protocol):
-    """A prepared simulation whose last parameters are the states that its runs begin in, behind recordings' offsets.
+    """A prepared simulation whose last parameters are the initial states of its runs, after recordings' offsets.
 
     Attributes:
-        beginnings: how many.
+        beginnings: number of these parameters.
     """
 
     @property
@@ -284,11 +284,11 @@ class Beginning(Protocol):
 
 
 class Correction(Protocol):
-    """The measuring side of a simulation on a new recording: what taking effects off it needs.
+    """A fitted simulation on a new recording, for removing effects from it.
 
     Attributes:
-        time: in s.
-        ports: those at which an effect belongs to the sensor or system, and not to where it was.
+        time: (N,), in s.
+        ports: ports at which an effect belongs to the sensor or system, and not to the place.
     """
 
     @property
@@ -297,20 +297,20 @@ class Correction(Protocol):
     def ports(self) -> Mapping[str, Port]: ...
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        """The corrected columns, with ``changes`` taken off."""
+        """The corrected columns, with ``changes`` removed."""
         ...
 
 
 @runtime_checkable
 class CorrectableSimulation(Protocol):
-    """A simulation whose effects can be taken off new recordings."""
+    """A simulation whose effects can be removed from new recordings."""
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> Correction:
-        """The measuring side on a new recording.
+        """The fitted simulation on a new recording.
 
         Args:
-            state: :attr:`PreparedSimulation.state` of the one that was fitted.
-            recording: to correct.
+            state: :attr:`PreparedSimulation.state` of the fitted simulation.
+            recording: the recording to correct.
 
         Raises:
             MissingColumnError: the recording lacks a column.
@@ -319,19 +319,19 @@ class CorrectableSimulation(Protocol):
 
 
 class Simulation(Protocol):
-    """A simulation of a kind of recording: what :func:`mkc_torch.diagnose` takes.
+    """A simulation of a kind of recording, the argument of :func:`mkc_torch.diagnose`.
 
-    :class:`mkc_torch.simulation.Magnetometer` and :class:`mkc_torch.simulation.Paired` are some as they are; a user's
-    own derives from :class:`mkc_torch.simulation.Static` or :class:`mkc_torch.simulation.Dynamics`.
+    :class:`mkc_torch.simulation.Magnetometer` and :class:`mkc_torch.simulation.Paired` are ready to use; a user's own
+    simulation derives from :class:`mkc_torch.simulation.Static` or :class:`mkc_torch.simulation.Dynamics`.
 
     Attributes:
-        name: as ``diagnosis.json`` gives it.
-        columns: names of the columns that the simulation uses itself, which are no drivers of effects.
-        joins_experiments: whether one fit takes all runs of a recording together, told apart by its column
-            ``experiment``; where it does not, each run is diagnosed by itself.
+        name: name in ``diagnosis.json``.
+        columns: names of the columns that the simulation uses, which do not drive effects.
+        joins_experiments: whether all runs of a recording, separated by its column ``experiment``, are fitted jointly;
+            otherwise each run is diagnosed separately.
 
-    It may also have ``measured``, the names of the columns that it is compared with: a column that repeats one of these
-    drives no effect.
+    An optional attribute ``measured`` has the names of the columns that it is compared with: a column that repeats a
+    measured column drives no effect.
 
     Example:
         >>> from mkc_torch.simulation import Static
@@ -353,20 +353,20 @@ class Simulation(Protocol):
     def joins_experiments(self) -> bool: ...
 
     def prepare(self, recording: Recording) -> PreparedSimulation:
-        """The simulation of a recording.
+        """The simulation together with a recording.
 
         Raises:
             MissingColumnError: the recording lacks a column.
-            ValueError: it cannot be simulated; the message says why.
+            ValueError: it cannot be simulated; the message states why.
         """
         ...
 
 
 def refuse_no_recording(name: str, value: object) -> None:
-    """Refuse what is no recording, and say how to get one.
+    """Refuse a value that is not a recording, with the remedy.
 
     Raises:
-        TypeError: a file's name, columns, or something else.
+        TypeError: it is a file name, a data frame, or another object.
     """
     advice = "make one, Recording({'time': ..., ...}), or read it, Recording.read('REC.csv')"
     if isinstance(value, (str, os.PathLike)):

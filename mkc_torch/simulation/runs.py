@@ -1,4 +1,4 @@
-"""Which run of a recording each sample is of."""
+"""Run numbers of the samples of a recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["experiment_runs", "successive_runs"]
 
 
 def successive_runs(label: Shaped[Tensor, " N"], time: Float[Tensor, " N"]) -> Tensor:
-    """Number of each sample's run, (N,), ascending: one begins where the label changes, or where time goes back.
+    """Number of each sample's run, (N,), ascending; a run begins where the label changes or time goes back.
 
     Example:
         >>> successive_runs(torch.tensor([7, 7, 3, 3, 3]), torch.tensor([0.0, 1.0, 2.0, 3.0, 0.0]))
@@ -27,6 +27,6 @@ def successive_runs(label: Shaped[Tensor, " N"], time: Float[Tensor, " N"]) -> T
 
 
 def experiment_runs(recording: Recording) -> Tensor:
-    """The same by a recording's column ``experiment``, whatever the clocks do from one run to the next."""
+    """Number of each sample's run, (N,), by the column ``experiment`` of a recording and its times."""
     time = recording["time"]
     return successive_runs(recording["experiment"] if "experiment" in recording else torch.zeros_like(time), time)

@@ -25,30 +25,30 @@ if TYPE_CHECKING:
 __all__ = ["PreparedStatic", "Static", "StaticCorrection"]
 
 MOST_PARAMETERS = 200
-"""A module with more numbers than this is a fit of anything; what a simulation lacks cannot be asked of it."""
+"""Largest number of parameters of a module; a larger module can fit anything, and so lacks no effect."""
 
 
 class Static:
-    """Outputs that are a function of inputs and parameters at the same moment: derive from it, or wrap a module.
+    """Outputs as a function of inputs and parameters at the same moment: derive from it, or wrap a module.
 
-    A subclass gives names, parameters and an ``output``. A module takes the inputs side by side, (N, k), and returns
-    the outputs, (N, m), or (N,) for one; all numbers of its parameters are fitted, from where they are. The module is
-    copied, and computes in float64 and in evaluation mode.
+    A subclass defines names, parameters and ``output``. A module takes the stacked inputs, (N, k), and returns the
+    outputs, (N, m), or (N,) for a single output; all its parameters are fitted, starting from their values. The module
+    is copied, and evaluated in float64 and in evaluation mode.
 
     Args:
-        module: of the user's own; None for a subclass with ``output``.
-        inputs, outputs: names of columns, instead of the class's.
-        name: of the simulation; default the class's, or the module's.
+        module: a module; None for a subclass with ``output``.
+        inputs, outputs: names of columns; default the class attributes.
+        name: name of the simulation; default the name of the class, or of the module's class.
 
     Attributes:
-        inputs: names of the columns it is a function of.
-        outputs: names of the columns that it predicts.
-        parameters: name to value to start from, or :class:`mkc_torch.simulation.Parameter`.
-        units: of inputs and outputs.
-        joins_experiments: False: each run of a recording is diagnosed by itself.
+        inputs: names of the input columns.
+        outputs: names of the predicted columns.
+        parameters: name to start value or :class:`mkc_torch.simulation.Parameter`.
+        units: units of inputs and outputs.
+        joins_experiments: False: each run of a recording is diagnosed separately.
 
     Raises:
-        TypeError: what is no module, or text in place of names of columns.
+        TypeError: ``module`` is not a module, or names of columns are a string.
         SimulationError: a module without parameters that are real numbers, or with more than 200 of them.
 
     Example:
@@ -109,11 +109,11 @@ class Static:
         return frozenset(self.outputs)
 
     def output(self, time: Tensor, u: Any, p: Any) -> Mapping[str, Tensor]:
-        """What is measured, by the columns' names.
+        """The predicted outputs: name of the column to (N,).
 
         Args:
-            time: (N,) in s.
-            u: the inputs, each (N,), as attributes.
+            time: (N,), in s.
+            u: the inputs as attributes, each (N,).
             p: the parameters as attributes.
         """
         raise NotImplementedError(
@@ -124,15 +124,15 @@ class Static:
     def computed(
         self, time: Float[Tensor, " N"], inputs: Float[Tensor, "N k"], theta: Float[Tensor, " p"]
     ) -> Float[Tensor, "N m"]:
-        """The outputs side by side.
+        """The stacked outputs.
 
         Raises:
-            SimulationError: an output of a wrong shape, or one that is missing.
+            SimulationError: an output has a wrong shape or is missing.
         """
         if self.module is not None:
             known = dict(self.module.named_parameters())
-            parts = theta.split([one.numel() for one in known.values()])
-            values = {name: part.reshape(one.shape) for (name, one), part in zip(known.items(), parts, strict=True)}
+            parts = theta.split([tensor.numel() for tensor in known.values()])
+            values = {name: part.reshape(known[name].shape) for name, part in zip(known, parts, strict=True)}
             try:
                 found = torch.func.functional_call(self.module, values, (inputs,))
             except RuntimeError as error:
@@ -151,39 +151,39 @@ class Static:
         if isinstance(found, Tensor) and found.shape == (count,) and m == 1:
             return found.unsqueeze(-1)
         if not isinstance(found, Tensor) or found.shape != (count, m):
-            told = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+            returned = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
             raise SimulationError(
                 f"{self.name}: the module should return a tensor of shape ({count}, {m}), a column for each of "
-                f"{', '.join(self.outputs)}, but it returns {told}."
+                f"{', '.join(self.outputs)}, but it returns {returned}."
             )
         return found
 
     def _checked(self, outputs: Mapping[str, Tensor], name: str, count: int) -> Tensor:
         if not isinstance(outputs, Mapping) or name not in outputs:
-            told = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else type(outputs).__name__
+            returned = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else type(outputs).__name__
             raise SimulationError(
-                f"{self.name}.output does not return `{name}`, which is in its outputs; it returns {told}."
+                f"{self.name}.output does not return `{name}`, which is in its outputs; it returns {returned}."
             )
         value = outputs[name]
         if not isinstance(value, Tensor) or value.shape not in ((), (1,), (count,)):
-            told = str(tuple(value.shape)) if isinstance(value, Tensor) else type(value).__name__
+            actual = str(tuple(value.shape)) if isinstance(value, Tensor) else type(value).__name__
             raise SimulationError(
                 f"{self.name}.output: `{name}` should be a tensor of shape ({count},), like the inputs it is given, "
-                f"but is {told}."
+                f"but is {actual}."
             )
         return value.expand(count)
 
     def prepare(self, recording: Recording) -> PreparedStatic:
-        """The simulation of a recording, which needs no ``time``.
+        """The simulation together with a recording, which needs no ``time``.
 
         Raises:
-            TypeError: what is no recording.
+            TypeError: ``recording`` is not a recording.
             MissingColumnError: the recording lacks an input or an output.
-            SimulationError: no outputs are named or one twice, a parameter is no number, a module takes another number
-                of inputs, or ``output`` returns a wrong shape or what is not finite.
+            SimulationError: outputs are missing, a name is repeated, a parameter is not a number, a module takes
+                another number of inputs, or ``output`` returns a wrong shape or values that are not finite.
         """
         refuse_no_recording("recording", recording)
-        twice = sorted({one for names in (self.inputs, self.outputs) for one in names if names.count(one) > 1})
+        twice = sorted({name for names in (self.inputs, self.outputs) for name in names if names.count(name) > 1})
         if twice:
             raise SimulationError(f"{self.name} names the column `{twice[0]}` twice; name it once.")
         if not self.outputs:
@@ -192,12 +192,12 @@ class Static:
         return PreparedStatic(self, table if table.time is None else table.sorted_by_time())
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> StaticCorrection:
-        """The same with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        """The simulation with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
         return StaticCorrection(self, state.get("fixed", ()), recording)
 
 
 class PreparedStatic(ClosedForm):
-    """A function of inputs with the recording that answers it."""
+    """A function of inputs together with a recording."""
 
     prior: GaussianPrior | None = None
 
@@ -218,10 +218,10 @@ class PreparedStatic(ClosedForm):
         own = {units[name] for name in system.outputs}
         self.unit = own.pop() if len(own) == 1 else ""
         self.known = known_parameters(system.name, system.parameters)
-        self.known |= {one.name: Parameter(0.0, unit=units[one.output]) for one in own_offsets}
+        self.known |= {offset.name: Parameter(0.0, unit=units[offset.output]) for offset in own_offsets}
         self.parameter_names = tuple(self.known)
-        low = [one.lower for one in self.known.values()]
-        high = [one.upper for one in self.known.values()]
+        low = [parameter.lower for parameter in self.known.values()]
+        high = [parameter.upper for parameter in self.known.values()]
         self.bounds = self.time.new_tensor(low), self.time.new_tensor(high)
         self.independent = (True,) * len(self.channels)
         self._refuse_not_finite()
@@ -233,7 +233,7 @@ class PreparedStatic(ClosedForm):
         self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
-        return self.time.new_tensor([one.value for one in self.known.values()])
+        return self.time.new_tensor([parameter.value for parameter in self.known.values()])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)
@@ -253,19 +253,19 @@ class PreparedStatic(ClosedForm):
         return outputs if self._of_recording is None else outputs + self._offsets(theta[own:], self._of_recording)
 
     def _offsets(self, values: Float[Tensor, " q"], recording: Int[Tensor, " N"]) -> Float[Tensor, "N m"]:
-        """Of each output in the recording that a sample is of."""
+        """The offset of each output at each sample, (N, m), by the recording of the sample."""
         added = [torch.zeros_like(self.time) for _ in self.channels]
-        for one, value in zip(self.own_offsets, values.unbind(), strict=True):
-            column = self.channels.index(one.output)
-            added[column] = added[column] + value * (recording == one.recording).to(self.time.dtype)
+        for offset, value in zip(self.own_offsets, values.unbind(), strict=True):
+            column = self.channels.index(offset.output)
+            added[column] = added[column] + value * (recording == offset.recording).to(self.time.dtype)
         return torch.stack(added, -1)
 
     def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> PreparedStatic:
-        """The same with an offset of each output in each recording, as far as they are determined.
+        """The simulation with an offset of each output in each recording, where it is identifiable.
 
         Args:
-            recording: number of the recording that each sample is of.
-            names: of the recordings.
+            recording: number of each sample's recording.
+            names: names of the recordings.
         """
         tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
         found = determined_offsets(tangents, self.channels, recording, names)
@@ -277,25 +277,25 @@ class PreparedStatic(ClosedForm):
         if not len(bad):
             return
         row, column = bad[0].tolist()
-        told = [f"{name} = {float(self.inputs[row, k]):.4g}" for k, name in enumerate(self.system.inputs)]
-        fixed = [f"{name} = {one.value:.4g}" for name, one in list(self.known.items())[:12]]
+        inputs = [f"{name} = {float(self.inputs[row, k]):.4g}" for k, name in enumerate(self.system.inputs)]
+        parameters = [f"{name} = {known.value:.4g}" for name, known in list(self.known.items())[:12]]
         raise SimulationError(
             f"{self.name}.output: `{self.channels[column]}` is {float(outputs[row, column])} at time "
-            f"{float(self.time[row]):.4g} s with {', '.join(told) or 'no inputs'}; parameters "
-            f"{', '.join(fixed) or 'none'}. Keep it finite there, or start from other parameters."
+            f"{float(self.time[row]):.4g} s with {', '.join(inputs) or 'no inputs'}; parameters "
+            f"{', '.join(parameters) or 'none'}. Keep it finite there, or start from other parameters."
         )
 
 
 class StaticCorrection:
-    """A function of inputs with its parameters and effects on a new recording, which needs no outputs.
+    """A function of inputs with known parameters and effects on a new recording, which needs no outputs.
 
     Args:
         system: the function.
-        fixed: the outputs whose zero none of its parameters moves.
-        recording: with the inputs.
+        fixed: outputs that no parameter of the function shifts.
+        recording: a recording of the inputs.
 
     Raises:
-        MissingColumnError: an input is not there.
+        MissingColumnError: an input is missing.
     """
 
     def __init__(self, system: Static, fixed: Sequence[str], recording: Recording) -> None:
@@ -307,7 +307,7 @@ class StaticCorrection:
         self.ports = _ports(system, units, "", self.inputs, nothing, fixed)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        """The outputs as simulated."""
+        """The simulated outputs with the effects."""
         inputs = _changed_inputs(self.system, self.inputs, changes)
         outputs = changed_outputs(self.system.computed(self.time, inputs, theta), self.system.outputs, changes)
         return {"time": self.time} | dict(zip(self.system.outputs, outputs.unbind(-1), strict=True))
@@ -349,18 +349,18 @@ def _ports(
 
 
 def _moves(tangents: Float[Tensor, "N m p"], channel: int) -> bool:
-    """Whether the parameters together can move one output by a constant, and nothing else."""
+    """Whether a change of the parameters can shift one output by a constant and leave the others unchanged."""
     constant = torch.zeros_like(tangents[..., :1])
     constant[:, channel] = 1.0
     columns, target = tangents.flatten(0, 1), constant.flatten(0, 1)
     columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300)
     solution = torch.linalg.lstsq(columns, target, driver="gelsd").solution
-    left = torch.linalg.vector_norm(target - columns @ solution)
-    return bool(left < 1e-6 * torch.linalg.vector_norm(target))
+    remainder = torch.linalg.vector_norm(target - columns @ solution)
+    return bool(remainder < 1e-6 * torch.linalg.vector_norm(target))
 
 
 def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
-    """Every number of a module's parameters by its name and place."""
+    """Each number of a module's parameters: name with index to value."""
     numbers: dict[str, float] = {}
     for key, values in module.named_parameters():
         if not values.is_floating_point():
@@ -368,8 +368,8 @@ def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
         flat = values.detach().flatten().tolist()
         for place, value in enumerate(flat):
             index = torch.unravel_index(torch.tensor(place), values.shape) if values.dim() else ()
-            told = ",".join(str(int(i)) for i in index)
-            numbers[f"{key}[{told}]" if told else key] = value
+            label = ",".join(str(int(i)) for i in index)
+            numbers[f"{key}[{label}]" if label else key] = value
     if not numbers:
         raise SimulationError(f"{name}: the module has no parameters; there is nothing to fit with what is found.")
     if len(numbers) > MOST_PARAMETERS:

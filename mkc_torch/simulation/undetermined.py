@@ -1,4 +1,4 @@
-"""Parameters that a recording does not determine."""
+"""Warnings about parameters that a recording does not determine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 __all__ = ["undetermined"]
 
 _TINY = 1e-6
+"""Relative singular value up to which a direction is undetermined."""
+
 _NAMED = 0.1
+"""Share of a direction from which a parameter is named."""
 
 
 def undetermined(
@@ -23,20 +26,19 @@ def undetermined(
     names: Sequence[str],
     of_interest: int | None = None,
 ) -> tuple[str, ...]:
-    """A sentence for each direction of the parameters along which the residual does not move.
+    """A sentence for each direction of the parameters along which the residual is constant, near ``theta``.
 
-    Each parameter is measured by its own size, and by one where it is zero, so that a direction is a relative one. What
-    is told is true near ``theta`` alone.
+    Each parameter is scaled by its absolute value, or 1 where it is 0, so that directions are relative.
 
     Args:
-        tangents: of the R residuals with the p parameters.
+        tangents: derivatives of the R residuals by the p parameters.
         theta: the parameters.
-        names: of the parameters.
-        of_interest: how many of the first parameters are asked for: a direction of the others alone is not told. None
-            for all.
+        names: names of the parameters.
+        of_interest: number of leading parameters of interest: a direction that involves only the others is omitted.
+            None for all.
 
     Example:
-        A mass and a spring of which only the quotient shows:
+        A mass and a spring of which only the quotient is identifiable:
 
         >>> tangents = torch.ones(5, 2) * torch.tensor([1.0, -2.0])
         >>> undetermined(tangents, torch.tensor([2.0, 1.0]), ("spring", "mass"))
@@ -46,13 +48,13 @@ def undetermined(
     scaled = tangents * size
     if not bool(scaled.isfinite().all()) or scaled.shape[1] == 0:
         return ()
-    # of many rows, what spans them has the same lengths and directions
+    # R has the same singular values and directions, with fewer rows
     _, length, directions = torch.linalg.svd(torch.linalg.qr(scaled, mode="r").R, full_matrices=True)
     length = torch.cat([length, length.new_zeros(len(directions) - len(length))])
     return tuple(
         _sentence(direction, names)
-        for one, direction in zip(length, directions, strict=True)
-        if float(one) <= _TINY * float(length.max()) and bool((direction[:of_interest].abs() > _NAMED).any())
+        for size, direction in zip(length, directions, strict=True)
+        if float(size) <= _TINY * float(length.max()) and bool((direction[:of_interest].abs() > _NAMED).any())
     )
 
 
@@ -61,9 +63,9 @@ def _sentence(direction: Float[Tensor, " p"], names: Sequence[str]) -> str:
     moving = [(name, float(share)) for name, share in zip(names, shares, strict=True) if abs(share) > _NAMED]
     if len(moving) == 1:
         return f"The recording does not determine `{moving[0][0]}`: whatever it is, the residual is the same."
-    told = " and ".join(f"`{name}`" for name, _ in moving)
+    parameters = " and ".join(f"`{name}`" for name, _ in moving)
     sum_ = " ".join(f"{'+' if share > 0 else '−'} {abs(share):.2g} {name}" for name, share in moving).removeprefix("+ ")
     return (
-        f"The recording does not determine {told}, but only what they are together: they can move along one direction "
-        f"and the residual stays (direction {sum_}, relative)."
+        f"The recording does not determine {parameters}, but only what they are together: they can move along one "
+        f"direction and the residual stays (direction {sum_}, relative)."
     )

@@ -33,7 +33,7 @@ from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._float32_pass import float32_pass
 from mkc_torch.linear.streaming._reservoir import Reservoir
 from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, range_pass, report_pass, slopes_pass
-from mkc_torch.linear.streaming._survey import surveyed
+from mkc_torch.linear.streaming._survey import survey_rows
 
 COLUMNS = 8
 WRITTEN = 1_000_000
@@ -77,7 +77,7 @@ def passes(batches: MemmapBatches) -> dict[str, Callable[[], object]]:
         "gradient": lambda: slopes_pass(batches, shape, POINT, curvature=False),
         "range of residuals": lambda: range_pass(batches, shape, POINT),
         "gradient and Hessian": lambda: slopes_pass(batches, shape, POINT, curvature=True),
-        "the first, with a sample": lambda: surveyed(batches, Reservoir(50_000, 0)),
+        "the first, with a sample": lambda: survey_rows(batches, Reservoir(50_000, 0)),
         "the last, with the covariance": lambda: report_pass(batches, shape, POINT),
     }
 

@@ -87,7 +87,7 @@ def test_an_older_one_in_other_units_is_converted(pair, points):
 
 def test_units_without_a_size_are_refused_with_what_to_do(pair, points):
     new, old = pair
-    with pytest.raises(ValueError, match=r"counts .* with the same `--unit`"):
+    with pytest.raises(ValueError, match=r"counts .* with the same unit options"):
         differences(new, dataclasses.replace(old, unit="counts"), points)
     with pytest.raises(ValueError, match="--field-strength"):
         differences(new, dataclasses.replace(old, field_unit="counts"), points)

@@ -10,7 +10,7 @@ import mkc_torch.challenge
 
 FOLDER = Path(mkc_torch.challenge.__file__).parent
 FORBIDDEN = ("effects", "diagnosis", "simulation", "nonlinear")
-GIVEN_AWAY = {FOLDER / "dynamics" / "naive.py", FOLDER / "dynamics" / "worlds" / "wrong_simulations.py"}
+GIVEN_AWAY = {FOLDER / "dynamics" / "nominal_models.py", FOLDER / "dynamics" / "scenarios" / "wrong_simulations.py"}
 """What a user would have written: material for the diagnosis, of which the generator knows the place alone."""
 
 ALLOWED = {"mkc_torch", "torch", "numpy", "jaxtyping", "jinja2", "markupsafe", "matplotlib", "__future__"}

@@ -52,8 +52,8 @@ def test_false_alarms_are_claims_that_physics_is_missing():
     assert result.confusion == {"nothing": {"nothing": 2, "unknown": 1, "offset_drift": 1, "failed": 1, "unfit": 1}}
 
 
-@pytest.mark.parametrize(("grade", "claimed"), [("left out", 1), ("real but small", 1), (None, 1), ("not confirmed", 0),
-                                                ("nearest in the catalogue", 0)])  # fmt: skip
+@pytest.mark.parametrize(("grade", "claimed"), [("left_out", 1), ("small", 1), (None, 1), ("unconfirmed", 0),
+                                                ("nearest", 0)])  # fmt: skip
 def test_a_grade_says_whether_a_finding_is_a_claim(grade, claimed):
     told = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
     result = score([key("a"), key("b", "empty")], {"a": told, "b": told})

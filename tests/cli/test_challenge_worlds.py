@@ -1,4 +1,4 @@
-"""``mkc challenge --worlds``."""
+"""``mkc challenge --scenarios``."""
 
 import json
 
@@ -10,7 +10,7 @@ pytest.importorskip("jsonschema")
 pytest.importorskip("jinja2")
 
 from mkc_torch.cli import challenge_jobs
-from mkc_torch.cli.challenge_jobs import diagnose_in_world
+from mkc_torch.cli.challenge_jobs import diagnose_in_scenario
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER
 from tests.cli.test_diagnose import mkc, refused
 
@@ -22,14 +22,25 @@ def adequate(paths, folder):
         (folder / path.stem / "diagnosis.json").write_text(json.dumps(told))
 
 
-def test_worlds_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch):
-    monkeypatch.setattr(challenge_jobs, "diagnose_in_world", adequate)
-    folder = tmp_path / "worlds"
-    command = ("challenge", "--worlds", "--family", "dynamics", "--per-world", 3, "--hidden-per-world", 1, "--seed", 4)
+def test_scenarios_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch):
+    monkeypatch.setattr(challenge_jobs, "diagnose_in_scenario", adequate)
+    folder = tmp_path / "scenarios"
+    command = (
+        "challenge",
+        "--scenarios",
+        "--family",
+        "dynamics",
+        "--per-scenario",
+        3,
+        "--hidden-per-scenario",
+        1,
+        "--seed",
+        4,
+    )
     result = mkc(*command, "--only", "gusts", "--only", "useless", "--workers", 1, "--output", folder)
     assert result.exit_code == 0, result.output
     flat = " ".join(result.stdout.split())
-    assert "Blind proof in worlds: 7 recordings" in flat
+    assert "Blind proof in scenarios: 7 recordings" in flat
     assert "gusts: pushes of the rate of one state in some stretches" in flat
     assert "said of 3 unfit 0, adequate 3, explained 0, unexplained 0, failed 0" in flat
     assert "false alarms 0.0 % (0 of 3; 0.0-70.8 %)" in flat
@@ -40,30 +51,30 @@ def test_worlds_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch)
     assert "wrong sign adequate 1" in flat
     assert str(folder / "challenge.html") in result.stdout
     record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
-    assert [world["name"] for world in record["worlds"]] == ["gusts", "useless"]
+    assert [scenario["name"] for scenario in record["scenarios"]] == ["gusts", "useless"]
     assert record["settings"]["seed"] == 4
     refused(mkc(*command, "--output", folder), "not empty", "--force")
 
 
 def test_a_third_as_many_have_something_hidden_by_default(tmp_path, monkeypatch):
-    monkeypatch.setattr(challenge_jobs, "diagnose_in_world", adequate)
-    command = ("challenge", "--worlds", "--per-world", 3, "--only", "white", "--duration", 12, "--workers", 1)
+    monkeypatch.setattr(challenge_jobs, "diagnose_in_scenario", adequate)
+    command = ("challenge", "--scenarios", "--per-scenario", 3, "--only", "white", "--duration", 12, "--workers", 1)
     result = mkc(*command, "--output", tmp_path / "a")
     assert result.exit_code == 0, result.output
     record = json.loads((tmp_path / "a" / "score.json").read_text(encoding="utf-8"))
-    assert (record["worlds"][0]["empty"], record["worlds"][0]["hidden"]) == (3, 1)
+    assert (record["scenarios"][0]["empty"], record["scenarios"][0]["hidden"]) == (3, 1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--worlds", "--cases", 1), ("--cases", "--per-world")),
-        (("--worlds", "--empty", 1), ("--empty", "--per-world")),
-        (("--per-world", 2), ("--per-world", "add --worlds")),
-        (("--only", "white"), ("--only", "add --worlds")),
-        (("--worlds", "--only", "held"), ("white, coloured, wander", "'held'")),
-        (("--worlds", "--per-world", 0), ("both 0",)),
-        (("--worlds", "--family", "dynamics", "--duration", 20), ("each system has a length of its own",)),
+        (("--scenarios", "--cases", 1), ("--cases", "--per-scenario")),
+        (("--scenarios", "--empty", 1), ("--empty", "--per-scenario")),
+        (("--per-scenario", 2), ("--per-scenario", "add --scenarios")),
+        (("--only", "white"), ("--only", "add --scenarios")),
+        (("--scenarios", "--only", "held"), ("white, coloured, wander", "'held'")),
+        (("--scenarios", "--per-scenario", 0), ("both 0",)),
+        (("--scenarios", "--family", "dynamics", "--duration", 20), ("each system has a length of its own",)),
     ],
 )
 def test_what_does_not_belong_together_is_refused(tmp_path, arguments, words):
@@ -80,7 +91,7 @@ def test_each_recording_is_compared_with_the_simulation_that_lies_ready_for_it(t
     for name in ("cart_pole_00003", "case_00004"):
         (tmp_path / "simulations" / f"{name}.py").touch()
     paths = [tmp_path / "recordings" / f"{name}.csv" for name in ("cart_pole_00003", "case_00004", "case_00005")]
-    diagnose_in_world(paths, tmp_path / "diagnoses")
+    diagnose_in_scenario(paths, tmp_path / "diagnoses")
     assert asked == [
         ("cart_pole_00003", f"{tmp_path / 'simulations' / 'cart_pole_00003.py'}:CartPole"),
         ("case_00004", f"{tmp_path / 'simulations' / 'case_00004.py'}:sensor"),
@@ -90,7 +101,18 @@ def test_each_recording_is_compared_with_the_simulation_that_lies_ready_for_it(t
 
 @pytest.mark.e2e
 def test_a_real_diagnosis_is_scored(tmp_path):
-    command = ("challenge", "--worlds", "--per-world", 1, "--only", "white", "--hidden-per-world", 0, "--duration", 15)
+    command = (
+        "challenge",
+        "--scenarios",
+        "--per-scenario",
+        1,
+        "--only",
+        "white",
+        "--hidden-per-scenario",
+        0,
+        "--duration",
+        15,
+    )
     result = mkc(*command, "--workers", 1, "--seed", 2, "--output", tmp_path / "a")
     assert result.exit_code == 0, result.output
     assert "failed 0" in result.stdout

@@ -201,7 +201,7 @@ def test_values_beyond_all_measure_are_refused(tmp_path, factor):
 @pytest.mark.parametrize("factor", [1e-9, 1e9])
 def test_any_usual_unit_will_do(tmp_path, factor):
     path = table(tmp_path / "scaled.csv", noisy_ellipsoid() * factor)
-    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", "other")
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit-label", "other")
     assert result.exit_code == 0, result.output
     text = (tmp_path / "out" / "scaled" / "calibration.json").read_text(encoding="utf-8")
     assert Calibration.from_json(text).center == pytest.approx((5 * factor, -9 * factor, 20 * factor), rel=0.05)
@@ -235,7 +235,7 @@ def test_usage_errors_exit_with_two(good, tmp_path):
     refused(mkc("calibrate", good), code=2)
     refused(mkc("calibrate", good, *out, "--columns", "mag_x"), "mag_x=mx", code=2)
     refused(mkc("calibrate", good, *out, "--columns", "mag_x=a,mag_x=b"), "twice", code=2)
-    refused(mkc("calibrate", good, *out, "--unit", " "), "--unit", code=2)
+    refused(mkc("calibrate", good, *out, "--unit-label", " "), "--unit-label", code=2)
     for value in ("0", "-3", "nan", "inf"):
         refused(mkc("calibrate", good, *out, "--field-strength", value), "positive", code=2)
     assert not (tmp_path / "out").exists()
@@ -246,9 +246,16 @@ def test_columns_and_units_of_the_users_own(tmp_path):
     points = 20.0 * noisy_ellipsoid(300)
     path = tmp_path / "own.csv"
     write_table(path, dict(zip(("mx", "my", "mz"), points.unbind(-1), strict=True)))
-    refused(mkc("calibrate", path, "--output", tmp_path / "out"), "milligauss", "`--unit mag=mG`", "`--unit counts`")
+    refused(
+        mkc("calibrate", path, "--output", tmp_path / "out"),
+        "milligauss",
+        "`--convert mag=mG`",
+        "`--unit-label counts`",
+    )
     names = ("--columns", "mag_x=mx, mag_y=my,mag_z=mz")
-    result = mkc("calibrate", path, "--output", tmp_path / "out", *names, "--unit", "counts", "--field-strength", 48)
+    result = mkc(
+        "calibrate", path, "--output", tmp_path / "out", *names, "--unit-label", "counts", "--field-strength", 48
+    )
     assert result.exit_code == 0, result.output
     assert "counts" in result.stdout
     content = json.loads((tmp_path / "out" / "own" / "calibration.json").read_text(encoding="utf-8"))
@@ -365,7 +372,7 @@ def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
     result = mkc("apply", calibrated[0] / "calibration.json", odd, "--output", tmp_path / "o.csv")
     assert result.stderr == f"mkc: {odd}: there is no such file.\n"
     path = table(odd, noisy_ellipsoid(300))
-    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", ":X:[b]")
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit-label", ":X:[b]")
     assert result.exit_code == 0
     assert "no:X:[b]file\n" in result.stdout
     assert "± SE, :X:[b] " in result.stdout
@@ -502,7 +509,7 @@ def test_a_full_disk_behind_the_terminal_is_told_in_a_line(good, tmp_path):
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr == "mkc: what it says could not be written: No space left on device.\n"
+    assert done.stderr == "mkc: the output could not be written: No space left on device.\n"
 
 
 def test_place_date_and_sensor_are_checked_in_one_sentence(good, tmp_path):
@@ -512,4 +519,4 @@ def test_place_date_and_sensor_are_checked_in_one_sentence(good, tmp_path):
     refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1.1.26"), "YYYY-MM-DD", code=2)
     refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1999-01-01"), "2015-01-01", code=2)
     refused(mkc("calibrate", good, *out, "--sensor", "sonar"), "sonar")
-    refused(mkc("calibrate", good, *out, "--sensor", "accel"), "no column `accel_x`")
+    refused(mkc("calibrate", good, *out, "--quantity", "accel"), "no column `accel_x`")

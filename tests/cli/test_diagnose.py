@@ -229,8 +229,8 @@ def test_columns_that_can_drive_nothing(tmp_path):
 def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option):
     scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
     path = quiet(tmp_path / "a.csv", **scaled)
-    refused(diagnosed(path, "--output", tmp_path / "out"), unit, f"`--unit mag={option}`")
-    assert f"converted from {option}" in warnings_of(path, tmp_path / "own", "--unit", f"mag={option}")
+    refused(diagnosed(path, "--output", tmp_path / "out"), unit, f"`--convert mag={option}`")
+    assert f"converted from {option}" in warnings_of(path, tmp_path / "own", "--convert", f"mag={option}")
     assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3, rel=0.2)
 
 
@@ -238,7 +238,7 @@ def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option)
 def test_raw_counts_are_told_of_and_keep_their_name(tmp_path):
     path = quiet(tmp_path / "a.csv", **{name: 100.0 * sensor(QUIET)[name] for name in AXES})
     assert "may be raw counts" in warnings_of(path, tmp_path / "out")
-    assert warnings_of(path, tmp_path / "own", "--unit", "counts") == ""
+    assert warnings_of(path, tmp_path / "own", "--unit-label", "counts") == ""
     assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(30.0, rel=0.2)
 
 
@@ -353,7 +353,7 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--noise", "norm=inf"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), "given twice"),
         ((path, *out, *known, "--input-hold", "torque=stepped"), "known: held, linear, smooth"),
-        ((path, *out, *known, "--unit", " "), "--unit is empty"),
+        ((path, *out, *known, "--unit-label", " "), "--unit-label is empty"),
         ((path, *out, *known, "--run-column", ""), "--run-column is empty"),
         ((path, *out, *known, "--columns", "experiment=a", "--run-column", "b"), "different columns"),
         ((path, *out, *known, "--columns", "mag_x"), "mag_x=mx"),
@@ -370,7 +370,7 @@ def test_a_low_level_gets_as_many_surrogates_as_it_needs(tmp_path, monkeypatch):
     for level, surrogates in (("0.05", 99), ("0.001", 999)):
         result = mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--level", level)
         assert (asked[-1]["level"], asked[-1]["surrogates"]) == (float(level), surrogates)
-    refused(result, "an error of the program's own (ZeroDivisionError in test_diagnose.py", "report it")
+    refused(result, "internal error (ZeroDivisionError in test_diagnose.py", "report it")
     assert not (tmp_path / "a").exists()
 
 

@@ -13,9 +13,9 @@ from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region, 
 from tests.diagnosis.factory import (
     graded,
     make_diagnosis,
+    make_environment,
     make_follows,
     make_unfit,
-    make_world,
     nearest,
     with_evidence,
 )
@@ -154,7 +154,7 @@ def answers(diagnosis):
 
 
 def test_the_four_answers_stand_first():
-    quiet = make_diagnosis(0, simulation="Pendulum", world=make_world(pushes=(), forcing=()))
+    quiet = make_diagnosis(0, simulation="Pendulum", environment=make_environment(process_noise=(), disturbance=()))
     assert answers(quiet).startswith(
         "flight_07 against Pendulum Nothing is missing that this recording could show. "
         "follows angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation "
@@ -163,7 +163,9 @@ def test_the_four_answers_stand_first():
 
 
 def test_what_pushes_is_located_before_any_finding():
-    pushed = make_diagnosis(0, simulation="Pendulum", verdict="unexplained", p_value=0.4, world=make_world())
+    pushed = make_diagnosis(
+        0, simulation="Pendulum", verdict="unexplained", p_value=0.4, environment=make_environment()
+    )
     told = answers(pushed)
     assert "Pendulum Something unrecorded pushes the rate of `rate`, and no physics in the catalogue" in told
     assert "noise Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², for about 0.7 s" in told
@@ -184,7 +186,7 @@ def test_a_simulation_that_does_not_follow_names_nothing():
 
 def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
     made = make_diagnosis(1, verdict="unexplained")
-    for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "not confirmed"), "not conf")):
+    for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "unconfirmed"), "not conf")):
         text = flat(shown(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
         assert f"named nothing surely; hard-iron step: {grade}" in text
         assert "unexplained structure without a name" in text
@@ -194,5 +196,5 @@ def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
 
 def test_outputs_are_told_each_in_its_own_unit():
     followed = (make_follows(), make_follows("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"))
-    text = flat(shown(make_diagnosis(0, world=make_world(follows=followed)), width=200))
+    text = flat(shown(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
     assert "rate follows to 0.0300 rad/s; noise floor 0.0200 rad/s (the steps of its numbers)" in text

@@ -107,9 +107,9 @@ def test_without_a_name_the_sensor_is_called_as_the_recording(good, tmp_path):
 @pytest.mark.usefixtures("no_pictures")
 def test_raw_counts_are_calibrated_and_not_exported(good, tmp_path):
     """The calibration stands; the exports that need a unit are refused with what to do."""
-    asked = ("--unit", "counts", "--export", "px4", "--export", "json")
+    asked = ("--unit-label", "counts", "--export", "px4", "--export", "json")
     result = mkc("calibrate", good, "--output", tmp_path, *asked)
-    refused(result, str(good), "in counts", "px4 needs gauss", "--unit mag=gauss")
+    refused(result, str(good), "in counts", "px4 needs gauss", "--convert mag=gauss")
     assert {path.name for path in (tmp_path / "good").iterdir()} == {
         "calibration.json",
         "report.html",
@@ -173,8 +173,8 @@ def test_an_old_one_that_is_none_ends_before_any_work(good, model, tmp_path):
 @pytest.mark.usefixtures("no_pictures")
 def test_an_old_one_in_units_without_a_size_is_told_and_the_new_one_written(done, good, tmp_path):
     old = done[0] / "calibration.json"
-    result = mkc("calibrate", good, "--output", tmp_path, "--unit", "counts", "--compare-with", old)
-    refused(result, "cannot be set beside one another", "--unit")
+    result = mkc("calibrate", good, "--output", tmp_path, "--unit-label", "counts", "--compare-with", old)
+    refused(result, "counts", "same unit options")
     assert (tmp_path / "good" / "calibration.json").exists()
 
 
@@ -282,4 +282,4 @@ def test_a_full_disk_behind_the_terminal_is_told_in_a_line(done, good, tmp_path,
             [sys.executable, "-m", "mkc_torch.cli", *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert ended.returncode == 1
-    assert ended.stderr == "mkc: what it says could not be written: No space left on device.\n"
+    assert ended.stderr == "mkc: the output could not be written: No space left on device.\n"

@@ -140,7 +140,7 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     assert not output.exists()
     result = mkc("apply", model, new, "--output", output, "--simulation", source)
     assert result.exit_code == 0, result.output
-    assert "300 rows of level simulated with what was found" in result.stdout
+    assert "300 rows of level simulated with the findings" in result.stdout
     corrected = Recording.read(output)
     # its own simulated level takes the place of the measured one
     assert corrected.names == Recording.read(new).names
@@ -218,7 +218,7 @@ def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     named = "mag_x=axis_x,mag_y=axis_y,mag_z=axis_z"
     result = mkc("diagnose", sensor, "--output", output, "--columns", named, "--surrogates", 19)
     assert result.exit_code == 0, result.output
-    assert "the recording is of a magnetometer, so it is `--simulation magnetometer`" in flat(result.stderr)
+    assert "the recording has a magnetometer, so `--simulation magnetometer` is used" in flat(result.stderr)
     content = json.loads((output / "sensor" / "diagnosis.json").read_text(encoding="utf-8"))
     assert content["simulation"] == "magnetometer"
 
@@ -246,9 +246,9 @@ def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_p
         "diagnose", other, "--simulation", source, "--output", output, "--surrogates", 19, "--columns", "voltage=adc"
     )
     assert result.exit_code == 0, result.output
-    result = mkc("diagnose", table, "--simulation", source, "--output", output, "--unit", "V")
+    result = mkc("diagnose", table, "--simulation", source, "--output", output, "--unit-label", "V")
     assert result.exit_code == 2
-    assert "--unit is that of a magnetometer's columns" in flat(result.stderr.replace("│", " "))
+    assert "apply to a magnetometer" in flat(result.stderr.replace("│", " "))
 
 
 def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
@@ -366,7 +366,7 @@ def test_a_declared_input_that_is_not_used_is_no_crash(tmp_path):
     command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)
     result = mkc("diagnose", decay_table(tmp_path / "run.csv"), *command)
     assert result.exit_code == 0, result.output
-    assert "error of the program" not in flat(result.stderr)
+    assert "internal error" not in flat(result.stderr)
 
 
 def test_an_output_that_is_zero_throughout_is_refused_with_words(tmp_path):
@@ -375,4 +375,4 @@ def test_an_output_that_is_zero_throughout_is_refused_with_words(tmp_path):
     result = mkc("diagnose", decay_table(tmp_path / "run.csv", zero=True), *command)
     assert result.exit_code == 1
     assert "`level`" in flat(result.stderr)
-    assert "error of the program" not in flat(result.stderr)
+    assert "internal error" not in flat(result.stderr)

@@ -99,7 +99,7 @@ def test_apply_converts_as_calibrate_did(folder, tmp_path):
     model = folder / "out" / "one" / "calibration.json"
     assert calibration(model.parent).unit == "µT"
     named = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv")
-    asked = ("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv", "--unit", "mag=gauss,time=ms")
+    asked = ("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv", "--convert", "mag=gauss,time=ms")
     for command in (named, asked):
         result = mkc(*command)
         assert result.exit_code == 0, result.output
@@ -111,7 +111,7 @@ def test_apply_converts_as_calibrate_did(folder, tmp_path):
 
 def test_apply_says_that_units_differ(folder, tmp_path):
     model = folder / "out" / "one" / "calibration.json"
-    command = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv", "--unit", "counts")
+    command = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv", "--unit-label", "counts")
     refused(mkc(*command), "is in counts, but this was made of measurements in µT")
     result = mkc("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv")
     assert "is this one in another unit" in flat(result.stdout)
@@ -125,9 +125,9 @@ def test_units_are_written_in_one_option_or_in_several(texts):
 @pytest.mark.e2e
 def test_units_are_asked_for_and_then_converted(folder, tmp_path):
     path = folder / "gauss.csv"
-    refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--unit mag=gauss`")
+    refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--convert mag=gauss`")
     assert not (tmp_path / "no" / "gauss").exists()
-    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", "mag=gauss", "time=ms")
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--convert", "mag=gauss", "time=ms")
     assert result.exit_code == 0, result.output
     found, expected = calibration(tmp_path / "out" / "gauss"), calibration(folder / "out" / "one")
     assert found.center == pytest.approx(expected.center, abs=1e-8)
@@ -137,8 +137,13 @@ def test_units_are_asked_for_and_then_converted(folder, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--unit", "mag="), "--unit is empty"),
-        (("--unit", "mag=nT,mag=uT"), "the unit of mag twice"),
+        (("--convert", "mag="), '"mag=" is not NAME=UNIT'),
+        (("--convert", "counts"), "--unit-label"),
+        (("--convert", "mag=counts"), "known units: µT, nT"),
+        (("--convert", "mag=nT,mag=uT"), "the unit of mag twice"),
+        (("--unit-label", "gauss"), "give --convert mag=gauss"),
+        (("--unit-label", "counts", "--convert", "mag=nT"), "exclude each other"),
+        (("--sensor", "mag0", "--quantity", "accel"), "leave it out with --quantity accel"),
     ],
 )
 def test_units_that_cannot_be_understood(folder, tmp_path, arguments, words):
@@ -148,9 +153,9 @@ def test_units_that_cannot_be_understood(folder, tmp_path, arguments, words):
 def test_a_simulation_of_ones_own_has_its_own_units():
     from typer import BadParameter
 
-    assert _units(["time=us"], "pendulum.py:Pendulum") == {"time": "us"}
-    with pytest.raises(BadParameter, match="--unit is that of a magnetometer's columns"):
-        _units(["counts"], "pendulum.py:Pendulum")
+    assert _units(["time=us"], None, "pendulum.py:Pendulum") == {"time": "us"}
+    with pytest.raises(BadParameter, match="apply to a magnetometer"):
+        _units([], "counts", "pendulum.py:Pendulum")
     with pytest.raises(BadParameter, match="--sensor names a magnetometer"):
         _sensor("mag0", "pendulum.py:Pendulum")
 
@@ -179,7 +184,7 @@ def test_the_command_that_inspect_gives_does_what_it_says(folder, tmp_path, monk
     for name in ("two", "gauss"):
         (data,) = json.loads(mkc("inspect", folder / f"{name}.csv", "--json").stdout)
         (command,) = data["commands"]
-        assert ("--unit mag=gauss" in command) == (name == "gauss")
+        assert ("--convert mag=gauss" in command) == (name == "gauss")
         result = mkc(*shlex.split(command)[1:])
         assert result.exit_code == 0, result.output
         assert [sensor["name"] for sensor in data["sensors"]] == (["mag0", "mag1"] if name == "two" else [""])

@@ -25,7 +25,7 @@ def test_many_normalisers_in_single_precision_are_those_of_double_precision(shor
     length = torch.exp(uniform(math.log(shortest), math.log(longest), len(kappa), seed=1)).float()
     found, expected = [], []
     for results, dtype in ((found, torch.float32), (expected, torch.float64)):
-        k, reach = (one.to(dtype).requires_grad_() for one in (kappa, length))
+        k, reach = (entry.to(dtype).requires_grad_() for entry in (kappa, length))
         value = log_partition(k, reach)
         by_kappa, by_length = torch.autograd.grad(value.sum(), (k, reach))
         results += [value.detach().double(), by_kappa.double(), (by_length * length).double()]

@@ -13,7 +13,7 @@ from mkc_torch.density.normalizer import _log_partition_and_slopes, log_partitio
 
 
 def of_few(kappa, length):
-    return log_partition_and_slopes(kappa, length, *(one.numpy() for one in head_rule_constants()), HEAD_TOLERANCE)
+    return log_partition_and_slopes(kappa, length, *(value.numpy() for value in head_rule_constants()), HEAD_TOLERANCE)
 
 
 @given(
@@ -21,9 +21,9 @@ def of_few(kappa, length):
     length=st.floats(1e-3, 1e7),
 )
 def test_it_is_that_of_tensors(kappa, length):
-    expected = _log_partition_and_slopes(*(torch.tensor(one, dtype=torch.float64) for one in (kappa, length)), energy)
-    for one, other in zip(of_few(np.asarray(kappa), np.asarray(length)), expected, strict=True):
-        assert float(one) == pytest.approx(float(other), rel=1e-10, abs=1e-12)
+    expected = _log_partition_and_slopes(*(torch.tensor(value, dtype=torch.float64) for value in (kappa, length)), energy)
+    for value, other in zip(of_few(np.asarray(kappa), np.asarray(length)), expected, strict=True):
+        assert float(value) == pytest.approx(float(other), rel=1e-10, abs=1e-12)
 
 
 def test_both_ways_give_the_same_gradients():
@@ -32,13 +32,13 @@ def test_both_ways_give_the_same_gradients():
 
     def gradients(repeats):
         """Of the first six channels, beside as many copies of them."""
-        inputs = [one.repeat(repeats).requires_grad_() for one in (kappa, length)]
-        assert few(*(one.detach() for one in inputs)) == (repeats == 1)
+        inputs = [entry.repeat(repeats).requires_grad_() for entry in (kappa, length)]
+        assert few(*(entry.detach() for entry in inputs)) == (repeats == 1)
         value = log_partition(*inputs)
         return [value.detach()[:6], *(g[:6] for g in torch.autograd.grad(value.sum(), inputs))]
 
-    for one, other in zip(gradients(1), gradients(20), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-13)
+    for entry, other in zip(gradients(1), gradients(20), strict=True):
+        torch.testing.assert_close(entry, other, rtol=1e-11, atol=1e-13)
 
 
 def test_single_precision_keeps_its_dtype():
@@ -50,7 +50,7 @@ def test_single_precision_keeps_its_dtype():
 
 def test_tensors_of_a_transform_are_not_few():
     seen = []
-    torch.vmap(lambda one: seen.append(few(one)) or one)(torch.ones(3, 2))
+    torch.vmap(lambda value: seen.append(few(value)) or value)(torch.ones(3, 2))
     assert seen == [False]
     assert few(torch.ones(2))
     assert not few(torch.ones(1000))

@@ -35,7 +35,7 @@ def found(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -
         value.backward(torch.full_like(value, 1700.0 if input.dtype == torch.float16 else 1.7))
     assert leaf.grad is not None
     grads = [p.grad for p in loss.parameters() if p.grad is not None]
-    return [one.detach().cpu().double() for one in (value, leaf.grad, *grads)]
+    return [grad.detach().cpu().double() for grad in (value, leaf.grad, *grads)]
 
 
 Case = tuple[str, tuple[int, ...], int, str, bool, torch.dtype]
@@ -67,12 +67,12 @@ def compared(device: str, case: Case) -> list[tuple[str, float]]:
     on_device = found(loss, x.to(device), y.to(device), None if weight is None else weight.to(device))
     expected = found(reference, x.double(), y.double(), None if weight is None else weight.double())
     rows = []
-    for what, one, other in zip(("value", "input", "sigma", "d"), on_device, expected, strict=False):
+    for what, value, other in zip(("value", "input", "sigma", "d"), on_device, expected, strict=False):
         # a gradient scaler's factor stands in what float16 gives back
         other = other if what == "value" or dtype != torch.float16 else 1000.0 * other
         size = other.abs().max().clamp(min=1e-3 if what in ("sigma", "d") else 1e-12)
         text = f"{name} {shape} {reduction}{' weighted' if weighted else ''} {what}"
-        rows.append((text, float((one - other).abs().max() / size)))
+        rows.append((text, float((value - other).abs().max() / size)))
     return rows
 
 

@@ -52,13 +52,13 @@ def worst_difference(case: Case, device: torch.device) -> float:
     loss, reference, leaves, rest = case
     found = []
     for own, where, wide in ((loss.to(device), device, False), (reference.double(), torch.device("cpu"), True)):
-        given = [one.to(where, torch.float64 if wide else one.dtype).requires_grad_() for one in leaves]
-        others = [one.to(where) for one in rest]
+        given = [entry.to(where, torch.float64 if wide else entry.dtype).requires_grad_() for entry in leaves]
+        others = [entry.to(where) for entry in rest]
         value = own(*given, *others)
         # float16 has no digits for a mean over many elements without a gradient scaler
         upstream = 1700.0 if own.reduction == "mean" else 1.7
         grads = torch.autograd.grad(value, given, torch.full_like(value, upstream))
-        found.append([one.detach().cpu().double() for one in (value, *grads)])
+        found.append([grad.detach().cpu().double() for grad in (value, *grads)])
     return max(float((a - b).abs().max() / b.abs().max().clamp(min=1e-12)) for a, b in zip(*found, strict=True))
 
 
@@ -93,12 +93,12 @@ def agreement(device: torch.device) -> bool:
 
 def step_of(loss: Callable[..., Tensor], leaves: list[Tensor], rest: list[Tensor]) -> Callable[[], None]:
     """Forward and backward on one batch."""
-    for one in leaves:
-        one.requires_grad_()
+    for value in leaves:
+        value.requires_grad_()
 
     def step() -> None:
-        for one in leaves:
-            one.grad = None
+        for value in leaves:
+            value.grad = None
         loss(*leaves, *rest).backward()
 
     return step

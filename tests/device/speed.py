@@ -202,6 +202,6 @@ def print_capture(device: torch.device) -> None:
             step_of(twin, other, same)()
         torch.cuda.synchronize()
         pairs = zip(loss.state_dict().values(), twin.state_dict().values(), strict=True)
-        off = max([0.0, *(float((one.double() - other.double()).abs().max()) for one, other in pairs)])
+        off = max([0.0, *(float((value.double() - other.double()).abs().max()) for value, other in pairs)])
         time = seconds(graph.replay, device, budget=0.2)
         print(f"  {name:20} captured; state differs by {off:.1e} after 50 batches; a replay {1e3 * time:.4f} ms")

@@ -107,7 +107,7 @@ def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, fl
 LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
 """Of two outputs, neither followed."""
 
-PUSHED = ProcessNoise("rate", at_rate=True, lasting=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", nats=311.0)
+PUSHED = ProcessNoise("rate", at_rate=True, correlation_time=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", log_likelihood_gain=311.0)
 
 
 def make_forcing(samples=1800, push=PUSHED):
@@ -127,10 +127,10 @@ def make_forcing(samples=1800, push=PUSHED):
     return DisturbanceEstimate(push.place, push.at_rate, push.unit, time, value, band, curves, sentences)
 
 
-def make_world(**changes):
+def make_environment(**changes):
     """A pendulum that is followed, whose rate something pushes, and whose torque is held."""
     world = NoiseEnvironment(
-        follows=(make_follows(),), pushes=(PUSHED,), input_hold={"torque": "held"}, forcing=(make_forcing(),), starts=12
+        goodness_of_fit=(make_follows(),), process_noise=(PUSHED,), input_hold={"torque": "held"}, disturbance=(make_forcing(),), starts=12
     )
     return dataclasses.replace(world, **changes)
 
@@ -141,14 +141,14 @@ def make_unfit(**changes):
         "Another start reaches 0.006 rad: `gravity` = −9.81 with the other sign.",
         "`damping` ends at its bound, 0.",
     )
-    world = NoiseEnvironment(follows=LOST, reasons=reasons, starts=12)
-    return make_diagnosis(0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "world": world} | changes)
+    world = NoiseEnvironment(goodness_of_fit=LOST, reasons=reasons, starts=12)
+    return make_diagnosis(0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "environment": world} | changes)
 
 
 def nearest(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
     """A finding whose name's shape is not the recording's."""
     shape = ShapeCheck(gain, 0.002, curve or finding.curve, formula)
-    return dataclasses.replace(finding, grade="nearest in the catalogue", shape=shape)
+    return dataclasses.replace(finding, grade="nearest", shape=shape)
 
 
 def make_traces(findings, channels, samples, has_time):

@@ -20,7 +20,7 @@ class Line(ClosedForm):
     bounds = None
     state = {}  # noqa: RUF012
     ports = {  # noqa: RUF012
-        "mixed": Port(("a", "b", "c"), "mV", wanders=True),
+        "mixed": Port(("a", "b", "c"), "mV", allows_drift=True),
         "summed": Port(("flow",), "l/s", pointwise=False),
     }
 

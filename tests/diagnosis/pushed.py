@@ -91,7 +91,7 @@ def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
 
 def in_the_world(recording, system=Pendulum):
     """A simulation alone, fitted under the likeliest noise of the world."""
-    prepared = system().prepare(recording).holding({"torque": "held"})
+    prepared = system().prepare(recording).with_input_hold({"torque": "held"})
     world = fit_baseline(prepared, {}, NoiseSettings())
     return choose_input_hold(world, {}, {"torque": "held"}, NoiseSettings())
 
@@ -112,7 +112,7 @@ def at_the_truth(push="white", seed=0):
     size, lasting = (0.4, 0.0) if push == "white" else (0.3, 1.0)
     sensor = torch.tensor([NOISE], dtype=torch.float64)
     pushes = (Disturbance("rate", True, lasting, size),)
-    observer = observer_of(flow, pushes, sensor, prepared.pushable, prepared.channels)
+    observer = observer_of(flow, pushes, sensor, prepared.disturbable, prepared.channels)
     model = JointModel(prepared.observed(observer))
     residual = model.residual(theta).detach()
     d = residual.std(0)

@@ -12,7 +12,7 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.simulation import load_simulation
 from tests.shared_data import shared_case, shared_real
 
-AS_WRITTEN, CONFIRMED = "left out", ("left out", "real but small")
+AS_WRITTEN, CONFIRMED = "left_out", ("left_out", "small")
 INPUT, DRAG = "torque", ("linear_drag", "quadratic_drag", "power_law")
 
 slow = pytest.mark.slow
@@ -60,9 +60,9 @@ def confirmed(diagnosis):
 )
 def test_what_an_input_does_between_samples_is_found_whatever_the_simulation_says_and_is_no_physics(name, between):
     diagnosis = pendulum(name, between)
-    assert (diagnosis.verdict, diagnosis.findings, diagnosis.world.pushes) == ("adequate", (), ())
-    assert diagnosis.world.input_hold == {INPUT: name.removesuffix("_input")}
-    (angle,) = diagnosis.world.follows
+    assert (diagnosis.verdict, diagnosis.findings, diagnosis.environment.process_noise) == ("adequate", (), ())
+    assert diagnosis.environment.input_hold == {INPUT: name.removesuffix("_input")}
+    (angle,) = diagnosis.environment.goodness_of_fit
     assert angle.residual == pytest.approx(0.005, rel=0.1)
 
 
@@ -79,11 +79,11 @@ def test_a_push_that_nobody_recorded_is_told_as_one_and_no_physics_is_left_out(n
     diagnosis = pendulum(name)
     assert diagnosis.verdict == "unexplained"
     assert confirmed(diagnosis) == []
-    push = diagnosis.world.pushes[0]
+    push = diagnosis.environment.process_noise[0]
     assert (push.place, push.at_rate) == ("rate", True)
     assert size / 2.0 < push.size < 2.0 * size
     assert 0.0 < push.standard_error < push.size
-    course = diagnosis.world.forcing[0]
+    course = diagnosis.environment.disturbance[0]
     assert course.value.shape == course.band.shape == course.time.shape == (750,)
     assert ("is white" in course.sentences[0]) is white
     assert course.sentences[1] == f"It is independent of {INPUT} at every lag."
@@ -95,9 +95,9 @@ def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named_where_nothing_pu
     diagnosis = diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:UpsideDown")
     assert diagnosis.verdict == "unfit"
     assert diagnosis.findings == ()
-    assert diagnosis.world.reasons
+    assert diagnosis.environment.reasons
     if name in ("held_input", "linear_input"):
-        assert "`stiffness`" in diagnosis.world.reasons[0]
+        assert "`stiffness`" in diagnosis.environment.reasons[0]
 
 
 @slow
@@ -105,10 +105,10 @@ def test_an_output_that_has_nothing_to_do_with_the_input_is_not_followed():
     diagnosis = pendulum("unrelated")
     assert diagnosis.verdict == "unfit"
     assert diagnosis.findings == ()
-    assert diagnosis.world.reasons
-    (angle,) = diagnosis.world.follows
+    assert diagnosis.environment.reasons
+    (angle,) = diagnosis.environment.goodness_of_fit
     assert angle.explained < 0.5
-    assert angle.residual > angle.last_value_predicts
+    assert angle.residual > angle.rmse_of_last_value
 
 
 @slow
@@ -164,7 +164,7 @@ def test_dry_friction_of_a_geared_motor_is_told_in_each_outputs_unit():
         assert 0.0 < one.after < one.before < math.inf
     assert sizes["angle"].before < 1.0
     assert sizes["speed"].before < 20.0
-    assert [(one.output, one.unit) for one in diagnosis.world.follows] == [("angle", "rad"), ("speed", "rad/s")]
+    assert [(one.output, one.unit) for one in diagnosis.environment.goodness_of_fit] == [("angle", "rad"), ("speed", "rad/s")]
     assert all(math.isfinite(one.value) for one in found.parameters)
 
 
@@ -173,8 +173,8 @@ def test_a_free_double_integrator_does_not_follow_a_ball_on_a_beam():
     diagnosis = diagnosed("ball_beam/run.csv", "ball_beam/naive.py:Ball")
     assert diagnosis.verdict == "unfit"
     assert confirmed(diagnosis) == []
-    assert diagnosis.world.reasons
-    (position,) = diagnosis.world.follows
+    assert diagnosis.environment.reasons
+    (position,) = diagnosis.environment.goodness_of_fit
     assert position.unit == "m"
     assert 0.055 < position.residual < position.variation
 
@@ -182,7 +182,7 @@ def test_a_free_double_integrator_does_not_follow_a_ball_on_a_beam():
 @slow
 def test_the_fit_of_two_tanks_is_found_and_the_rest_is_not_called_noise():
     diagnosis = diagnosed("tanks/fit.csv", "tanks/naive.py:Tanks")
-    (level,) = diagnosis.world.follows
+    (level,) = diagnosis.environment.goodness_of_fit
     assert (level.unit, level.residual < 0.65) == ("V", True)
     assert level.explained > 0.9
     assert diagnosis.verdict in ("explained", "unexplained")

@@ -80,7 +80,7 @@ def test_the_fit_improves_on_blocks_that_it_has_not_seen(named):
 def test_the_file_is_valid_and_says_the_same(named):
     effect, *_, diagnosis = named
     content = json.loads(diagnosis_to_json(diagnosis))
-    assert content["schema"] == "mkc-diagnosis/2"
+    assert content["schema"] == "mkc-diagnosis/3"
     assert content["findings"][0]["effect"] == effect
 
 

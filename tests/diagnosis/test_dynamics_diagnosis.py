@@ -279,7 +279,7 @@ def test_a_ball_that_spins_is_named_and_sized():
     diagnosis = diagnose(Ball(), recording, effects=rivals, **QUICK)
     assert diagnosis.verdict == "unexplained"  # the lift is not the constant one of the catalogue
     (finding,) = diagnosis.findings
-    assert (finding.effect, finding.grade) == ("magnus_lift", "left out")
+    assert (finding.effect, finding.grade) == ("magnus_lift", "left_out")
     assert value(finding, "turning")[0] == pytest.approx(0.165, abs=0.02)
     assert finding.channels == ("rate of vx", "rate of vy")
 
@@ -355,7 +355,7 @@ def test_a_light_ball_is_braked_by_the_air():
     (finding,) = diagnosis.findings
     alike = [one.effect for one in finding.alternatives if not one.separable]
     assert {"linear_drag", "quadratic_drag"} & {finding.effect, *alike}
-    assert finding.grade == "left out"
+    assert finding.grade == "left_out"
     assert finding.held_out.outputs["height"].after < 0.1 * finding.held_out.outputs["height"].before
 
 

@@ -107,8 +107,8 @@ def test_a_declared_floor_goes_before_what_samples_and_steps_say():
 
 def test_the_mean_and_the_last_value_predict_what_they_do():
     one = followed(7.0 + WAVE, 0.1 * randn(N, 1))[0]
-    assert one.mean_predicts == pytest.approx(float(WAVE.std()), rel=0.02)
-    assert one.last_value_predicts == pytest.approx(float(WAVE.diff(dim=0).square().mean().sqrt()), rel=0.02)
+    assert one.rmse_of_mean == pytest.approx(float(WAVE.std()), rel=0.02)
+    assert one.rmse_of_last_value == pytest.approx(float(WAVE.diff(dim=0).square().mean().sqrt()), rel=0.02)
 
 
 @pytest.mark.parametrize("lost", [None, torch.full((N, 1), torch.nan).double()])
@@ -196,15 +196,15 @@ def verdict_of(simulation, columns):
 def test_a_field_that_has_nothing_to_do_with_the_attitude_is_not_followed():
     columns, attitude = turning_sensor(field=20.0 * smooth(3, 5))
     result = verdict_of(Magnetometer(), columns | attitude)
-    assert pooled(result.world.follows) < 0.35
+    assert pooled(result.environment.goodness_of_fit) < 0.35
     assert result.verdict == "unfit"
 
 
 def test_a_sensor_that_hardly_tilts_follows_in_all_axes():
     columns, attitude = turning_sensor(yaw=True)
     result = verdict_of(Magnetometer(), columns | attitude)
-    assert {one.variation for one in result.world.follows} == {result.world.follows[0].variation}
-    assert all(one.explained > 0.99 for one in result.world.follows)
+    assert {one.variation for one in result.environment.goodness_of_fit} == {result.environment.goodness_of_fit[0].variation}
+    assert all(one.explained > 0.99 for one in result.environment.goodness_of_fit)
     assert result.verdict == "adequate"
 
 

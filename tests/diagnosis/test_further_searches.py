@@ -114,7 +114,7 @@ def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
 def test_what_drives_the_simulation_away_is_found_from_where_it_began(recording):
     """Without its spring the sled is fitted with a damping of thousands, and beside that no spring has its size."""
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
-    assert diagnosis.world.follows[0].explained < 0.5
+    assert diagnosis.environment.goodness_of_fit[0].explained < 0.5
     (finding,) = diagnosis.findings
     assert finding.effect == "cubic_stiffness"
     (stiffness,) = finding.parameters

@@ -118,7 +118,7 @@ def test_time_enough_changes_nothing():
 @pytest.mark.parametrize(
     ("case", "effect", "grade"),
     # process noise that nobody drew, and a shape that nobody asked for, leave it unconfirmed
-    [(magnetometer, "current_field", "left out"), (pendulum, "quadratic_drag", "not confirmed")],
+    [(magnetometer, "current_field", "left_out"), (pendulum, "quadratic_drag", "unconfirmed")],
 )
 def test_a_quick_look_finds_the_same_without_draws_and_says_so(monkeypatch, case, effect, grade):
     def none(*_, **__):

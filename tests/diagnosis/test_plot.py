@@ -10,7 +10,7 @@ pytest.importorskip("matplotlib")
 from matplotlib import pyplot
 
 import mkc_torch.diagnosis
-from tests.diagnosis.factory import make_diagnosis, make_world
+from tests.diagnosis.factory import make_diagnosis, make_environment
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def closed():
 
 @pytest.fixture(scope="module")
 def found():
-    return make_diagnosis(3, samples=300, channels=4, verdict="unexplained", world=make_world())
+    return make_diagnosis(3, samples=300, channels=4, verdict="unexplained", environment=make_environment())
 
 
 def drawn(ax):

@@ -78,7 +78,7 @@ def moved(recording, column, by):
 
 
 def told_offsets(result):
-    return [(one.output, one.name, round(one.value, 1)) for one in result.world.offsets]
+    return [(one.output, one.name, round(one.value, 1)) for one in result.environment.offsets]
 
 
 class Coast(Dynamics):
@@ -111,12 +111,12 @@ def test_a_sensor_s_offset_is_each_recording_s_own_and_physics_is_all_of_theirs(
     assert [finding.effect for finding in result.findings] == ["quadratic_drag"]
     assert result.findings[0].parameters[0].value == pytest.approx(0.05, rel=0.02)
     assert told_offsets(result) == [("speed", "a", 0.3), ("speed", "b", -0.2), ("speed", "c", 0.0)]
-    assert all(0.0 < one.standard_error < 0.01 and one.unit == "m/s" for one in result.world.offsets)
+    assert all(0.0 < one.standard_error < 0.01 and one.unit == "m/s" for one in result.environment.offsets)
     content = json.loads(diagnosis_to_json(result))
     assert [one["recording"] for one in content["offsets"]] == [1, 2, 3]
     assert [one["name"] for one in content["runs"]] == ["a", "b", "c"]
     assert re.search(r"recording 1 \(a\): 0\.(30|29)\d* ± 0\.0", " ".join(output_lines(result)))
-    told = shares_of_runs(result.findings[0].experiments, result.world.runs)
+    told = shares_of_runs(result.findings[0].experiments, result.environment.runs)
     assert "recording 2 (b): " in told
     assert "experiment" not in told
     assert len(result.model.theta) == 4  # a gain and three first states
@@ -159,7 +159,7 @@ def test_a_simulation_without_states_has_offsets_of_each_recording_too():
 
 def test_a_single_recording_has_no_offsets():
     result = diagnose(Line(), [line(0, "a")], effects=(), surrogates=19)
-    assert (result.world.offsets, result.world.runs) == ((), ())
+    assert (result.environment.offsets, result.environment.runs) == ((), ())
 
 
 def test_a_simulation_without_states_has_one_clock():

@@ -15,7 +15,7 @@ from tests.diagnosis.factory import make_follows
 
 FOLLOWING, LOST = make_follows(), make_follows(residual=0.33, explained=0.1)
 HALFWAY = make_follows(residual=0.15, explained=0.8, floor=0.14)
-FIRST, SMALL = SimpleNamespace(grade="left out"), SimpleNamespace(grade="real but small")
+FIRST, SMALL = SimpleNamespace(grade="left_out"), SimpleNamespace(grade="small")
 
 
 def noise(*pushes):
@@ -72,7 +72,7 @@ def test_findings_with_names_that_leave_white_noise_explain(findings):
     assert verdict(around(FOLLOWING, corrected=(FOLLOWING,)), *findings) == "explained"
 
 
-@pytest.mark.parametrize("grade", ["not confirmed", "nearest in the catalogue"])
+@pytest.mark.parametrize("grade", ["unconfirmed", "nearest"])
 def test_one_finding_without_a_name_of_its_own_leaves_it_unexplained(grade):
     doubted = SimpleNamespace(grade=grade)
     for findings in ((doubted,), (FIRST, doubted)):

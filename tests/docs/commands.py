@@ -24,23 +24,23 @@ BUILD = ("--config-file", ".zensical.toml")
 """What the site is built with, beside that nothing may be amiss."""
 
 SMALL = {
-    "mkc challenge --worlds --family dynamics --only slow_sensor --only lasting_push --only lasting_push_runs "
-    "--only useless --per-world 6 --hidden-per-world 6 --seed 6161 --workers 1 --output newer": (
-        "--per-world 1 --hidden-per-world 0"
+    "mkc challenge --scenarios --family dynamics --only slow_sensor --only lasting_push --only lasting_push_runs "
+    "--only useless --per-scenario 6 --hidden-per-scenario 6 --seed 6161 --workers 1 --output newer": (
+        "--per-scenario 1 --hidden-per-scenario 0"
     ),
     "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
-    "mkc challenge --worlds --output worlds": (
-        "--per-world 1 --hidden-per-world 0 --only white --duration 15 --workers 1"
+    "mkc challenge --scenarios --output scenarios": (
+        "--per-scenario 1 --hidden-per-scenario 0 --only white --duration 15 --workers 1"
     ),
-    "mkc challenge --worlds --family dynamics --output worlds_of_dynamics": (
-        "--per-world 1 --hidden-per-world 0 --only white --workers 1"
+    "mkc challenge --scenarios --family dynamics --output scenarios_of_dynamics": (
+        "--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"
     ),
-    "mkc challenge --worlds --family dynamics --per-world 15 --hidden-per-world 8 --seed 8608 --output worlds": (
-        "--per-world 1 --hidden-per-world 0 --only white --workers 1"
+    "mkc challenge --scenarios --family dynamics --per-scenario 15 --hidden-per-scenario 8 --seed 8608 --output scenarios": (
+        "--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"
     ),
-    "mkc challenge --worlds --family magnetometer --per-world 15 --hidden-per-world 5 --seed 7302 "
-    "--output worlds_of_sensors": "--per-world 1 --hidden-per-world 0 --only white --duration 15 --workers 1",
+    "mkc challenge --scenarios --family magnetometer --per-scenario 15 --hidden-per-scenario 5 --seed 7302 "
+    "--output scenarios_of_sensors": "--per-scenario 1 --hidden-per-scenario 0 --only white --duration 15 --workers 1",
     "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --seed 7741 --workers 2 --output proof_of_dynamics": (
         "--seed 1 --cases 0 --empty 1 --workers 1"

@@ -17,12 +17,14 @@ MANUAL = {
     "architecture.md",
     "bad_inputs.md",
     "calibrate.md",
+    "changelog.md",
     "diagnose.md",
     "estimators.md",
     "for_networks.md",
     "for_sensors.md",
     "for_simulations.md",
     "gallery.md",
+    "glossary.md",
     "how_it_decides.md",
     "index.md",
     "large_data.md",
@@ -33,12 +35,13 @@ MANUAL = {
     "promises.md",
     "wrong_targets.md",
 }
+FOLDERS = {"decisions/index.md"}
 COMMON = {"--version", "--help"}
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 
 def test_the_readme_is_short():
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 200
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
 
 
 def test_the_second_command_of_the_readme_is_the_one_that_tests():
@@ -54,7 +57,7 @@ def test_the_second_command_of_the_readme_is_the_one_that_tests():
 
 def test_the_readme_leads_to_every_page():
     assert {page.name for page in PAGES[1:]} == MANUAL
-    assert {target.removeprefix("docs/") for target in links(README) if target.startswith("docs/")} == MANUAL
+    assert {target.removeprefix("docs/") for target in links(README) if target.startswith("docs/")} - FOLDERS == MANUAL
 
 
 @each_page
@@ -100,10 +103,10 @@ def test_commands_named_in_a_sentence_exist(page):
 
 @pytest.mark.parametrize("command", ["calibrate", "diagnose"])
 def test_every_option_is_explained(command):
-    told = " ".join(inline(ROOT / "docs" / f"{command}.md"))
-    assert {option for option in mkc_options(command) if option not in told} == set()
+    named = " ".join(inline(ROOT / "docs" / f"{command}.md"))
+    assert {option for option in mkc_options(command) if option not in named} == set()
 
 
 def test_every_effect_of_the_catalogue_is_explained():
-    told = {*inline(ROOT / "docs" / "diagnose.md"), *inline(ROOT / "docs" / "own_simulation.md")}
-    assert {effect.id for effect in CATALOGUE} <= told
+    named = {*inline(ROOT / "docs" / "diagnose.md"), *inline(ROOT / "docs" / "own_simulation.md")}
+    assert {effect.id for effect in CATALOGUE} <= named

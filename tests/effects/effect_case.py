@@ -242,7 +242,7 @@ class OfEveryShape:
         else:
             with pytest.raises(NotImplementedError, match="`basis`"):
                 effect.basis(shape, context)
-        if effect.has_course:
+        if effect.has_waveform:
             assert torch.equal(gained(effect.waveform(shape, context), gamma), change)
 
     def test_what_lasts_is_nothing_without_an_amplitude(self, effect, shape, context):

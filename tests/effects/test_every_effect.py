@@ -128,7 +128,7 @@ def test_what_effects_can_do_beside():
         "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",
     }  # fmt: skip
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
-    assert {e.id for e in CATALOGUE if not e.has_course} & {"hard_iron_step", "linear_drag", "gain"} == set()
+    assert {e.id for e in CATALOGUE if not e.has_waveform} & {"hard_iron_step", "linear_drag", "gain"} == set()
 
 
 def test_what_belongs_to_a_place_or_an_attitude_says_so():

@@ -76,6 +76,6 @@ def test_of_the_heaters_what_is_left_is_located(loaded):
     case = loaded("systems").heaters(shared_data("dynamics"))
     (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=2)
     assert proof.diagnosis.verdict == "unexplained"
-    assert {push.place for push in proof.diagnosis.world.pushes} == {"temperature_1", "temperature_2"}
-    claimed = [one.effect for one in proof.diagnosis.findings if one.grade != "not confirmed"]
+    assert {push.place for push in proof.diagnosis.environment.process_noise} == {"temperature_1", "temperature_2"}
+    claimed = [one.effect for one in proof.diagnosis.findings if one.grade != "unconfirmed"]
     assert claimed in ([], ["input_delay"])

@@ -29,7 +29,7 @@ def row(**changes):
     region = {"state": "altitude", "unit": "m", "kind": "below", "bound": 2138.6}
     drag = {
         "effect": "quadratic_drag",
-        "grade": "left out",
+        "grade": "left_out",
         "drivers": [],
         "channels": ["rate of speed"],
         "region": region | {"share_of_gain": 0.892, "share_of_time": 0.3},

@@ -1,6 +1,6 @@
 """The gate for changes of the verdict: `python -m tests.gate --output DIR [--compare STORED.json]`.
 
-Diagnoses the real recordings and cases that lie beside the repository, a few recordings of each world, and small draws
+Diagnoses the real recordings and cases that lie beside the repository, a few recordings of each scenario, and small draws
 of both proofs, always the same ones, and writes `DIR/gate.json`: for each recording verdict, findings, residuals, CPU
 and wall seconds, and whether it is right. Prints the counts and the recordings that are not right; with `--compare`,
 also each recording in which a stored `gate.json` and this one differ.
@@ -31,7 +31,7 @@ from tests.gate.compare import differences
 from tests.gate.tables import compared_lines, count_lines, wrong_lines
 from tests.gate.work import Job, diagnosed
 
-PARTS = ("real", "cases", "worlds", "proofs")
+PARTS = ("real", "cases", "scenarios", "proofs")
 RESULT = "gate.json"
 
 
@@ -67,8 +67,8 @@ def run(
     answers = {one.name: one for one in _known(parts) if match in one.name}
     jobs = [Job(one.name, one.recording, one.request) for one in answers.values()]
     draws: dict[str, list[drawn.Drawn]] = {}
-    if "worlds" in parts:
-        draws["worlds"] = list(drawn.all_worlds(output, match=match, workers=workers))
+    if "scenarios" in parts:
+        draws["scenarios"] = list(drawn.all_scenarios(output, match=match, workers=workers))
     if "proofs" in parts:
         draws["proofs"] = list(drawn.both_proofs(output, match=match, workers=workers))
     jobs += [job for group in draws.values() for one in group for job in one.jobs]

@@ -1,4 +1,4 @@
-"""Recordings that are drawn for the gate: of each world, and of both proofs, always the same ones."""
+"""Recordings that are drawn for the gate: of each scenario, and of both proofs, always the same ones."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from mkc_torch._support.files import write_atomically
-from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
+from mkc_torch.challenge.dynamics.scenarios import dynamics_scenarios
 from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
 from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_scenarios
 from mkc_torch.challenge.magnetometer.subject import magnetometer
 from mkc_torch.challenge.pool import Pool, every, silent
 from mkc_torch.challenge.scenario import ScenarioCase, ScenarioKey, Scenarios
-from mkc_torch.challenge.scenarios.score import score_worlds
+from mkc_torch.challenge.scenarios.score import score_scenarios
 from mkc_torch.challenge.score import score
 from mkc_torch.challenge.subject import Case
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
@@ -25,8 +25,8 @@ from tests.gate.work import Job
 
 SEED = 7
 
-EMPTY_PER_WORLD = 6
-HIDDEN_PER_WORLD = 2
+EMPTY_PER_SCENARIO = 6
+HIDDEN_PER_SCENARIO = 2
 
 PER_PROOF = {"magnetometer": 40, "dynamics": 20}
 """Recordings with something hidden, and as many with nothing."""
@@ -37,7 +37,7 @@ Rows = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Drawn:
-    """The recordings of a family's worlds, or of a proof.
+    """The recordings of a family's scenarios, or of a proof.
 
     Attributes:
         jobs: by the recordings' names in the run.
@@ -61,20 +61,25 @@ class _Address:
     simulation: str = ""
 
 
-def all_worlds(
-    output: Path, *, match: str = "", workers: int = 1, empty: int = EMPTY_PER_WORLD, hidden: int = HIDDEN_PER_WORLD
+def all_scenarios(
+    output: Path,
+    *,
+    match: str = "",
+    workers: int = 1,
+    empty: int = EMPTY_PER_SCENARIO,
+    hidden: int = HIDDEN_PER_SCENARIO,
 ) -> Iterator[Drawn]:
-    """Both families' worlds; of the recordings those whose name has ``match`` in it."""
-    for family in (dynamics_worlds(), magnetometer_worlds()):
+    """Both families' scenarios; of the recordings those whose name has ``match`` in it."""
+    for family in (dynamics_scenarios(), magnetometer_scenarios()):
         addresses = [
             # a number of its own for each recording, which its file's name has in it
-            _Address(name, partial(world.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
-            for place, world in enumerate(family.worlds)
-            for hides, total in ((False, empty), (True, world.hidden(empty, hidden)))
+            _Address(name, partial(scenario.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
+            for place, scenario in enumerate(family.scenarios)
+            for hides, total in ((False, empty), (True, scenario.hidden(empty, hidden)))
             for index in range(total)
-            if match in (name := f"world {family.family} {world.name} {'hidden' if hides else 'empty'} {index}")
+            if match in (name := f"scenario {family.family} {scenario.name} {'hidden' if hides else 'empty'} {index}")
         ]
-        yield _of_worlds(family, *_written(addresses, output / "drawn" / f"worlds_{family.family}", workers))
+        yield _of_scenarios(family, *_written(addresses, output / "drawn" / f"scenarios_{family.family}", workers))
 
 
 def both_proofs(
@@ -107,32 +112,32 @@ def _write(folder: Path, address: _Address) -> tuple[Job, Key | ScenarioKey]:
     return Job(address.name, recording, _request(recording, simulation)), case.key
 
 
-def _of_worlds(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, ScenarioKey]) -> Drawn:
+def _of_scenarios(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, ScenarioKey]) -> Drawn:
     def scored(rows: Rows) -> Any:
-        return score_worlds(family, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
+        return score_scenarios(family, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
 
     def counts(rows: Rows) -> dict[str, str]:
         found = scored(rows)
         total, cases = found.total, found.cases
-        apart = {world.name for world in family.worlds if world.apart}
-        together = [case for case in cases if case.key.world not in apart]
+        apart = {scenario.name for scenario in family.scenarios if scenario.apart}
+        together = [case for case in cases if case.key.scenario not in apart]
         empty, useless = [case for case in together if not case.hides], [case for case in cases if case.key.useless]
-        of_apart = [case for case in cases if case.key.world in apart]
+        of_apart = [case for case in cases if case.key.scenario in apart]
         counted_apart = f"{sum(case.alone for case in of_apart)}/{len(of_apart)}"
         return {
-            "false alarms": f"{sum(case.said.alarm for case in empty)}/{len(empty)}",
+            "false alarms": f"{sum(case.stated.alarm for case in empty)}/{len(empty)}",
             **({"a name alone where one run cannot tell": counted_apart} if of_apart else {}),
             "strong named": f"{total.named.count}/{total.named.total}",
             "strong named wrong": f"{total.wrong.count}/{total.wrong.total}",
-            "useless unfit": f"{sum(case.said.verdict == 'unfit' for case in useless)}/{len(useless)}",
+            "useless unfit": f"{sum(case.stated.verdict == 'unfit' for case in useless)}/{len(useless)}",
             "useful unfit": f"{total.useful_unfit.count}/{total.useful_unfit.total}",
-            "failed": str(sum(case.said.verdict == "failed" for case in cases)),
+            "failed": str(sum(case.stated.verdict == "failed" for case in cases)),
         }
 
     def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
         cases = scored(rows).cases
         return {
-            name: {"named": case.named} if case.hides else {"false_alarm": case.said.alarm}
+            name: {"named": case.named} if case.hides else {"false_alarm": case.stated.alarm}
             for name, case in zip(keys, cases, strict=True)
         }
 
@@ -188,4 +193,4 @@ def _truth(key: Key) -> dict[str, Any]:
 
 
 def _pushed(key: ScenarioKey) -> dict[str, Any]:
-    return {"push": asdict(key.push) if key.push else None, "useless": key.useless}
+    return {"push": asdict(key.disturbance) if key.disturbance else None, "useless": key.useless}

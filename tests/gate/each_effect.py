@@ -28,7 +28,7 @@ from mkc_torch.challenge.pool import content_of
 from mkc_torch.challenge.run import SIMULATIONS
 from mkc_torch.challenge.subject import Case
 from mkc_torch.challenge.thresholds import STRONG_Z
-from mkc_torch.challenge.verdict import answer, named_right
+from mkc_torch.challenge.verdict import stated_diagnosis, named_right
 from mkc_torch.cli.challenge_jobs import diagnose_dynamics
 from mkc_torch.recording.recording import write_table
 
@@ -74,7 +74,7 @@ def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> 
 def said_of(key: Key, folder: Path) -> tuple[bool, str]:
     """Whether it was named right, and what was said: claims with their alternatives, or the verdict."""
     (truth,) = key.effects
-    said = answer(content_of(folder / key.name / "diagnosis.json"))
+    said = stated_diagnosis(content_of(folder / key.name / "diagnosis.json"))
     claims = [
         " or ".join([one.named.effect, *(other.effect for other in one.others)]) + f" at {', '.join(one.named.at)}"
         for one in said.claims

@@ -17,7 +17,7 @@ fits <- function(d) {
   a <- 1.207617
   ybar <- sum(w*y)/sum(w); S <- sum(w*(y-ybar)^2); R <- sum(w*r^2)
   n <- nrow(x); p <- ncol(x)
-  # residuals kept of a start that is not the one kept: no standard errors
+  # the stored residuals are not those of the best start: no standard errors
   if (max(abs(out$init$resid - (y - x %*% out$init.S$coefficients))) > 1e-6 * out$scale) v[] <- NA
   list(coef=unname(out$coefficients), scale=out$scale, se=unname(sqrt(diag(v))), s_coef=unname(out$init.S$coefficients), r2=(S-R)/(S+R*(a-1)))
 }

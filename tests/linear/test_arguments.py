@@ -1,4 +1,4 @@
-"""What an argument's value alone decides is refused when an estimator is made, by name and with what to do."""
+"""Arguments that are invalid by their value are refused by the constructor, with name and remedy."""
 
 import inspect
 import math
@@ -45,14 +45,14 @@ def taking(name):
     return [kind for kind in ESTIMATORS if name in inspect.signature(kind).parameters]
 
 
-def test_all_estimators_are_looked_at():
+def test_every_estimator_is_covered():
     assert len(ESTIMATORS) == 14
     assert len(taking("seed")) >= 8
 
 
 @pytest.mark.parametrize("name", ["max_iter", "starts", "seed"])
 @pytest.mark.parametrize("value", ["a", 2.5, None, True])
-def test_counts_that_are_no_whole_numbers_are_refused(name, value):
+def test_counts_must_be_whole_numbers(name, value):
     for kind in taking(name):
         if (name == "starts" and value is None and kind is ReweightedLeastSquares) or kind is LeastEntropyLike:
             continue
@@ -61,7 +61,7 @@ def test_counts_that_are_no_whole_numbers_are_refused(name, value):
 
 
 @pytest.mark.parametrize("name", ["max_iter", "starts"])
-def test_counts_of_nothing_are_refused(name):
+def test_counts_must_be_at_least_one(name):
     for kind in taking(name):
         if (kind, name) != (LeastEntropyLike, "starts"):
             with pytest.raises(ValueError, match=f"`{name}` to be a whole number of at least 1 but got 0; "):
@@ -89,9 +89,9 @@ def test_parameters_of_the_density_out_of_range_are_refused(kind, name, value):
         kind(**{name: "a"})
 
 
-def test_a_bandwidth_below_that_of_the_normaliser_is_refused_where_there_is_one():
+def test_sigma_below_its_limit_is_refused_where_the_density_is_normalised():
     FixedPointLinear(sigma=0.01)
-    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.01; None learns it"):
+    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.01; pass None to learn it"):
         MKCRegression(sigma=0.01)
 
 
@@ -104,17 +104,17 @@ def test_parameters_under_vmap_are_taken_as_they_are():
 
 @pytest.mark.parametrize("kind", [FixedPointLinear, MKCRegression, MEstimator, MinimumEntropy])
 @pytest.mark.parametrize("value", ["ols", 3, np.ones(2), [1.0, 2.0], torch.tensor([NAN, 1.0]), torch.tensor(1.0)])
-def test_starts_that_are_none_are_refused(kind, value):
+def test_invalid_starts_are_refused(kind, value):
     with pytest.raises(ValueError, match=r"`start` to be .*coefficients.* but got") as refused:
         kind(start=value)
     assert ("torch.as_tensor(start)" in str(refused.value)) == isinstance(value, (np.ndarray, list))
 
 
 @pytest.mark.parametrize("kind", [LeastMedianOfSquares, LeastTrimmedSquares])
-def test_a_coverage_of_nothing_is_refused(kind):
+def test_a_coverage_below_one_is_refused(kind):
     assert kind(h=np.int64(20)).h == 20
     for h in (-1, 0):
-        with pytest.raises(ValueError, match=f"`h` to be a whole number of at least 1 but got {h}; it counts values"):
+        with pytest.raises(ValueError, match=f"`h` to be a whole number of at least 1 but got {h}"):
             kind(h=h)
     for h in ("a", 2.5, True):
         with pytest.raises(TypeError, match="`h` to be a whole number but got"):
@@ -129,7 +129,7 @@ def test_a_coverage_of_nothing_is_refused(kind):
         (lambda: LeastSquares(bandwidth=-1), ValueError, "`bandwidth` to be >= 0 and finite but got -1"),
         (lambda: MEstimator(["huber"]), ValueError, "`psi` to be one of 'huber'"),
         (lambda: ReweightedLeastSquares(["lts"]), ValueError, "`start` to be 'lts', 'lms', 's' or an estimator but"),
-        (lambda: ReweightedLeastSquares(Ridge), ValueError, r"got the class Ridge; make one, Ridge\(\)"),
+        (lambda: ReweightedLeastSquares(Ridge), ValueError, r"got the class Ridge; pass an instance, Ridge\(\)"),
         (lambda: ReweightedLeastSquares(threshold="a"), TypeError, "`threshold` to be a number"),
         (lambda: LeastEntropyLike("a"), TypeError, "`start` to be a tensor but got str"),
         (lambda: LeastEntropyLike([1.0]), TypeError, r"`start` .* got list; .*torch\.as_tensor\(start\)"),
@@ -156,13 +156,13 @@ def test_a_coverage_of_nothing_is_refused(kind):
         ),
     ],
 )
-def test_other_arguments_are_refused_as_they_are_given(make, error, message):
+def test_other_arguments_are_checked_by_the_constructor(make, error, message):
     with pytest.raises(error, match=message):
         make()
 
 
 @each_estimator
-def test_data_that_are_no_tensors_are_told_how_to_become_some(kind):
+def test_errors_for_other_types_name_the_conversion(kind):
     X, y = sample(0, 30, 2), sample(1, 30)
     with pytest.raises(TypeError, match=r"`X` .* but got list; make a tensor of it, torch\.as_tensor\(X\)"):
         made(kind).fit(X.tolist(), y)
@@ -170,11 +170,11 @@ def test_data_that_are_no_tensors_are_told_how_to_become_some(kind):
         made(kind).fit(X, y.long())
     with pytest.raises(TypeError, match="`sample_weight` to be a tensor or an array but got list; make a tensor"):
         made(kind).fit(X, y, [1.0] * 30)
-    with pytest.raises(TypeError, match=r"share dtype and device .*; convert one"):
+    with pytest.raises(TypeError, match=r"share dtype and device .*; use Y"):
         made(kind).fit(X, y.float())
 
 
-def test_data_for_a_noise_covariance_are_looked_at_before_it_is_applied():
+def test_data_are_checked_before_whitening():
     with pytest.raises(TypeError, match=r"`X` .* but got list"):
         FixedPointLinear(noise_covariance=torch.eye(2)).fit(torch.ones(5, 2, 3).tolist(), torch.ones(5, 2))
 
@@ -188,7 +188,7 @@ def test_data_for_a_noise_covariance_are_looked_at_before_it_is_applied():
         ((1000, 3), (999,), r"\(1000, 3\) and \(999,\)\."),
     ],
 )
-def test_shapes_that_do_not_fit_are_told_the_mend_where_it_is_plain(x_shape, y_shape, mend):
+def test_errors_for_wrong_shapes_name_the_remedy(x_shape, y_shape, mend):
     with pytest.raises(ValueError, match=mend):
         LeastSquares().fit(sample(0, *x_shape), sample(1, *y_shape))
 
@@ -203,7 +203,7 @@ def test_prediction_takes_what_the_fit_took(kind):
     with pytest.raises(TypeError, match=r"`X` of the dtype .* of the fit, torch\.float64 .* but got torch\.float32"):
         fit.predict(X.float())
     with pytest.raises(
-        ValueError, match="`X` with 2 columns in its last dimension but got 3; give it those of the fit"
+        ValueError, match="`X` with 2 columns in its last dimension but got 3; pass those of the fit"
     ):
         fit.predict(sample(0, 30, 3))
 

@@ -1,4 +1,4 @@
-"""NumPy arrays and data frames fit as tensors of the same numbers do, and give tensors."""
+"""NumPy arrays and data frames are fitted as tensors of the same numbers are, and results are tensors."""
 
 import numpy as np
 import pytest
@@ -50,13 +50,13 @@ def test_frames_give_what_tensors_give_and_their_columns_are_remembered(kind, li
         got.feature_names_in_  # noqa: B018
 
 
-def test_arrays_beside_tensors_take_their_dtype():
+def test_arrays_given_with_tensors_take_the_dtype_of_the_tensors():
     X, y, weight = data()
     fit = LeastSquares().fit(X.float(), y.numpy(), weight.numpy())
     assert fit.coef_.dtype == torch.float32
     assert fit.predict(X.numpy()).dtype == torch.float32
     assert LeastSquares().fit(X.float().numpy(), y).coef_.dtype == torch.float64
-    # weights decide nothing
+    # the weights are irrelevant here
     assert LeastSquares().fit(X.numpy(), y.numpy(), weight.float()).coef_.dtype == torch.float64
 
 
@@ -88,7 +88,7 @@ def test_arrays_of_several_channels_and_problems_are_read_as_tensors_are():
     assert torch.equal(LeastSquares().fit(X.numpy(), Y.numpy()).coef_, LeastSquares().fit(X, Y).coef_)
 
 
-def test_what_a_frame_lacks_is_told_by_column():
+def test_missing_values_of_a_frame_are_reported_by_column():
     X, y, _ = data()
     frame = framed(pd.DataFrame, X).astype("Float64")
     frame.loc[3:5, "b"] = pd.NA
@@ -117,7 +117,7 @@ def test_parameters_are_checked_and_change_together_or_not_at_all():
     assert (estimator.psi, estimator.max_iter) == ("tukey", 7)
 
 
-def test_parameters_of_an_estimator_within_are_reached():
+def test_parameters_of_a_nested_estimator_are_reached():
     inner = MEstimator()
     outer = ReweightedLeastSquares(inner)
     assert outer.get_params()["start__max_iter"] == 500

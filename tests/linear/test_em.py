@@ -65,7 +65,7 @@ CASES = [(1.0, 1.0), (0.8, 1.0), (1.0, 0.8), (0.8, 0.8), (0.8, 0.6), (0.6, 0.8)]
 
 
 def example_2(case: int, draws: int) -> tuple[Tensor, Tensor, Tensor]:
-    """X (100, 2, 2), Y (draws, 100, 2) and whether each value is noise of the head."""
+    """X (100, 2, 2), Y (draws, 100, 2) and the mask of the values of the head."""
     p = torch.tensor(CASES[case - 1], dtype=torch.float64)
     x = 8.0 * torch.sin(0.04 * math.pi * torch.arange(1, 101, dtype=torch.float64))
     X = torch.stack([torch.ones(100).double(), x], -1).unsqueeze(-2).expand(100, 2, 2)
@@ -102,7 +102,7 @@ def test_example_2_of_the_paper(case):
         assert error < 1.03 * best
     else:
         wls = FixedPointLinear(sigma=math.inf, d=torch.tensor([1.0, 2.0]).double()).fit(X, Y).coef_
-        # one-sided outliers reach into the head of case 6, and any symmetric density is biased by those
+        # one-sided outliers overlap the head in case 6, and bias every symmetric density
         assert error < (1.6 if case == 6 else 1.35) * best
         assert error < (0.6 if case == 3 else 0.4) * rms_error(wls)
         assert error < rms_error(LeastAbsoluteDeviations().fit(X, Y).coef_)
@@ -194,7 +194,7 @@ def test_history_never_increases_and_ends_at_the_likelihood(start):
     assert -80 * float(fit.history_[-1]) == pytest.approx(float(fit.log_likelihood_), abs=1e-6)
 
 
-def test_convergence_is_told():
+def test_convergence_is_reported():
     X, Y = channels(0)
     assert bool(MKCRegression().fit(X, Y).converged_)
     short = MKCRegression(max_iter=1, bound=40.0, start="least_squares").fit(X, Y)
@@ -340,7 +340,7 @@ def test_forty_per_cent_one_sided_outliers_do_not_trap_it(seed):
     assert float(fit.weights_[:40].mean()) < 0.25
 
 
-def test_sigma_is_large_in_the_clean_channel_and_small_in_the_dirty_one():
+def test_sigma_is_large_in_a_clean_and_small_in_a_contaminated_channel():
     X, Y, _ = example_2(2, 60)
     fit = MKCRegression().fit(X, Y)
     assert bool((fit.sigma_[:, 0] < 3.5).all())
@@ -387,14 +387,14 @@ def test_an_ordinary_fit_is_not_flagged_as_exact():
     assert not bool(MKCRegression().fit(*line(0)).exact_fit_)
 
 
-def test_a_channel_of_zero_residuals_beside_a_noisy_one():
+def test_a_channel_of_zero_residuals_and_a_noisy_channel():
     X, Y = channels(0)
     Y[:, 1] = X[:, 1].sum(-1)
     fit = MKCRegression().fit(X, Y)
     torch.testing.assert_close(fit.coef_, torch.ones(3).double(), rtol=0, atol=1e-8)
     for name in ("d_", "bound_", "log_likelihood_", "covariance_", "weights_"):
         assert bool(torch.isfinite(getattr(fit, name)).all()), name
-    # the coefficients are known exactly, so that the other channel is a fit of its density alone
+    # the coefficients are known exactly, so the other channel is only a fit of its density
     residual = (Y - X @ fit.coef_)[:, :1]
     alone = fit_density(residual, bound=float(fit.bound_[0]))
     assert float(fit.d_[0]) == pytest.approx(float(alone.d), rel=1e-3)
@@ -555,7 +555,7 @@ def test_fewer_values_than_coefficients_are_refused():
         MKCRegression().fit(sample(0, 3, 4), sample(1, 3))
 
 
-def test_what_a_batched_fit_returns_can_be_given_to_the_next():
+def test_results_of_a_batched_fit_are_valid_parameters():
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(50, 2, generator=generator, dtype=torch.float64)
     Y = X.sum(-1) + 0.1 * torch.randn(3, 50, generator=generator, dtype=torch.float64)
@@ -566,7 +566,7 @@ def test_what_a_batched_fit_returns_can_be_given_to_the_next():
 
 
 @pytest.mark.parametrize("start", [torch.full((2,), math.nan), torch.zeros(3), torch.tensor(1.0)])
-def test_a_start_that_is_no_set_of_coefficients_is_refused(start):
+def test_a_start_of_invalid_coefficients_is_refused(start):
     X, y = torch.randn(20, 2).double(), torch.randn(20).double()
     with pytest.raises(ValueError, match=r"`start` to be (2 )?finite coefficients"):
         MKCRegression(start=start).fit(X, y)

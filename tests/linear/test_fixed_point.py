@@ -77,7 +77,7 @@ def test_an_infinite_sigma_weights_samples_and_channels():
     torch.testing.assert_close(fit.coef_, expected, rtol=1e-10, atol=1e-11)
 
 
-def test_a_channel_of_infinite_sigma_beside_a_finite_one():
+def test_channels_of_infinite_and_finite_sigma():
     X, Y = channels(0, m=2)
     sigma, d = torch.tensor([math.inf, 1.5], dtype=torch.float64), torch.tensor([4.0, 1.0], dtype=torch.float64)
     fit = FixedPointLinear(sigma=sigma, d=d).fit(X, Y)
@@ -123,7 +123,7 @@ def test_hbk_from_least_squares_is_trapped():
     torch.testing.assert_close(fit.coef_, published("hbk", 1.5, "least_squares"), rtol=1e-5, atol=0)
 
 
-def test_the_robust_end_is_kept_where_leverage_points_make_another_one_lower():
+def test_the_robust_minimum_is_kept_where_leverage_points_make_another_lower():
     X, y = DATA_SETS["hbk"]()
     fit = FixedPointLinear(sigma=1.5, d=1.0).fit(X, y)
     trapped = FixedPointLinear(sigma=1.5, d=1.0, start="least_squares").fit(X, y)
@@ -193,7 +193,7 @@ def test_the_objective_counts_sample_weights():
     torch.testing.assert_close(fit.history_[-1], repeated.history_[-1], rtol=1e-9, atol=0)
 
 
-def test_convergence_is_told():
+def test_convergence_is_reported():
     X, y = contaminated_line(0)
     assert bool(FixedPointLinear(sigma=2.0).fit(X, y).converged_)
     short = FixedPointLinear(sigma=2.0, max_iter=1, start=torch.zeros(3).double()).fit(X, y)
@@ -235,7 +235,7 @@ def test_a_diagonal_noise_covariance_is_d_squared():
 @pytest.mark.parametrize(
     "covariance", [torch.eye(3), torch.tensor([[1.0, 2.0], [2.0, 1.0]]), torch.tensor([[1.0, 0.5], [0.0, 1.0]])]
 )
-def test_a_noise_covariance_that_is_none_is_refused(covariance):
+def test_an_invalid_noise_covariance_is_refused(covariance):
     with pytest.raises(ValueError, match="`noise_covariance`"):
         FixedPointLinear(noise_covariance=covariance).fit(*channels(0, m=2))
 
@@ -488,7 +488,7 @@ def test_starts_agree_where_there_is_one_minimum():
         torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-8)
 
 
-def test_being_led_from_a_wide_bandwidth_ends_lower_where_minima_are_many():
+def test_graduation_from_a_wide_bandwidth_ends_lower_where_minima_are_many():
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(100, 3, generator=generator, dtype=torch.float64)
     Y = X.sum(-1) + torch.randn(60, 100, generator=generator, dtype=torch.float64)

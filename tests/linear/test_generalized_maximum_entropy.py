@@ -1,4 +1,4 @@
-"""Generalised maximum entropy: the constrained problem itself by SciPy, singular X, supports, refusals."""
+"""Generalised maximum entropy: comparison with SciPy, singular X, supports, refusals."""
 
 import math
 
@@ -18,7 +18,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def primal(X: np.ndarray, y: np.ndarray, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
-    """(35)-(38) over the probabilities themselves, by sequential quadratic programming."""
+    """(35)-(38) by sequential quadratic programming over the probabilities."""
     N, n, l, k = *X.shape, z.shape[-1], v.shape[-1]  # noqa: E741
 
     def split(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +43,7 @@ def primal(X: np.ndarray, y: np.ndarray, z: np.ndarray, v: np.ndarray) -> tuple[
 
 
 @pytest.mark.parametrize("rank_deficient", [False, True])
-def test_the_constrained_problem_solved_as_it_stands(rank_deficient):
+def test_it_solves_the_constrained_problem(rank_deficient):
     X = sample(0, 6, 3)
     if rank_deficient:
         X[:, 2] = X[:, 0] - X[:, 1]
@@ -55,7 +55,7 @@ def test_the_constrained_problem_solved_as_it_stands(rank_deficient):
     assert float(fit.entropy_) == pytest.approx(entropy, abs=1e-8)
 
 
-def test_what_it_finds_satisfies_the_constraints_and_is_stationary():
+def test_the_solution_satisfies_the_constraints_and_is_stationary():
     X, y = sample(2, 40, 4), sample(3, 40)
     fit = GeneralizedMaximumEntropy(10.0, 8.0).fit(X, y)
     p, w = fit.probabilities_, fit.error_probabilities_[:, 0]
@@ -66,14 +66,14 @@ def test_what_it_finds_satisfies_the_constraints_and_is_stationary():
     torch.testing.assert_close((w * 8 * POINTS).sum(-1), fit.error_[:, 0], rtol=1e-12, atol=1e-12)
     # log w = -λ v + const and log p = -z Xᵀλ + const
     multiplier = -(torch.log(w[:, -1]) - torch.log(w[:, 0])) / 16
-    pull = -(torch.log(p[:, -1]) - torch.log(p[:, 0])) / 20
-    torch.testing.assert_close(X.T @ multiplier, pull, rtol=1e-7, atol=1e-9)
+    tilt = -(torch.log(p[:, -1]) - torch.log(p[:, 0])) / 20
+    torch.testing.assert_close(X.T @ multiplier, tilt, rtol=1e-7, atol=1e-9)
     total = -(p * p.log()).sum() - (w * w.log()).sum()
     assert float(fit.entropy_) == pytest.approx(float(total), rel=1e-12)
 
 
 def test_wide_supports_give_ridge_regression():
-    # the entropy is quadratic near even distributions: variances c² / 2 and d² / 2 of the five points
+    # the entropy is quadratic near uniform distributions: variances c² / 2 and d² / 2 of the five points
     X, y = sample(4, 30, 3), sample(5, 30)
     c, d = 2e3, 1e4
     fit = GeneralizedMaximumEntropy(c, d).fit(X, y)
@@ -155,7 +155,7 @@ def test_float32_gives_the_fit_of_float64():
     )
 
 
-def test_supports_that_cannot_hold_are_refused_by_the_sample():
+def test_infeasible_supports_are_refused_with_the_sample():
     X, y = torch.ones(10, 1).double(), torch.ones(10).double()
     y[6] = 100.0
     with pytest.raises(ValueError, match=r"sample 6 .* widen"):
@@ -167,7 +167,7 @@ def test_errors_that_have_to_be_at_the_end_of_their_support_are_refused(seed):
     X = sample(seed, 10, 3)
     supports = torch.linspace(-10, 10, 5).double(), torch.linspace(-3, 3, 5).double()
     y = torch.full((10,), 3.0).double()
-    with pytest.raises(ValueError, match=r"sample \d+ .* is left over; widen `coef_support` or `error_support`"):
+    with pytest.raises(ValueError, match=r"sample \d+ .* remains unexplained; widen `coef_support` or `error_support`"):
         GeneralizedMaximumEntropy(*supports).fit(X, y)
     wider = GeneralizedMaximumEntropy(supports[0], 2.0 * supports[1]).fit(X, y)
     torch.testing.assert_close(X @ wider.coef_ + wider.error_.squeeze(-1), y, rtol=0, atol=1e-8)

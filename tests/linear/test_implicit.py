@@ -1,4 +1,4 @@
-"""Fits as differentiable layers: against unrolled steps, differences of whole fits, transforms, limits and refusals."""
+"""Fits as differentiable layers: comparison with unrolled steps and finite differences, transforms, limits, refusals."""
 
 import math
 
@@ -25,7 +25,7 @@ def leaves(*values: Tensor) -> list[Tensor]:
 
 
 def line(seed: int, N: int = 40, n: int = 3, batch: tuple[int, ...] = ()) -> tuple[Tensor, Tensor, Tensor]:
-    """X, y and weights of one channel, a fifth of it far off on both sides."""
+    """X, y and weights of one channel; a fifth of y are outliers on both sides."""
     X = sample(seed, *batch, N, n)
     y = X.sum(-1) + 0.3 * sample(seed + 1, *batch, N)
     y[..., : N // 5] += 6.0 * sample(seed + 2, *batch, N // 5)
@@ -33,7 +33,7 @@ def line(seed: int, N: int = 40, n: int = 3, batch: tuple[int, ...] = ()) -> tup
 
 
 def channels(seed: int, N: int = 50) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """X, Y, weights of single values, σ and d of three channels that differ in scale."""
+    """X, Y, weights of values, σ and d of three channels with different scales."""
     d = torch.tensor([0.2, 1.0, 5.0]).double()
     X = sample(seed, N, 3, 4)
     Y = X.sum(-1) + d * sample(seed + 1, N, 3)
@@ -46,7 +46,7 @@ def fixed_point(X: Tensor, Y: Tensor, weight: Tensor, sigma: Tensor, d: Tensor) 
 
 
 def unrolled(X: Tensor, Y: Tensor, weight: Tensor, sigma: Tensor, d: Tensor, steps: int = 300) -> Tensor:
-    """Autograd through (15) from the solution on, by explicit sums."""
+    """Autograd through (15) from the solution, by explicit sums."""
     coef = FixedPointLinear(sigma.detach(), d.detach()).fit(X.detach(), Y.detach(), weight.detach()).coef_
     for _ in range(steps):
         w = weight * torch.exp(-((Y - X @ coef) ** 2) / (2 * d**2 * sigma**2)) / d**2
@@ -73,10 +73,12 @@ def test_the_hessian_is_that_of_the_loss_and_not_the_gram_matrix_of_the_step():
     (slope,) = grad(coef[0], leaf)
     z2 = ((Y - X @ coef.detach()) / d) ** 2
     w = weight * torch.exp(-z2 / (2 * sigma**2)) / d**2
-    bend = w * (1 - z2 / sigma**2)
-    right, wrong = (torch.linalg.inv(torch.einsum("ki,kin,kil->nl", a, X, X)) for a in (bend, w))
-    torch.testing.assert_close(slope, torch.einsum("n,kin,ki->ki", right[0], X, bend), rtol=1e-9, atol=1e-12)
-    other = torch.einsum("n,kin,ki->ki", wrong[0], X, bend)
+    curvature_weight = w * (1 - z2 / sigma**2)
+    right, wrong = (torch.linalg.inv(torch.einsum("ki,kin,kil->nl", a, X, X)) for a in (curvature_weight, w))
+    torch.testing.assert_close(
+        slope, torch.einsum("n,kin,ki->ki", right[0], X, curvature_weight), rtol=1e-9, atol=1e-12
+    )
+    other = torch.einsum("n,kin,ki->ki", wrong[0], X, curvature_weight)
     assert float((slope - other).norm()) > 0.05 * float(slope.norm())
 
 
@@ -87,7 +89,7 @@ def test_gradients_are_differences_of_fits_in_both_modes():
 
 
 @pytest.mark.e2e
-def test_second_derivatives_are_differences_of_first_ones():
+def test_second_derivatives_are_differences_of_first_derivatives():
     X, y, weight = line(0, N=10, n=2)
     inputs = leaves(X, y, weight, torch.tensor(1.7).double(), torch.tensor(0.6).double())
     assert gradgradcheck(fixed_point, inputs, check_fwd_over_rev=True, fast_mode=True)
@@ -115,7 +117,7 @@ def test_an_infinite_sigma_has_the_derivatives_of_weighted_least_squares():
     assert slopes[4].abs().item() < 1e-12
 
 
-def test_columns_of_different_size_and_nearly_dependent_ones():
+def test_columns_of_different_size_and_nearly_dependent_columns():
     X, y, weight = line(3, N=30)
     mix = torch.tensor([[1e6, 1.0, 0.0], [0.0, 1e-3, 1.0], [0.0, 0.0, 1.001]]).double()
     straight, mixed = leaves(y, y)
@@ -146,7 +148,7 @@ def test_float32_agrees_with_float64():
         torch.testing.assert_close(single, double, rtol=0, atol=1e-4 * float(double.abs().max()))
 
 
-def test_samples_of_weight_0_have_no_say_but_a_derivative_in_their_weight():
+def test_samples_of_weight_0_have_no_influence_but_a_derivative_by_their_weight():
     X, y, weight = line(0)
     weight[:8] = 0.0
     y[0] = 1e6
@@ -291,7 +293,7 @@ def test_an_ellipsoid_follows_its_points():
 # transforms
 
 
-def test_a_forward_derivative_is_the_backward_one():
+def test_forward_and_backward_derivatives_agree():
     inputs = channels(0)
     tangents = [sample(20 + i, *v.shape) for i, v in enumerate(inputs)]
     _, forward = torch.func.jvp(fixed_point, inputs, tuple(tangents))
@@ -364,11 +366,11 @@ def test_a_hessian_by_forward_over_reverse_is_symmetric():
     torch.testing.assert_close(hessian, hessian.mT, rtol=1e-9, atol=1e-12)
 
 
-# no derivative wanted
+# without derivatives
 
 
 @pytest.mark.parametrize("estimator", [FixedPointLinear(2.0, 0.3), MKCRegression()])
-def test_nothing_is_recorded_where_nothing_is_wanted(estimator):
+def test_nothing_is_recorded_without_a_gradient(estimator):
     X, y, weight = line(0)
     plain = estimator.fit(X, y, weight).coef_
     assert not plain.requires_grad
@@ -407,7 +409,7 @@ TWO_CLUSTERS = torch.tensor([-2.0, 2.0]).double().repeat(5)
 
 
 def between(y: Tensor) -> FixedPointLinear:
-    """A mean that starts and stays halfway between two clusters, where the loss has its maximum."""
+    """A mean that stays halfway between two clusters, where the loss has its maximum."""
     start = torch.zeros(*y.shape[:-1], 1).double()
     return FixedPointLinear(1.0, 1.0, start=start).fit(torch.ones(10, 1).double(), y)
 
@@ -436,13 +438,13 @@ def test_a_direction_that_no_weight_is_left_for_is_refused():
 
 
 @pytest.mark.parametrize("estimator", [FixedPointLinear(2.0, 0.3, max_iter=2), MKCRegression(max_iter=2)])
-def test_a_fit_short_of_rest_is_refused(estimator):
+def test_a_fit_that_has_not_converged_is_refused(estimator):
     X, y, weight = line(0)
     plain = estimator.fit(X, y, weight).coef_
     fit = estimator.fit(X, y.requires_grad_(), weight)
     assert not bool(fit.converged_)
     torch.testing.assert_close(fit.coef_.detach(), plain, rtol=1e-12, atol=1e-13)
-    with pytest.raises(NotDifferentiableError, match="a fit at rest to differentiate but got a fit short of it; raise"):
+    with pytest.raises(NotDifferentiableError, match="a converged fit .* has not converged; raise `max_iter`"):
         fit.coef_.sum().backward()
 
 
@@ -461,7 +463,7 @@ def test_a_problem_without_a_derivative_can_be_left_out():
         grad(fit.coef_, y, torch.eye(2).double().unsqueeze(-1), is_grads_batched=True)
 
 
-def test_bad_input_is_refused_as_ever():
+def test_bad_input_is_refused():
     X, y, _ = line(0)
     leaf = X.clone().requires_grad_()
     with pytest.raises(ValueError, match="Expected argument `Y` to be finite"):
@@ -488,7 +490,7 @@ def test_features_under_a_robust_last_layer_learn_from_contaminated_samples():
     head = FixedPointLinear(2.0, 0.5)
     losses = []
     for _ in range(60):
-        # fitted on the first twenty samples, outliers among them, and judged on the others
+        # fitted on the first twenty samples, with outliers, and judged on the others
         fit = head.fit(features(x[:, :20]), y[:, :20])
         per_task = (fit.predict(features(x[:, 20:])) - y[:, 20:]).square().mean(-1)
         loss = per_task[fit.differentiable_].mean()
@@ -501,7 +503,7 @@ def test_features_under_a_robust_last_layer_learn_from_contaminated_samples():
 
 def test_weights_of_samples_are_learned():
     X, y, _ = line(0, N=60)
-    y[:20] += 1.0  # too near for a robust loss to tell
+    y[:20] += 1.0  # too near for a robust loss to reject
     logits = torch.zeros(60, dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([logits], lr=0.1)
     for _ in range(25):

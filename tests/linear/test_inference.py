@@ -46,7 +46,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def line(seed: int, N: int, n: int = 3, *batch: int, outliers: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Gaussian errors around coefficients 1, 2, …; outliers lie far out in X and on one side."""
+    """Gaussian errors about coefficients 1, 2, …; outliers are far out in X and one-sided."""
     X = torch.cat([torch.ones(*batch, N, 1, dtype=torch.float64), sample(seed, *batch, N, n - 1)], -1)
     y = torch.matmul(X, torch.arange(1.0, n + 1.0, dtype=torch.float64)) + sample(seed + 1, *batch, N)
     wrong = int(outliers * N)
@@ -59,7 +59,7 @@ def set_to(estimator: Inference, **parameters: object) -> Inference:
 
 
 @pytest.mark.parametrize("estimator", ALL, ids=label)
-def test_what_follows_from_the_covariance_has_the_shapes_of_the_batch(estimator):
+def test_inference_has_the_shapes_of_the_batch(estimator):
     X, y = line(0, 40, 3, 2, 2)
     fit = set_to(estimator).fit(X, y)
     assert fit.covariance_.shape == (2, 2, 3, 3)
@@ -77,18 +77,18 @@ def test_what_follows_from_the_covariance_has_the_shapes_of_the_batch(estimator)
 
 @pytest.mark.parametrize("covariance", ["sandwich", "hac", "homoscedastic"])
 @pytest.mark.parametrize("estimator", ROBUST, ids=label)
-def test_units_and_mixtures_of_columns_go_through(estimator, covariance):
+def test_covariances_are_equivariant(estimator, covariance):
     X, y = line(2, 60, outliers=0.1)
     mix = torch.tensor([[1.0, 0.5, 0.0], [0.0, 30.0, 1.0], [0.0, 2.0, -0.01]], dtype=torch.float64)
     one = set_to(estimator, covariance=covariance, bandwidth=4.0).fit(X, y)
     other = set_to(one).fit(X @ mix, 1e3 * y)
     back = mix @ other.covariance_ @ mix.mT / 1e6
-    # the searches start elsewhere, and end at half of the digits
+    # the searches start elsewhere, and are converged to half of the digits
     torch.testing.assert_close(back, one.covariance_, rtol=1e-3, atol=1e-6)
     torch.testing.assert_close(other.r_squared_, one.r_squared_, rtol=1e-4, atol=1e-4)
 
 
-def test_with_nothing_rejected_they_are_those_of_least_squares():
+def test_without_rejections_standard_errors_are_those_of_least_squares():
     X, y = line(4, 50)
     N, n = X.shape
     plain = LeastSquares().fit(X, y)
@@ -112,15 +112,15 @@ def test_with_nothing_rejected_they_are_those_of_least_squares():
 @pytest.mark.parametrize(
     "estimator", [MMRegression(), SRegression(), MEstimator("tukey", scale="proposal2")], ids=label
 )
-def test_the_influence_is_what_a_little_more_weight_of_a_sample_moves(estimator):
-    """Oracle of the scale's part too: the errors are skew, so that the scale moves the intercept."""
+def test_the_influence_is_the_derivative_by_a_samples_weight(estimator):
+    """The errors are skew, so that the scale moves the intercept and its influence is tested too."""
     N, step = 60, 1e-4
     X = torch.cat([torch.ones(N, 1, dtype=torch.float64), sample(6, N, 1)], -1)
     y = X.sum(-1) + torch.exp(0.8 * sample(7, N))
     weight = torch.ones(N, N, dtype=torch.float64) + step * torch.eye(N, dtype=torch.float64)
     plain = set_to(estimator).fit(X, y)
     moved = (set_to(estimator).fit(X.expand(N, N, 2), y.expand(N, N), weight).coef_ - plain.coef_) / step
-    moved = moved - moved.mean(0)  # the scale's denominator N - p grows with each
+    moved = moved - moved.mean(0)  # the scale's denominator N - p grows with every weight
     by_refitting = moved.mT @ moved * N / (N - 2)
     wider = 1.0 + 6.0 * 2 / N if isinstance(estimator, SRegression) else 1.0
     torch.testing.assert_close(plain.covariance_, wider**2 * by_refitting, rtol=0.03, atol=1e-5)
@@ -160,7 +160,7 @@ def test_a_series_of_no_lags_is_the_sandwich_and_a_slow_one_is_less_certain(esti
     "estimator", [MMRegression(starts=40), MEstimator("tukey"), ReweightedLeastSquares(starts=40)], ids=label
 )
 def test_intervals_cover(estimator, outliers):
-    """300 draws of 100 samples, outliers far out in X; 95 % with a deviation of chance of 0.7 %."""
+    """300 draws of 100 samples, outliers far out in X; the 95 % share has a standard deviation of 0.7 %."""
     X, y = line(12, 100, 3, 300, outliers=outliers)
     interval = set_to(estimator).fit(X, y).confidence_interval()
     truth = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
@@ -172,7 +172,7 @@ def test_intervals_cover(estimator, outliers):
     ("estimator", "widest"), [(LeastTrimmedSquares(starts=40), 1.4), (SRegression(starts=40), 1.8)], ids=label
 )
 def test_standard_errors_of_few_samples_are_those_of_the_draws(estimator, widest):
-    """They are widened for few samples, and that is no licence for any width."""
+    """Standard errors are widened for few samples, within limits."""
     X, y = line(5, 80, 4, 200)
     fit = estimator.fit(X, y)
     spread = (fit.coef_ - torch.arange(1.0, 5.0, dtype=torch.float64)).square().mean(0).sqrt()
@@ -192,13 +192,13 @@ def test_a_prediction_adds_the_scale_of_its_channel_to_the_error_of_the_mean():
     torch.testing.assert_close(more / more[..., :1, :1], expected)
 
 
-def test_predictions_of_good_values_are_covered():
+def test_predictions_of_inliers_are_covered():
     X, y = line(14, 200, 3, 100, outliers=0.1)
     fit = MMRegression(starts=40).fit(X, y)
     new_X, new_y = line(99, 200, 3, 100)
     interval = fit.prediction_interval(new_X)
     inside = (interval[..., 0] <= new_y) & (new_y <= interval[..., 1])
-    # the scale of the S-estimate is that of the good values and a tenth more, for the outliers
+    # the scale of the S-estimate is a tenth larger than that of the inliers, because of the outliers
     assert 0.95 <= float(inside.double().mean()) <= 0.985
     mean = fit.mean_interval(new_X)
     truth = torch.matmul(new_X, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
@@ -227,7 +227,7 @@ def test_standard_errors_have_the_derivatives_of_the_fit(estimator, channels, co
 
 
 @pytest.mark.parametrize("estimator", [LeastTrimmedSquares(starts=50), ReweightedLeastSquares(starts=50)], ids=label)
-def test_standard_errors_of_what_counts_have_derivatives(estimator):
+def test_standard_errors_of_the_values_kept_have_derivatives(estimator):
     X, y = line(18, 40, outliers=0.1)
 
     def results(X: Tensor, y: Tensor) -> tuple[Tensor, ...]:
@@ -266,12 +266,12 @@ def test_p_values_are_uniform_where_the_restrictions_hold():
         (([0, 1], torch.ones(3)), r"of shape \(2,\) but got \(3,\)"),
     ],
 )
-def test_restrictions_that_are_none_are_refused(arguments, message):
+def test_invalid_restrictions_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         MMRegression().fit(*line(24, 30)).wald_test(*arguments)
 
 
-def test_a_table_for_people():
+def test_a_table_as_text_and_html():
     X, y = line(26, 60, outliers=0.1)
     frame = pd.DataFrame(X.numpy(), columns=["one", "heat <b>", "[red]drift"])
     fit = MMRegression().fit(frame, pd.Series(y.numpy()))
@@ -323,7 +323,7 @@ def test_an_exact_fit_is_certain_and_holds_no_nan(estimator):
     assert str(flat.summary())
 
 
-def test_as_many_coefficients_as_values_leave_nothing_to_tell_errors_from():
+def test_as_many_coefficients_as_values_have_infinite_errors():
     X, y = line(34, 3)
     assert bool(torch.isinf(SRegression().fit(X, y).covariance_).all())
 
@@ -363,7 +363,7 @@ def test_arguments(estimator):
         estimator().summary()
 
 
-def test_an_estimator_without_covariance_has_none_of_it():
+def test_an_estimator_without_covariance_has_no_inference():
     assert not isinstance(LeastAbsoluteDeviations(), Inference)
     assert issubclass(MMRegression, RobustInference)
 

@@ -1,4 +1,4 @@
-"""MKC-EM on many rows: fully converged, the same function as on few, in few passes and without copies of the data."""
+"""MKC-EM on many rows: converged, the same function as on few rows, in few passes and without copies of the data."""
 
 import math
 
@@ -13,10 +13,10 @@ from mkc_torch.linear._blocks import Density, blocks, energy_of, kernel, residua
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._passes import Rows
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
-from mkc_torch.linear._problem import laid_out, linear_problem
+from mkc_torch.linear._problem import checked_shapes, linear_problem
 
 N = 24_000
-"""Rows of a fit that begins with a pilot."""
+"""Rows of a fit that starts with a pilot."""
 
 
 def normal(seed: int, *shape: int) -> Tensor:
@@ -24,7 +24,7 @@ def normal(seed: int, *shape: int) -> Tensor:
 
 
 def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tuple[Tensor, Tensor]:
-    """y = X 1 + noise, the first rows with an outlier of 15: sorted, so that no part of the rows is like all."""
+    """y = X 1 + noise, the first rows with an outlier of 15: sorted, so that no part of the rows represents all."""
     X = normal(seed, rows, n)
     X[:, 0] = 1.0
     y = X.sum(-1) + normal(seed + 1, rows)
@@ -33,7 +33,7 @@ def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tupl
 
 
 def clustered() -> tuple[Tensor, Tensor]:
-    """Two fifths of the rows in a far cluster of X, where y is wrong."""
+    """Two fifths of the rows are a far cluster of X with wrong y."""
     X, y = sample(share=0.0)
     bad = 2 * N // 5
     X[:bad, 1:] = 8.0 + 0.1 * normal(4, bad, 4)
@@ -47,7 +47,7 @@ def heavy_tailed() -> tuple[Tensor, Tensor]:
 
 
 def channels() -> tuple[Tensor, Tensor]:
-    """Two channels with columns of their own beside a common one, the first with outliers."""
+    """Two channels with their own columns and a common column, the first with outliers."""
     X = torch.zeros(N, 2, 3, dtype=torch.float64)
     X[..., 0] = 1.0
     X[:, 0, 1], X[:, 1, 2] = normal(2, N), normal(3, N)
@@ -57,7 +57,7 @@ def channels() -> tuple[Tensor, Tensor]:
 
 
 def seldom() -> tuple[Tensor, Tensor]:
-    """A column that is 1 in 30 rows and else 0."""
+    """A column that is 1 in 30 rows and 0 elsewhere."""
     X, y = sample()
     X = torch.cat([X, torch.zeros(N, 1).double()], 1)
     X[:: N // 30, -1] = 1.0
@@ -96,7 +96,7 @@ HARD = {
 
 @pytest.fixture
 def piloted(monkeypatch) -> list[bool]:
-    """Of each fit that is large, whether it ended as one, and was not left to the alternation over all rows."""
+    """For each large fit, whether it ended as such and not in the alternation over all rows."""
     ends: list[bool] = []
     whole = _large.large_maximum
 
@@ -110,12 +110,12 @@ def piloted(monkeypatch) -> list[bool]:
 
 
 def directly(monkeypatch) -> None:
-    """No fit is large from here on."""
+    """Fit directly, without a pilot, from here on."""
     monkeypatch.setattr(_large, "LARGE", 1 << 60)
 
 
 def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = None, **given: float) -> MKCRegression:
-    """Fully converged on the same domain, by the Newton steps of a fit as a layer."""
+    """The converged fit on the same domain, by the Newton steps of a differentiable fit."""
     rest = MKCRegression(bound=fit.bound_, start=fit.coef_, **given).fit(X.clone().requires_grad_(), Y, weight)
     rest.coef_, rest.sigma_, rest.d_ = rest.coef_.detach(), rest.sigma_.detach(), rest.d_.detach()
     rest.weights_, rest.log_likelihood_ = rest.weights_.detach(), rest.log_likelihood_.detach()
@@ -123,7 +123,7 @@ def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = 
 
 
 def apart(fit: MKCRegression, other: MKCRegression) -> float:
-    """Between coefficients, in standard errors."""
+    """Largest difference of the coefficients, in standard errors."""
     return float(((fit.coef_ - other.coef_).abs() / other.standard_error_).detach().max())
 
 
@@ -133,7 +133,7 @@ def test_a_large_fit_is_fully_converged(case, piloted):
     fit = MKCRegression().fit(X, Y)
     assert piloted == [True]
     rest = converged(fit, X, Y)
-    # coefficients of 1e8 have a last place of their own
+    # coefficients of 1e8 have coarser last digits
     assert apart(fit, rest) < (1e-4 if "far" in case else 1e-6)
     gaussian = torch.isinf(rest.sigma_)
     assert torch.equal(torch.isinf(fit.sigma_), gaussian)
@@ -188,7 +188,7 @@ def test_any_start_ends_at_the_same_maximum(start, piloted):
     assert piloted[-1]
 
 
-def test_a_weight_of_0_is_removal_and_one_of_2_repetition(piloted):
+def test_weight_0_is_removal_and_weight_2_is_repetition(piloted):
     X, y = sample()
     weight = torch.arange(N).double() % 3
     y[::3] = 1e6  # of no weight
@@ -210,7 +210,7 @@ def test_the_seed_hardly_matters_and_not_at_all_on_a_given_domain():
     assert max(apart(fit, fits[0]) for fit in fits) < 1e-6
 
 
-def test_nothing_jumps_where_fits_become_large(monkeypatch, piloted):
+def test_results_are_continuous_where_fits_become_large(monkeypatch, piloted):
     X, y = sample(rows=6000)
     monkeypatch.setattr(_large, "LARGE", 6000)
     large = MKCRegression(bound=20.0).fit(X, y)
@@ -290,7 +290,7 @@ def test_gradients_through_a_large_fit(piloted):
 
 
 class Largest(TorchDispatchMode):
-    """The most elements of a tensor that an operation makes, those that share the memory of ``given`` not counted."""
+    """Number of elements of the largest tensor that an operation creates, except views of ``given``."""
 
     def __init__(self, *given: Tensor) -> None:
         super().__init__()
@@ -320,7 +320,7 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
     with Largest(X, y) as largest:
         MKCRegression().fit(X, y)
     assert read < 12 * rows
-    # weights, and no more than that at once
+    # the weights, and nothing larger at once
     assert largest.most == rows
 
 
@@ -331,22 +331,22 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     weight = torch.arange(2 * N).double().reshape(N, 2) % 3 if weighted else None
     beta = torch.tensor([1.1, 0.9, 1.2]).double()
     density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
-    total, bends = Rows(X, Y, weight).look(beta, density, bend=True)
-    assert bends is not None
+    total, curvature_sums = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    assert curvature_sums is not None
     problem = linear_problem(X, Y, weight)
     in_basis = problem.in_basis(beta)
     normalised = None if weight is None else weight / weight.sum(0)
     log_d = torch.log(density.d)
-    wanted = energy_derivatives(problem.residual(in_basis)[0], normalised, density.kappa, log_d)
-    for mine, value in zip(energy_of(total, density.kappa), wanted, strict=True):
+    expected = energy_derivatives(problem.residual(in_basis)[0], normalised, density.kappa, log_d)
+    for mine, value in zip(energy_of(total, density.kappa), expected, strict=True):
         torch.testing.assert_close(mine / total.weight, value, rtol=1e-7, atol=1e-9)
     covariance = coefficient_covariance(problem, in_basis, density.kappa[None], density.d[None], "sandwich", None)
     used = 2 * N if weight is None else int((weight > 0).sum())
-    torch.testing.assert_close(_large._sandwich(bends, used, used - 3), covariance, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(_large._sandwich(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
     monkeypatch.setattr(_blocks, "_STRIP", 100)
     monkeypatch.setattr(_passes, "blocks", lambda *args: blocks(*args, 1234))
-    again, bent = Rows(X, Y, weight).look(beta, density, bend=True)
-    for one, other in zip((*total, *bends), (*again, *(bent or ())), strict=True):
+    again, transformed = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    for one, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-6)
 
 
@@ -355,12 +355,14 @@ def test_a_frame_is_a_change_of_columns():
     frame = torch.linalg.inv(normal(9, 5, 5))
     density = Density(torch.tensor([0.2]).double(), torch.tensor([1.0]).double())
     beta = torch.ones(5).double()
-    plain, bends = Rows(X[:, None], y[:, None], None).look(beta, density, bend=True)
-    framed, bent = Rows(X[:, None], y[:, None], None, frame).look(torch.linalg.solve(frame, beta), density, bend=True)
-    assert bends is not None
-    assert bent is not None
+    plain, curvature_sums = Rows(X[:, None], y[:, None], None).evaluate(beta, density, with_curvature=True)
+    framed, transformed = Rows(X[:, None], y[:, None], None, frame).evaluate(
+        torch.linalg.solve(frame, beta), density, with_curvature=True
+    )
+    assert curvature_sums is not None
+    assert transformed is not None
     torch.testing.assert_close(framed.score, plain.score @ frame)
-    torch.testing.assert_close(bent.curvature, frame.mT @ bends.curvature @ frame)
+    torch.testing.assert_close(transformed.curvature, frame.mT @ curvature_sums.curvature @ frame)
 
 
 def test_score_is_the_slope_of_the_energy():
@@ -380,19 +382,19 @@ def test_score_is_the_slope_of_the_energy():
         assert float(slope) == pytest.approx(-float(energy_at(beta)[1 + k] / density.d.square()), rel=1e-6)
 
 
-def test_rows_are_drawn_of_those_in_use_and_seldom_ones_by_leverage():
+def test_rows_in_use_are_drawn_and_rare_rows_by_leverage():
     X, y = seldom()
     weight = (torch.arange(N) % 2).double()
-    index = drawn_rows(laid_out(X, y, weight), 2000, 0)
+    index = drawn_rows(checked_shapes(X, y, weight), 2000, 0)
     assert (weight[index] == 1).all()
     assert (index.diff() > 0).all()
-    found = pilot_problem(laid_out(X, y), 0)
+    found = pilot_problem(checked_shapes(X, y), 0)
     assert found is not None
     problem, alike = found
     assert not alike
     assert int((problem.basis[0, :, 0] @ torch.linalg.inv(problem.to_coef[0]))[:, -1].round().sum()) >= 25
     X, y = sample()
-    found = pilot_problem(laid_out(X, y), 0)
+    found = pilot_problem(checked_shapes(X, y), 0)
     assert found is not None
     assert found[1]
 

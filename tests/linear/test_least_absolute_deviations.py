@@ -1,4 +1,4 @@
-"""Least absolute deviations: the optimum of the linear program, whatever the data."""
+"""Least absolute deviations: the optimum of the linear program for all kinds of data."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def heavy(seed: int, *shape: int) -> Tensor:
-    """Noise of Student's t with two degrees of freedom or so: tails, but a finite mean."""
+    """Noise like Student's t with two degrees of freedom: heavy tails, but a finite mean."""
     return sample(seed, *shape) / (sample(seed + 1, *shape).square() + sample(seed + 2, *shape).square()).sqrt()
 
 
@@ -111,7 +111,7 @@ def test_weights_of_very_different_size():
 
 def test_batch_equals_loop():
     X, y = sample(0, 6, 25, 3).unsqueeze(-2), heavy(1, 6, 25).unsqueeze(-1)
-    y[2] = torch.matmul(X[2], torch.ones(3, dtype=X.dtype))  # one that is done at once
+    y[2] = torch.matmul(X[2], torch.ones(3, dtype=X.dtype))  # a problem that needs no iteration
     together = LeastAbsoluteDeviations().fit(X, y)
     for i in range(6):
         alone = LeastAbsoluteDeviations().fit(X[i], y[i])
@@ -193,7 +193,7 @@ def test_vast_outliers_leave_the_coefficients_exact():
     outlier = 3.0 * sample(2, 10, 6).sign()
     near[:, :6] += 1e3 * outlier
     far[:, :6] += 1e9 * outlier
-    # LAD sees the side of an outlier, never its distance
+    # the fit depends on the side of an outlier, not on its distance
     fits = [LeastAbsoluteDeviations().fit(X, v) for v in (near, far)]
     torch.testing.assert_close(fits[1].coef_, fits[0].coef_, rtol=1e-6, atol=1e-6)
     assert bool(fits[1].converged_.all())

@@ -1,4 +1,4 @@
-"""Least entropy-like regression: the published minima, the local minima of H, equivariance, what has no answer."""
+"""Least entropy-like regression: published minima, local minima of H, equivariance, input without a solution."""
 
 import math
 
@@ -25,7 +25,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def problem(seed: int, N: int = 60, n: int = 3, outliers: float = 0.15) -> tuple[Tensor, Tensor]:
-    """A fit with gross outliers in Y, one minimum of H near the truth (1, ..., n)."""
+    """A fit with gross outliers in Y, with a minimum of H near the truth (1, ..., n)."""
     X = sample(seed, N, n)
     y = X @ torch.arange(1.0, n + 1).double() + 0.1 * sample(seed + 1, N)
     bad = int(outliers * N)
@@ -107,7 +107,7 @@ def test_gradient_and_hessian_are_those_of_automatic_differentiation(shared, wei
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_every_minimum_is_one_for_scipy(seed):
+def test_scipy_confirms_every_minimum(seed):
     X, y = problem(seed)
     fit = LeastEntropyLike().fit(X, y)
     h = h_of(X.numpy(), y.numpy())
@@ -121,7 +121,7 @@ def test_every_minimum_is_one_for_scipy(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_outliers_in_y_are_pushed_away(seed):
+def test_outliers_in_y_have_weight_zero(seed):
     X, y = problem(seed, N=200)
     fit = LeastEntropyLike().fit(X, y)
     torch.testing.assert_close(fit.coef_, torch.tensor([1.0, 2.0, 3.0]).double(), rtol=0, atol=0.2)
@@ -159,11 +159,11 @@ def test_starts_given_are_used():
             LeastEntropyLike(starts=bad).fit(X, y)
     with pytest.raises(ValueError, match="`start`"):
         LeastEntropyLike(torch.ones(2).double()).fit(X, y)
-    with pytest.raises(ValueError, match="drop one"):
+    with pytest.raises(ValueError, match="`start` or `starts` but got both"):
         LeastEntropyLike(guess, starts=starts)
 
 
-# equivariance: of the minimum, from starts that move along
+# equivariance: of the minima, from equivariant starts
 
 
 @properties
@@ -262,7 +262,7 @@ def test_float32_gives_the_fit_of_float64():
     torch.testing.assert_close(single.coef_.double(), LeastEntropyLike().fit(X, y).coef_, rtol=1e-4, atol=1e-4)
 
 
-# what has no answer, or an exact one
+# no solution, or an exact one
 
 
 def test_an_exact_fit_is_least_squares_with_entropy_zero():
@@ -278,7 +278,7 @@ def test_an_exact_fit_is_least_squares_with_entropy_zero():
     assert float(fit.weights_[0].min()) == 1.0
 
 
-def test_a_fit_that_is_exact_where_it_counts():
+def test_a_fit_that_is_exact_where_weights_are_positive():
     X = sample(14, 20, 3)
     beta, counts = sample(15, 3), torch.ones(20)
     y = X @ beta
@@ -288,7 +288,7 @@ def test_a_fit_that_is_exact_where_it_counts():
     assert float(fit.entropy_) == 0.0
 
 
-def test_a_channel_without_residuals_spoils_nothing():
+def test_a_channel_without_residuals_does_not_affect_the_others():
     X = torch.zeros(30, 2, 3).double()
     X[:, 0, :2], X[:, 1, 2] = sample(16, 30, 2), 1.0
     y = X[:, 0] @ torch.tensor([1.0, 2.0, 0.0]).double() + sample(17, 30)

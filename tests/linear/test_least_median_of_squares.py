@@ -1,4 +1,4 @@
-"""Least median of squares: published and exhaustive optima, minimax against a linear program, breakdown."""
+"""Least median of squares: published and exhaustive optima, minimax by a linear program, breakdown."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def linear_program(X: np.ndarray, y: np.ndarray) -> float:
-    """The smallest largest absolute residual."""
+    """Minimum over the coefficients of the largest absolute residual."""
     N, n = X.shape
     one = np.ones((N, 1))
     found = linprog(
@@ -58,7 +58,7 @@ def test_minimax_of_a_batch_with_and_without_ties(N, n, whole):
         assert float(fit.height[i]) == pytest.approx(linear_program(X[i].numpy(), y[i].numpy()), abs=1e-6)
 
 
-def test_minimax_minds_only_the_rows_in_use():
+def test_minimax_ignores_rows_that_are_not_in_use():
     X, y = sample(0, 1, 30, 3), sample(1, 1, 30)
     used = torch.arange(30).unsqueeze(0) % 3 > 0
     fit = minimax(X, torch.where(used, y, 1e6), used, torch.zeros(1, 3).double())
@@ -122,7 +122,7 @@ def test_scale_of_gaussian_residuals_is_their_standard_deviation():
     y = 3.0 * sample(0, 40, 100)
     for h in (51, 100):
         fit = LeastMedianOfSquares(h, starts=50).fit(torch.ones(100, 1).double(), y)
-        # the quantile that has been minimised is smaller than that of the errors
+        # the minimised quantile of the residuals is smaller than that of the errors
         assert 0.8 * 3.0 < float(fit.scale_.mean()) < 1.1 * 3.0
 
 

@@ -26,7 +26,7 @@ def lstsq(X: Tensor, y: Tensor) -> Tensor:
 
 
 def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.3) -> tuple[Tensor, Tensor]:
-    """X with an intercept column and y = X 1 + noise, the first rows far off."""
+    """X with an intercept column and y = X 1 + noise, with outliers in the first rows."""
     X = torch.cat([torch.ones(N, 1).double(), sample(seed, N, n - 1)], 1)
     y = X.sum(-1) + 0.1 * sample(seed + 1, N)
     y[: int(share * N)] += 10.0 + sample(seed + 2, int(share * N))
@@ -56,7 +56,7 @@ def test_the_published_optimum_is_found(name):
 
 
 @pytest.mark.parametrize("name", [n for n in REFERENCE if REFERENCE[n].lts is not None])
-def test_rows_rejected_at_two_and_a_half_scales_include_the_published_ones(name):
+def test_rows_rejected_at_two_and_a_half_scales_include_the_published_rows(name):
     X, y = DATA_SETS[name]()
     fit = LeastTrimmedSquares().fit(X, y)
     far = (y - fit.predict(X)).abs() / fit.scale_ > 2.5
@@ -106,7 +106,7 @@ def test_no_exchange_of_two_samples_lowers_the_sum():
     assert float(sums.min()) >= float(fit.objective_) * (1 - 1e-9)
 
 
-def test_the_gradient_is_that_of_least_squares_on_what_counts():
+def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
     X, y = contaminated_line(0)
     keep = LeastTrimmedSquares().fit(X, y).weights_[:, 0]
     for leaf in (X, y):
@@ -241,7 +241,7 @@ def test_many_samples_are_screened_on_a_part_and_finished_on_all():
     torch.testing.assert_close(lstsq(X[keep], y[keep]), fit.coef_, rtol=1e-6, atol=1e-8)
 
 
-def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
+def test_an_exact_fit_is_found_with_forty_per_cent_outliers():
     X = torch.cat([torch.ones(50, 1).double(), sample(0, 50, 2)], 1)
     y = X @ torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     y[:20] = 50.0 + sample(1, 20)
@@ -282,7 +282,7 @@ def test_each_channel_keeps_its_own_samples():
     assert float(fit.weights_[30:55, 1].sum()) == 0.0
 
 
-def test_a_channel_fitted_exactly_does_not_blind_the_others():
+def test_a_channel_fitted_exactly_does_not_hide_the_others():
     X, Y = two_channels(0, 1.0)
     Y[:, 0] = X[:, 0].sum(-1)
     fit = LeastTrimmedSquares().fit(X, Y)
@@ -309,12 +309,12 @@ def test_one_seed_gives_one_result():
     state = torch.random.get_rng_state()
     one, other = LeastTrimmedSquares(starts=3, seed=5).fit(X, y), LeastTrimmedSquares(starts=3, seed=5).fit(X, y)
     assert torch.equal(one.coef_, other.coef_)
-    assert torch.equal(torch.random.get_rng_state(), state)  # the global generator is left alone
+    assert torch.equal(torch.random.get_rng_state(), state)  # the global generator is not used
 
 
 def test_the_seed_chooses_the_starts():
     X, y, _ = clustered(0, 1)
-    # weights, so that no exchange finishes what the starts began
+    # with weights no exchange improves the result of the starts
     found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X[0], y[0], torch.ones(300)).objective_) for s in range(8)}
     assert len(found) > 1
 

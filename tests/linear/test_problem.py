@@ -1,4 +1,4 @@
-"""The checked linear problem: shapes, the orthonormal basis, and the errors that say what to do."""
+"""The checked linear problem: shapes, the orthonormal basis, and errors with remedies."""
 
 import pytest
 import torch
@@ -42,8 +42,8 @@ def test_both_forms_are_read(x_shape, y_shape, single, canonical):
     ("A", "B", "n", "single"),
     [
         (100, 3, 2, False),  # samples of three channels
-        (4, 50, 3, True),  # more channels than samples are not meant
-        (100, 50, 3, True),  # nor more than 16
+        (4, 50, 3, True),  # more channels than samples are read as samples
+        (100, 50, 3, True),  # as are more than 16
         (100, 16, 3, False),
         (100, 17, 3, True),
         (100, 17, 17, False),  # as many channels as coefficients
@@ -170,7 +170,7 @@ def test_solve_gram_equals_solve_and_falls_back_to_the_least_norm():
 def test_dependent_columns_are_named():
     X = sample(0, 20, 4)
     X[:, 3] = 2 * X[:, 1]
-    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] are linearly dependent .* remove one of them"):
+    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] are linearly dependent .* remove a column"):
         linear_problem(X, sample(1, 20))
 
 
@@ -249,7 +249,7 @@ def test_integer_dtype_raises(name):
         linear_problem(**values)
 
 
-def test_what_is_no_tensor_raises():
+def test_other_types_raise():
     with pytest.raises(TypeError, match="`Y` to be a real floating-point tensor but got list"):
         linear_problem(sample(0, 2, 1), [1.0, 2.0])
 

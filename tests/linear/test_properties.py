@@ -1,6 +1,6 @@
-"""What every linear estimator promises, one test a property: equivariance, weights, order, batches, exact fits.
+"""Properties of all linear estimators, one test a property: equivariance, weights, order, batches, exact fits.
 
-A new estimator is one line of ``CASES``; a property it does not have is named there with the reason.
+A new estimator is one line of ``CASES``; a property that it lacks is named there with the reason.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ N, n = 20, 3
 
 @dataclass(frozen=True)
 class Case:
-    """An estimator for a given number of samples, and the properties it has not, each with the reason."""
+    """An estimator for a given number of samples, and the properties that it lacks, each with the reason."""
 
     name: str
     make: Callable[[int], LinearEstimator]
@@ -45,9 +45,9 @@ class Case:
 
 
 PENALTY = {
-    "regression": "the penalty draws towards 0",
+    "regression": "the penalty shrinks towards 0",
     "affine": "the penalty is in the units of the columns",
-    "exact": "the penalty draws towards 0",
+    "exact": "the penalty shrinks towards 0",
 }
 GIVEN_SCALE = {"scale": "d is in the unit of Y"}
 GIVEN_BANDWIDTH = {"scale": "the bandwidth is in the unit of Y"}
@@ -60,10 +60,10 @@ OWN_STARTS = {
     "affine": "its minima are equivariant, the starts (50) and (51) from which they are sought are not",
 }
 PRIOR = {
-    "regression": "coefficients are drawn to the middle of their support",
+    "regression": "coefficients shrink to the middle of their support",
     "scale": "the support of the coefficients is in the unit of Y",
     "affine": "the support of the coefficients is in their units",
-    "exact": "coefficients are drawn to the middle of their support",
+    "exact": "coefficients shrink to the middle of their support",
 }
 DETERMINED_BY_PRIOR = ("ridge", "maximum entropy")  # dependent columns are allowed
 

@@ -1,4 +1,4 @@
-"""The ψ functions: the printed formulas, and tuning constants against quadrature and published tables."""
+"""The ψ functions: the published formulas, and tuning constants by quadrature and from published tables."""
 
 import math
 
@@ -112,8 +112,8 @@ def test_bisquare_breakdown_is_the_mean_of_rho():
         ("hampel", (1.0, 2.0, 2.0), "three numbers 0 < a <= b < c"),
     ],
 )
-def test_bad_tuning_is_refused(name, tuning, wanted):
-    with pytest.raises(ValueError, match=f"`tuning` of '{name}' to be {wanted} but got"):
+def test_bad_tuning_is_refused(name, tuning, expected):
+    with pytest.raises(ValueError, match=f"`tuning` of '{name}' to be {expected} but got"):
         checked_tuning(name, tuning)
 
 

@@ -79,7 +79,7 @@ def test_it_is_more_precise_than_its_start():
     assert then < 0.6 * first
 
 
-def test_the_gradient_is_that_of_least_squares_on_what_counts():
+def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
     X, y = sample(0, 20, 2), sample(1, 20)
     y[:3] += 30.0
     keep = ReweightedLeastSquares().fit(X, y).weights_[:, 0]

@@ -161,7 +161,7 @@ def test_columns_of_very_different_size_do_no_harm():
 # breakdown and exact fits
 
 
-def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
+def test_an_exact_fit_is_found_with_forty_per_cent_outliers():
     X = torch.cat([torch.ones(50, 1).double(), sample(0, 50, 2)], 1)
     y = X @ torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     y[:20] = 50.0 + sample(1, 20)
@@ -205,7 +205,7 @@ def test_the_product_of_the_channels_scales_is_minimal():
     assert found.fun >= product(at) * (1 - 1e-7)
 
 
-def test_a_channel_fitted_exactly_does_not_blind_the_others():
+def test_a_channel_fitted_exactly_does_not_hide_the_others():
     X, Y = two_channels(0, 1.0)
     Y[:, 0] = X[:, 0].sum(-1)
     fit = SRegression().fit(X, Y)
@@ -257,7 +257,7 @@ def test_one_seed_gives_one_result():
 
 @pytest.mark.parametrize(("n", "drawn"), [(1, 30), (2, 73), (3, 156), (4, 322), (5, 500), (6, 500), (12, 500)])
 def test_no_more_starts_are_drawn_than_are_worth_it(n, drawn):
-    """1e-9 is the largest probability to miss at 50 % outliers where fewer than asked for are drawn."""
+    """Where fewer starts than requested are drawn, all miss with probability at most 1e-9 at 50 % outliers."""
     assert starts_worth_drawing(500, n) == drawn
     assert drawn == 500 or (1 - 0.5**n) ** drawn <= 1e-9 < (1 - 0.5**n) ** (drawn - 1)
     assert starts_worth_drawing(7, n) == 7
@@ -271,15 +271,15 @@ def test_the_scale_does_not_depend_on_where_it_begins(off, dtype):
     residual = problem.Y.unsqueeze(1)
     rule = MScale(30)
     scale = rule.scale(problem, residual)
-    again, weight = rule.weighed(problem, residual, off * scale)
+    again, weight = rule.weighted(problem, residual, off * scale)
     tolerance = 8 * torch.finfo(dtype).eps
     torch.testing.assert_close(again, scale, rtol=tolerance, atol=0.0)
     expected = bisquare_weight(residual / (BISQUARE_50 * scale.unsqueeze(-2)))
     torch.testing.assert_close(weight, expected, rtol=0.0, atol=100 * tolerance)
 
 
-def test_many_problems_in_one_call_are_fitted_as_each_alone():
-    """More than are worked on at once, some of which come to rest long before others."""
+def test_many_problems_in_one_call_are_fitted_as_separately():
+    """More problems than are processed at once; some converge long before others."""
     X, y = sample(52, 150, 40, 2), sample(53, 150, 40)
     y[::3, :15] = 50.0 + X[::3, :15, 0]
     together = SRegression().fit(X, y)
@@ -291,7 +291,7 @@ def test_many_problems_in_one_call_are_fitted_as_each_alone():
 
 
 def test_derivatives_of_several_channels_are_those_of_refitting():
-    """Channels that disagree each have a slope where their sum has none, and it enters the derivative."""
+    """Channels whose derivatives cancel in the sum: each of them enters the derivative of the fit."""
     X, Y = sample(3, 12, 2, 2), sample(4, 12, 2)
     Y[:, 0] += 2.0 * X[:, 0, 0]
 

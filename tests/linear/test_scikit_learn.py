@@ -1,4 +1,4 @@
-"""The regressor for scikit-learn: scikit-learn's own checks, its tools, and the numbers of the estimator inside."""
+"""The regressor for scikit-learn: scikit-learn's own checks and tools, and equality with the wrapped estimator."""
 
 import numpy as np
 import pytest
@@ -35,17 +35,17 @@ CHECKED = [
     LeastSquares(),
     MKCRegression(),
 ]
-each_checked = pytest.mark.parametrize("estimator", CHECKED, ids=lambda one: type(one).__name__)
+each_checked = pytest.mark.parametrize("estimator", CHECKED, ids=lambda estimator: type(estimator).__name__)
 
 
 def undetermined(_):
     return {
-        "check_sample_weight_equivalence_on_dense_data": "has 30 features of 15 samples, which determine no "
+        "check_sample_weight_equivalence_on_dense_data": "has 30 features of 15 samples, which do not determine the "
         "coefficients; test_a_weight_is_a_repetition does the same with enough samples"
     }
 
 
-@parametrize_with_checks([ScikitLearnRegressor(one) for one in CHECKED], expected_failed_checks=undetermined)
+@parametrize_with_checks([ScikitLearnRegressor(estimator) for estimator in CHECKED], expected_failed_checks=undetermined)
 def test_scikit_learn_finds_nothing_to_object_to(estimator, check):
     check(estimator)
 
@@ -86,7 +86,7 @@ def test_without_an_intercept_least_squares_is_that_of_scikit_learn():
     assert ours.intercept_ == 0.0
 
 
-def test_by_default_outliers_are_survived():
+def test_the_default_is_robust_to_outliers():
     X, y = data()
     fit = ScikitLearnRegressor().fit(X, y)
     np.testing.assert_allclose([*fit.coef_, fit.intercept_], [1.0, -2.0, 0.5, 1.0], atol=0.1)
@@ -94,7 +94,7 @@ def test_by_default_outliers_are_survived():
     assert (fit.weights_[12:] > 0.1).all()
 
 
-def test_float32_stays_so():
+def test_float32_stays_float32():
     X, y = data()
     fit = ScikitLearnRegressor().fit(X.astype(np.float32), y)
     assert fit.coef_.dtype == fit.predict(X.astype(np.float32)).dtype == np.float32
@@ -103,7 +103,7 @@ def test_float32_stays_so():
 @each_checked
 def test_a_weight_is_a_repetition(estimator):
     X, y = data()
-    # in total as many as there are samples, by whose number least trimmed squares chooses the share it keeps
+    # total weight as large as the number of samples, by which least trimmed squares chooses its share
     weight = np.arange(len(y)) % 3
     weighted = ScikitLearnRegressor(estimator).fit(X, y, sample_weight=weight)
     repeated = ScikitLearnRegressor(estimator).fit(X.repeat(weight, axis=0), y.repeat(weight))
@@ -141,7 +141,7 @@ def test_a_parameter_inside_is_checked_when_it_is_set():
         regressor.set_params(estimator__efficiency=2.0)
 
 
-def test_names_of_features_are_kept_and_looked_at():
+def test_names_of_features_are_kept_and_checked():
     X, y = data()
     frame = pytest.importorskip("pandas").DataFrame(X, columns=["a", "b", "c"])
     fit = ScikitLearnRegressor().fit(frame, y)
@@ -150,7 +150,7 @@ def test_names_of_features_are_kept_and_looked_at():
         fit.predict(frame[["c", "b", "a"]])
 
 
-def test_a_fit_with_another_estimator_leaves_nothing_of_the_last():
+def test_a_fit_with_another_estimator_removes_earlier_results():
     X, y = data()
     fit = ScikitLearnRegressor(MMRegression()).fit(X, y)
     assert fit.scale_ > 0
@@ -169,7 +169,7 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="at least 4 values for 4 coefficients but got 3 samples"):
         ScikitLearnRegressor().fit(X[:3], y[:3])
     X[:, 1] = 2.0
-    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] .* Column 3 is the intercept's, of ones"):
+    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] .* Column 3 is the constant column of the intercept"):
         ScikitLearnRegressor().fit(X, y)
     with pytest.raises(ValueError, match="`sample_weight` to be >= 0"):
         ScikitLearnRegressor().fit(*data(), sample_weight=-np.ones(60))

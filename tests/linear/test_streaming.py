@@ -1,4 +1,4 @@
-"""Streamed MKC-EM: the numbers of memory, whatever the batches; restarts; what is refused."""
+"""Streamed MKC-EM: results equal to those in memory for any batches; resuming; refusals."""
 
 import itertools
 import math
@@ -28,7 +28,7 @@ def problem(
     offset: float = 0.0,
     sort: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """X with an intercept and Y = X 1 + 0.5 noise, a share of which lies up to 20 higher."""
+    """X with an intercept and Y = X 1 + 0.5 noise, with a share of outliers of up to 20."""
     g = torch.Generator().manual_seed(seed)
     X = torch.randn(N, m, n, generator=g, dtype=torch.float64)
     X[..., 0] = 1.0
@@ -49,7 +49,7 @@ def cut(*tensors: Tensor, rows: int = 97) -> list[tuple[Tensor, ...]]:
 
 
 def in_memory(X: Tensor, Y: Tensor, weight: Tensor | None = None, **arguments) -> MKCRegression:
-    """The fit of memory, polished to where the gradient is rounding, as it is where a derivative is asked for."""
+    """The fit in memory, polished by Newton steps, as differentiable fits are."""
     fit = MKCRegression(**arguments).fit(X.clone().requires_grad_(), Y, weight)
     for name in ("coef_", "sigma_", "d_", "bound_", "log_likelihood_", "covariance_"):
         setattr(fit, name, getattr(fit, name).detach())
@@ -59,7 +59,7 @@ def in_memory(X: Tensor, Y: Tensor, weight: Tensor | None = None, **arguments) -
 def assert_same(fit: StreamedMKCRegression, memory: MKCRegression, tol: float = 1e-8) -> None:
     assert fit.converged_
     assert fit.coef_.dtype == torch.float64
-    # the standard error that one row has: d, but for what columns have in common
+    # standard error of one row: d, apart from what the columns have in common
     unit = memory.standard_error_ * memory.dof_.sqrt()
     torch.testing.assert_close(fit.coef_ / unit, memory.coef_ / unit, rtol=0, atol=tol)
     torch.testing.assert_close(fit.d_, memory.d_, rtol=tol, atol=0)
@@ -95,7 +95,7 @@ def test_the_numbers_of_memory(kind, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("m", [1, 2])
-def test_the_numbers_of_memory_with_weights(m, seed):
+def test_results_are_those_of_memory_with_weights(m, seed):
     X, Y = problem(seed, m=m)
     weight = torch.rand(Y.shape if seed else Y.shape[:1], generator=torch.Generator().manual_seed(seed)).double()
     weight[::7] = 0.0
@@ -116,12 +116,12 @@ def test_a_weight_of_two_is_two_rows():
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["clean", "many outliers", "leverage", "sorted", "two channels"])
-def test_the_numbers_of_memory_on_its_domain_where_the_sample_is_a_part(kind, seed):
+def test_results_are_those_of_memory_on_its_domain_with_a_partial_sample(kind, seed):
     X, Y = problem(seed, N=6000, **KINDS[kind])
     fit = StreamedMKCRegression(pilot=500).fit(cut(X, Y, rows=1000))
     assert fit.n_pilot_ == 500
     assert_same(fit, in_memory(X, Y, bound=fit.bound_))
-    # and the domain is that of memory, but for what a sample knows less of the rough fit
+    # and the domain is that of memory, apart from the error of the sample's rough fit
     torch.testing.assert_close(fit.bound_, MKCRegression().fit(X, Y).bound_, rtol=0.1, atol=0)
 
 
@@ -136,7 +136,7 @@ def test_the_domain_covers_the_residuals_of_all_rows():
 @pytest.mark.parametrize(
     "given", [{"sigma": 2.0}, {"sigma": math.inf}, {"d": 0.4}, {"bound": 25.0}, {"start": "s"}, {"start": [1.0] * 3}]
 )
-def test_what_is_given_is_given_to_both(given):
+def test_given_parameters_reach_both_fits(given):
     X, Y = problem(3)
     tensors = {k: torch.tensor(v).double() if isinstance(v, list) else v for k, v in given.items()}
     assert_same(StreamedMKCRegression(**given).fit(cut(X, Y)), in_memory(X, Y, **tensors))
@@ -170,7 +170,7 @@ def test_the_first_steps_of_float32_data_are_made_in_float32(monkeypatch):
     assert calls
     assert_same(fit, in_memory(X.double(), Y.double(), bound=fit.bound_))
     calls.clear()
-    StreamedMKCRegression(pilot=1000).fit(cut(X, 1e4 + Y, rows=1000))  # residuals are the last digits
+    StreamedMKCRegression(pilot=1000).fit(cut(X, 1e4 + Y, rows=1000))  # residuals are in the last digits
     StreamedMKCRegression(pilot=1000).fit(cut(X.double(), Y.double(), rows=1000))
     assert not calls
 
@@ -205,7 +205,7 @@ def test_a_loader_that_shuffles():
     assert_same(fit, in_memory(X, Y, bound=20.0))
 
 
-def test_every_row_of_a_reservoir_is_as_likely():
+def test_a_reservoir_samples_rows_uniformly():
     rows = np.arange(40.0)
     counts = np.zeros(40)
     for seed in range(500):
@@ -233,7 +233,7 @@ def test_samples_of_parts_are_the_sample_of_all():
     assert (merged(parts, 20).numbers == whole.drawn().numbers).all()
 
 
-# --- what follows
+# --- results
 
 
 @pytest.mark.e2e
@@ -266,7 +266,7 @@ def test_parameters_are_shown_and_set():
         fit.coef_  # noqa: B018
 
 
-# --- restarts
+# --- resuming
 
 
 class Interrupted(list):
@@ -306,7 +306,7 @@ def test_an_interrupted_fit_goes_on(passes, tmp_path):
     assert path.stat().st_size < 20_000
 
 
-def test_a_state_goes_on_with_its_own_data_and_parameters_alone(tmp_path):
+def test_a_state_resumes_only_with_its_data_and_parameters(tmp_path):
     X, Y = problem(5, N=2000)
     path = tmp_path / "fit.pt"
     StreamedMKCRegression(pilot=200).fit(cut(X, Y), checkpoint=path)
@@ -318,18 +318,18 @@ def test_a_state_goes_on_with_its_own_data_and_parameters_alone(tmp_path):
         StreamedMKCRegression(pilot=200).fit(cut(X, other), checkpoint=path)
     with pytest.raises(ValueError, match="every batch like the first, 3 columns without weights"):
         StreamedMKCRegression(pilot=200).fit(cut(X[:, :2], Y), checkpoint=path)
-    with pytest.raises(ValueError, match="Expected argument `pilot` of the fit that the state is of, 200, but got 300"):
+    with pytest.raises(ValueError, match="`pilot` as in the saved state, 200, but got 300"):
         StreamedMKCRegression(pilot=300).fit(cut(X, Y), checkpoint=path)
     path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="Expected argument `checkpoint` to be a file of a streamed fit"):
+    with pytest.raises(ValueError, match="`checkpoint` to be a checkpoint of StreamedMKCRegression"):
         StreamedMKCRegression(pilot=200).fit(cut(X, Y), checkpoint=path)
-    with pytest.raises(ValueError, match="Expected the state of a streamed fit"):
+    with pytest.raises(ValueError, match="Expected a state of StreamedMKCRegression"):
         StreamedMKCRegression().load_state_dict({"format": 0})
     with pytest.raises(NotFittedError):
         StreamedMKCRegression().state_dict()
 
 
-def test_a_fit_after_another_begins_anew():
+def test_a_second_fit_starts_over():
     X, Y = problem(5)
     fit = StreamedMKCRegression().fit(cut(X, Y))
     X, Y = problem(6, m=2)
@@ -340,7 +340,7 @@ def test_a_fit_after_another_begins_anew():
 
 
 class Changing:
-    """Batches that are others in each pass."""
+    """Batches that differ from pass to pass."""
 
     def __init__(self, *passes):
         self.passes = itertools.cycle(passes)
@@ -354,13 +354,13 @@ def test_a_stream_that_changes_between_passes():
     with pytest.raises(StreamChangedError, match="387, after 400 in the first"):
         StreamedMKCRegression(bound=30.0).fit(Changing(cut(X, Y), cut(X[:387], Y[:387])))
     for bound in (None, 30.0):
-        with pytest.raises(StreamChangedError, match="leave out random transforms"):
+        with pytest.raises(StreamChangedError, match="remove random transforms"):
             StreamedMKCRegression(bound=bound).fit(Changing(cut(X, Y), cut(X, Y + 0.01)))
 
 
-def test_what_can_be_gone_through_once_is_refused():
+def test_single_use_iterables_are_refused():
     X, Y = problem(0)
-    with pytest.raises(TypeError, match="used up by one; pass a DataLoader, a list"):
+    with pytest.raises(TypeError, match="can be read once; pass a DataLoader"):
         StreamedMKCRegression().fit(batch for batch in cut(X, Y))
     with pytest.raises(TypeError, match="from_memmap"):
         StreamedMKCRegression().fit(X)
@@ -439,7 +439,7 @@ def test_arguments_out_of_range(arguments, message):
         StreamedMKCRegression(**arguments)
 
 
-def test_a_fit_that_is_not_given_enough_passes_says_so():
+def test_too_few_passes_are_reported():
     X, Y = problem(5, N=2000)
     fit = StreamedMKCRegression(pilot=50, max_passes=4).fit(cut(X, Y))
     assert not fit.converged_

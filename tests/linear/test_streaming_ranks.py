@@ -1,4 +1,4 @@
-"""Streamed fits of a process group: two ranks are one, an error of one is an error of all, and so is a death."""
+"""Streamed fits of a process group: two ranks give the results of one; an error or death of a rank is an error on all."""
 
 import multiprocessing
 import os
@@ -27,7 +27,7 @@ def free_port():
 
 
 def run(work, folder, ranks=2):
-    """Runs ``work(rank, folder)`` in a process for each rank; their exit codes, once all have ended."""
+    """Run ``work(rank, folder)`` in a process for each rank; return their exit codes once all have ended."""
     context, port = multiprocessing.get_context("spawn"), free_port()
     processes = [context.Process(target=_process, args=(work, rank, ranks, port, str(folder))) for rank in range(ranks)]
     for process in processes:
@@ -60,7 +60,7 @@ def fitted(fit):
 
 
 class Plain:
-    """Batches that do not tell how many rows they have."""
+    """Batches of an unknown number of rows."""
 
     def __init__(self, batches):
         self.batches = batches
@@ -95,7 +95,7 @@ def _fits(rank, folder):
 
 
 def _errors(rank):
-    """What is wrong on rank 1 is an error on both, which are then of use again."""
+    """An error on rank 1 is an error on both ranks, which can be used afterwards."""
     X, Y = table()
     bad = Y.copy()
     bad[-3] = float("nan")
@@ -105,7 +105,7 @@ def _errors(rank):
         fit.fit(from_memmap(X, bad, shard=(rank, 2)))
     with pytest.raises(ValueError if rank == 0 else RanksError, match="every rank to have the same columns"):
         fit.fit(from_memmap(X if rank == 0 else X[:, :2], Y, shard=(rank, 2)))
-    with pytest.raises(RanksError if rank == 0 else TypeError, match="used up by one"):
+    with pytest.raises(RanksError if rank == 0 else TypeError, match="can be read once"):
         fit.fit(iter([(X, Y)]) if rank == 1 else [(X, Y)])
 
 
@@ -154,7 +154,7 @@ def test_results_and_errors_of_a_group(tmp_path):
 
 
 class Killed:
-    """Batches in whose third pass the process is killed."""
+    """Batches whose process is killed in the third pass."""
 
     def __init__(self, batches):
         self.batches, self.passes = batches, 0

@@ -1,4 +1,4 @@
-"""Tables on disk: the same numbers from a memmap, from Parquet and from tensors; shares of ranks; what is refused."""
+"""Tables on disk: the same results from a memmap, from Parquet and from tensors; shares of ranks; refusals."""
 
 import builtins
 import sys
@@ -23,7 +23,7 @@ def table(tmp_path):
 
 @pytest.fixture
 def parquet(table, tmp_path):
-    """The same as two Parquet files of several row groups each."""
+    """The same table as two Parquet files of several row groups each."""
     pa = pytest.importorskip("pyarrow")
     from pyarrow.parquet import write_table
 
@@ -66,7 +66,7 @@ def test_weights_and_channels_from_disk(table, parquet):
 def test_columns_have_the_names_of_the_file(parquet):
     fit = StreamedMKCRegression().fit(from_parquet(parquet[0], ["a", "b", "c"], "y"))
     assert fit.feature_names_in_ == ("a", "b", "c")
-    assert [one.name for one in fit.summary().coefficients] == ["a", "b", "c"]
+    assert [row.name for row in fit.summary().coefficients] == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("ranks", [1, 3, 7])
@@ -96,10 +96,10 @@ def test_a_missing_value_is_named(tmp_path):
         from_parquet(tmp_path / "gap.parquet", ["b"], "y")
 
 
-def test_files_that_are_none(tmp_path):
+def test_files_that_are_missing_or_damaged(tmp_path):
     pytest.importorskip("pyarrow")
     (tmp_path / "text.parquet").write_text("no table")
-    with pytest.raises(ValueError, match="no Parquet file"):
+    with pytest.raises(ValueError, match="is not a Parquet file"):
         from_parquet(tmp_path / "text.parquet", ["a"], "y")
     with pytest.raises(FileNotFoundError):
         from_parquet(tmp_path / "absent.parquet", ["a"], "y")
@@ -113,7 +113,7 @@ def test_columns_that_do_not_fit(tmp_path):
         from_parquet(path, ["a"], ["y"])
     with pytest.raises(ValueError, match="2 lists of equal length"):
         from_parquet(path, [["a"], ["a", "b"]], ["y", "z"])
-    with pytest.raises(ValueError, match="name a column at least"):
+    with pytest.raises(ValueError, match="at least one column"):
         from_parquet(path, [], "y")
 
 

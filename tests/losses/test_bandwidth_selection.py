@@ -151,7 +151,7 @@ def test_the_influence_of_the_initial_loss_is_its_derivative(at):
     found = initial_influence(torch, z.detach())
     torch.testing.assert_close(found[0], slope.detach(), rtol=1e-12, atol=0.0)
     torch.testing.assert_close(found[1], curvature, rtol=1e-10, atol=1e-20)
-    assert [float(one) for one in initial_influence(np, np.float64(at))] == pytest.approx([float(f) for f in found])
+    assert [float(value) for value in initial_influence(np, np.float64(at))] == pytest.approx([float(f) for f in found])
 
 
 def test_the_initial_loss_is_half_the_square_near_0_and_a_root_far_away():

@@ -39,10 +39,10 @@ def drawn(axes) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
 def test_a_picture_shows_the_three_curves_of_a_channel():
     pytest.importorskip("matplotlib")
     curves = drawn(LOSS.plot(1))
-    assert set(curves) == {"value / σ²", "pull · d", "weight"}
+    assert set(curves) == {"value / σ²", "influence · d", "weight"}
     for name, of, factor in (
         ("value / σ²", LOSS.rho, 1.0 / 16.0),
-        ("pull · d", LOSS.influence, 2.0),
+        ("influence · d", LOSS.influence, 2.0),
         ("weight", LOSS.weight, 1.0),
     ):
         x, y = curves[name]
@@ -100,10 +100,10 @@ def test_the_value_of_a_sample_is_the_loss_without_its_normaliser():
 def test_the_picture_of_a_sample():
     pytest.importorskip("matplotlib")
     curves = drawn(SAMPLES.plot(sigma=1.0, d=0.5))
-    x, y = curves["pull · d"]
+    x, y = curves["influence · d"]
     torch.testing.assert_close(y, 0.5 * SAMPLES.influence(x, 1.0, 0.5))
     assert float(x.max()) == 3.0
-    assert set(curves) == {"value / σ²", "pull · d", "weight"}
+    assert set(curves) == {"value / σ²", "influence · d", "weight"}
     for arguments, name in (({"sigma": 0.01}, "sigma"), ({"d": -1.0}, "d")):
         with pytest.raises(ValueError, match=f"`{name}`"):
             SAMPLES.plot(**arguments)
@@ -138,8 +138,8 @@ def test_the_picture_of_a_label(sigma):
     pytest.importorskip("matplotlib")
     loss = GeneralizedCrossEntropyLoss(sigma=sigma).double()
     curves = drawn(loss.plot())
-    assert set(curves) == {"value", "pull on the logit", "pull of cross-entropy", "weight"}
-    p, pull = curves["pull on the logit"]
+    assert set(curves) == {"value", "influence on the logit", "influence of cross-entropy", "weight"}
+    p, pull = curves["influence on the logit"]
     # by autograd through two logits
     logit = torch.logit(p[1:-1]).requires_grad_()
     (slope,) = torch.autograd.grad(loss.rho(logit.sigmoid()).sum(), logit)

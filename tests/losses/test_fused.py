@@ -24,7 +24,7 @@ def randn(*size, seed=0, dtype=torch.float64):
 
 def numbers(mode, m=4, dtype=torch.float64, reduction="mean"):
     """Raw parameters, and what a loss of that mode computes with beside them."""
-    kappa, raw_kappa, d, raw_d = (one.to(dtype).repeat(-(-m // 4))[:m] for one in (KAPPA, RAW_KAPPA, D, RAW_D))
+    kappa, raw_kappa, d, raw_d = (value.to(dtype).repeat(-(-m // 4))[:m] for value in (KAPPA, RAW_KAPPA, D, RAW_D))
     ramp = torch.linspace(0.0, 1.0, m, dtype=dtype)
     state = ChannelState(
         bound=30.0 - 20.0 * ramp, floor=0.6 - 0.59 * ramp
@@ -62,7 +62,7 @@ def differentiated(function, input, target, raw_kappa, raw_d, settings, weight=N
     """Value, and gradients by input, target and the raw parameters."""
     given = leaves(input, target, raw_kappa, raw_d)
     value = function(batch_of(*given[:2], weight, axis), *given[2:], settings)
-    wanted = [one for one in given if one is not None]
+    wanted = [entry for entry in given if entry is not None]
     return [value.detach(), *torch.autograd.grad(value, wanted, torch.tensor(upstream, dtype=value.dtype))]
 
 
@@ -117,7 +117,7 @@ def test_what_does_not_count_is_nowhere(mode):
     torch.testing.assert_close(found, spoilt, rtol=0.0, atol=0.0)
     assert (spoilt[1][weight == 0] == 0).all()
     nothing = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings, torch.zeros_like(weight))
-    assert all((one == 0).all() for one in nothing)
+    assert all((value == 0).all() for value in nothing)
 
 
 @each_mode
@@ -183,8 +183,8 @@ def test_single_precision_keeps_the_gradient_of_large_bandwidths(sigma):
     zeros = torch.zeros_like(error)
     found = differentiated(fused_loss, error, zeros, raw, None, settings)
     expected = differentiated(loss_value, error.double(), zeros.double(), raw.double(), None, double)
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one.double(), other, rtol=2e-5, atol=1e-10)
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value.double(), other, rtol=2e-5, atol=1e-10)
 
 
 def gaussian(m=1, reduction="sum", d=1.0):
@@ -252,7 +252,7 @@ def test_an_error_whose_square_overflows_does_not_pull_and_leaves_gradients_fini
     found = differentiated(fused_loss, error, torch.zeros(2, 1), raw_kappa, raw_d, settings)
     assert found[0].item() == pytest.approx(10.0 * (1.0 - math.exp(-0.0125)) + 10.0, rel=1e-5)
     assert found[1][1].item() == 0.0
-    assert all(one.isfinite().all() for one in found)
+    assert all(value.isfinite().all() for value in found)
 
 
 @pytest.mark.parametrize("rows", [100, LARGE_BATCH + 256])
@@ -262,8 +262,8 @@ def test_sums_of_single_precision_are_as_exact_as_one_rounding_of_each_element_a
     input, target = randn(rows, 1, dtype=torch.float32), randn(rows, 1, seed=1, dtype=torch.float32)
     found = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings)
     expected = differentiated(loss_value, input.double(), target.double(), *wide)
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one.double(), other, rtol=3e-6, atol=1e-9 if one.dim() else 0.0)
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value.double(), other, rtol=3e-6, atol=1e-9 if value.dim() else 0.0)
 
 
 # --- backward
@@ -275,18 +275,18 @@ def test_two_backward_passes_of_one_graph_give_the_same_gradients_to_the_bit(mod
     raw_kappa, raw_d, settings = numbers(mode)
     given = leaves(randn(9, 4), randn(9, 4, seed=1), raw_kappa, raw_d)
     value = fused_loss(batch_of(*given[:2]), *given[2:], settings)
-    wanted = [one for one in given if one is not None]
+    wanted = [entry for entry in given if entry is not None]
     for upstream in (1.0, 1.0, 3.0, 1.0):
         grad = torch.tensor(upstream, dtype=torch.float64)
         found = torch.autograd.grad(value, wanted, grad, retain_graph=True)
         if upstream == 1.0:
-            expected = [one.clone() for one in found]
-            for one in found:
-                one.mul_(7.0)  # what a caller does with its gradients changes no later pass
+            expected = [entry.clone() for entry in found]
+            for entry in found:
+                entry.mul_(7.0)  # what a caller does with its gradients changes no later pass
             found = torch.autograd.grad(value, wanted, grad, retain_graph=True)
             torch.testing.assert_close(list(found), expected, rtol=0.0, atol=0.0)
         else:
-            torch.testing.assert_close(list(found), [3.0 * one for one in expected], rtol=1e-14, atol=0.0)
+            torch.testing.assert_close(list(found), [3.0 * entry for entry in expected], rtol=1e-14, atol=0.0)
 
 
 def test_gradients_accumulate_in_leaves_as_twice_the_gradient():
@@ -294,9 +294,9 @@ def test_gradients_accumulate_in_leaves_as_twice_the_gradient():
     given = leaves(randn(9, 4), randn(9, 4, seed=1), raw_kappa, raw_d)
     value = fused_loss(batch_of(*given[:2]), *given[2:], settings)
     value.backward(retain_graph=True)
-    once = [one.grad.clone() for one in given]
+    once = [entry.grad.clone() for entry in given]
     value.backward()
-    torch.testing.assert_close([one.grad for one in given], [2.0 * one for one in once], rtol=1e-15, atol=0.0)
+    torch.testing.assert_close([entry.grad for entry in given], [2.0 * entry for entry in once], rtol=1e-15, atol=0.0)
 
 
 @each_mode
@@ -316,7 +316,7 @@ def test_only_gradients_that_are_wanted_are_made(mode, monkeypatch):
     made, reduced = [], module.reduced_loss
     monkeypatch.setattr(module, "reduced_loss", lambda *a, **k: made.append(reduced(*a, **k)) or made[-1])
     given = leaves(raw_kappa, raw_d)
-    wanted = [one for one in given if one is not None]
+    wanted = [entry for entry in given if entry is not None]
     value = fused_loss(batch_of(input, target), *given, settings)
     assert made[0].by_input is None
     assert value.requires_grad == bool(wanted)
@@ -334,12 +334,12 @@ def test_first_and_second_derivatives_are_those_of_finite_differences(mode, weig
     """Of the likelihood; the gradient of a robust loss is that of a sum of two terms with constants in each."""
     raw_kappa, raw_d, settings = numbers(mode)
     given = leaves(randn(3, 4), randn(3, 4, seed=1), raw_kappa, raw_d)
-    wanted = [one for one in given if one is not None]
+    wanted = [entry for entry in given if entry is not None]
     weight = randn(3, 4, seed=2).abs() if weighted else None
 
     def value(*now):
         now = iter(now)
-        all_of = [None if one is None else next(now) for one in given]
+        all_of = [None if entry is None else next(now) for entry in given]
         return fused_loss(batch_of(*all_of[:2], weight), *all_of[2:], settings)
 
     assert torch.autograd.gradcheck(value, wanted)
@@ -352,7 +352,7 @@ def test_second_derivatives_are_those_of_the_formulas(mode):
     found = []
     for function in (fused_loss, loss_value):
         given = leaves(randn(9, 4), randn(9, 4, seed=1), raw_kappa, raw_d)
-        wanted = [one for one in given if one is not None]
+        wanted = [entry for entry in given if entry is not None]
         value = function(batch_of(*given[:2]), *given[2:], settings)
         slopes = torch.autograd.grad(value, wanted, create_graph=True)
         mixed = sum((slope * (1.0 + slope)).sum() for slope in slopes)

@@ -126,7 +126,7 @@ def test_a_prediction_that_overflows_is_in_the_gradients_and_not_in_the_running_
         assert not value.isfinite().all()
     value.sum().backward()
     assert leaf.grad.isfinite().logical_not().nonzero().tolist() == [[3, 1], [7, 0]]
-    assert all(one.isfinite().all() for one in loss.state_dict().values())
+    assert all(entry.isfinite().all() for entry in loss.state_dict().values())
     torch.testing.assert_close(loss.state_dict(), twin.state_dict(), rtol=0.0, atol=0.0)
 
 
@@ -167,7 +167,7 @@ def test_a_gradient_scaler_skips_the_step_of_a_batch_that_overflows_and_goes_on(
         scaler.step(optimiser)
         scaler.update()
         after = (*model.parameters(), *loss.parameters())
-        return any(not torch.equal(one, other) for one, other in zip(before, after, strict=True)), prediction
+        return any(not torch.equal(value, other) for value, other in zip(before, after, strict=True)), prediction
 
     assert step(1.0)[0]
     moved, prediction = step(1e6)

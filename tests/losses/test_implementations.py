@@ -102,9 +102,9 @@ def test_a_compiled_loss_is_the_same_algorithm_over_300_batches(options):
     # eight forward passes, each of which changes the state, before a backward pass
     batches = [batch(step, 64, 2) for step in range(8)]
     found = []
-    for one in (loss, call):
+    for entry in (loss, call):
         inputs = [x.clone().requires_grad_() for x, _ in batches]
-        values = [one(x, y) for x, (_, y) in zip(inputs, batches, strict=True)]
+        values = [entry(x, y) for x, (_, y) in zip(inputs, batches, strict=True)]
         found.append([torch.autograd.grad(value, x)[0] for value, x in zip(values, inputs, strict=True)])
     torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)
 
@@ -123,9 +123,9 @@ def test_a_compiled_backward_pass_uses_the_state_of_its_forward_pass(monkeypatch
     monkeypatch.setattr(bandwidth_schedule, "select_bandwidth", selected)
     monkeypatch.setattr(residual_scale.ResidualScale, "update", lambda *_: None)
     loss, own, call = compiled({"d": 1.0, "objective": "robust", **FIXED}, "inductor")
-    for one in (loss, own):
-        one.schedule.warmup_steps = 0
-        one.residual_scale.recent.fill_(1.0)
+    for value in (loss, own):
+        value.schedule.warmup_steps = 0
+        value.residual_scale.recent.fill_(1.0)
     assert_same_steps(loss, own, call, 12, rtol=1e-12)
     assert float(loss.schedule.share[0]) == pytest.approx(0.06)
 
@@ -210,8 +210,8 @@ class OneDevice(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         assert func.overloadpacket not in self.looks, f"{func} looks at a value"
         result = func(*args, **(kwargs or {}))
-        tensors = [one for one in tree_leaves((args, kwargs, result)) if isinstance(one, torch.Tensor)]
-        assert {one.device.type for one in tensors} <= {"meta"}, f"{func} mixes devices"
+        tensors = [value for value in tree_leaves((args, kwargs, result)) if isinstance(value, torch.Tensor)]
+        assert {tensor.device.type for tensor in tensors} <= {"meta"}, f"{func} mixes devices"
         return result
 
 

@@ -83,8 +83,8 @@ def test_scale_domain_and_pull_have_the_unit_of_the_target(exponent, seed):
         value = loss(leaf, unit * y)
         (pull,) = torch.autograd.grad(value, leaf)
         found.append((value - math.log(unit), loss.d / unit, loss.bound / unit, loss.d_min / unit, pull * unit))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+    for entry, other in zip(*found, strict=True):
+        torch.testing.assert_close(entry, other, rtol=1e-6, atol=1e-9)
 
 
 def test_given_numbers_are_kept():
@@ -171,8 +171,8 @@ def test_a_batch_that_is_masked_throughout_changes_no_scale():
     loss = after(1.0, 3.0)
     before = loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches.clone()
     assert loss(*data(50), torch.zeros(50, 2)).item() == 0.0
-    for one, other in zip(before, (loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches), strict=True):
-        assert torch.equal(one, other)
+    for value, other in zip(before, (loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches), strict=True):
+        assert torch.equal(value, other)
 
 
 @each_robust
@@ -307,8 +307,8 @@ def test_training_that_is_saved_and_loaded_goes_on_to_the_bit(options, at):
             torch.manual_seed(1)
             model, loss = nn.Linear(3, 2), MKCLoss(2, **options)
             optimiser = torch.optim.Adam([*model.parameters(), *loss.parameters()], lr=0.01)
-            for part, one in zip((model, loss, optimiser), parts, strict=True):
-                part.load_state_dict(one)
+            for part, value in zip((model, loss, optimiser), parts, strict=True):
+                part.load_state_dict(value)
         trained(model, loss, optimiser, range(at, at + 6), found)
         runs.append((found, state(model), state(loss)))
     torch.testing.assert_close(*runs, rtol=0.0, atol=0.0)

@@ -86,7 +86,7 @@ def test_in_evaluation_the_value_is_the_likelihood_of_sigma_d_and_bound(reductio
 @pytest.mark.parametrize("weighted", [False, True])
 def test_in_training_the_value_is_the_sum_of_the_terms_and_so_are_its_gradients(reduction, options, weighted):
     loss = annealing(reduction=reduction, **options)
-    x, y = (leaf(one) for one in data(30, 2, seed=7))
+    x, y = (leaf(entry) for entry in data(30, 2, seed=7))
     weight = torch.rand(30, 2, generator=generator(), dtype=torch.float64) if weighted else None
     value = loss(x, y, weight)
     network, density = loss.terms(x, y, weight)
@@ -99,12 +99,12 @@ def test_in_training_the_value_is_the_sum_of_the_terms_and_so_are_its_gradients(
 
 @each_robust
 def test_the_network_term_reaches_no_parameter_and_the_density_term_no_prediction(options):
-    loss, (x, y) = annealing(**options), (leaf(one) for one in data(30, 2, seed=7))
+    loss, (x, y) = annealing(**options), (leaf(value) for value in data(30, 2, seed=7))
     network, density = loss.terms(x, y)
     assert torch.autograd.grad(network, list(loss.parameters()), allow_unused=True, retain_graph=True) == (None, None)
     assert torch.autograd.grad(density, (x, y), allow_unused=True, retain_graph=True) == (None, None)
-    assert all(bool((one != 0).any()) for one in torch.autograd.grad(network, (x, y)))
-    assert all(bool((one != 0).any()) for one in torch.autograd.grad(density, list(loss.parameters())))
+    assert all(bool((value != 0).any()) for value in torch.autograd.grad(network, (x, y)))
+    assert all(bool((value != 0).any()) for value in torch.autograd.grad(density, list(loss.parameters())))
 
 
 @each_robust
@@ -177,7 +177,7 @@ def test_a_bandwidth_near_the_widest_limits_no_gaussian():
 
 @pytest.mark.parametrize("options", LIKELIHOOD.values(), ids=LIKELIHOOD)
 def test_under_the_likelihood_the_network_term_is_0_and_the_density_term_has_all_gradients(options):
-    loss, (x, y) = annealing(**options), (leaf(one) for one in data(30, 2, seed=7))
+    loss, (x, y) = annealing(**options), (leaf(value) for value in data(30, 2, seed=7))
     network, density = loss.terms(x, y)
     assert network.item() == 0.0
     wanted = [x, y, *loss.parameters()]
@@ -197,7 +197,7 @@ def test_the_likelihood_is_differentiated_as_a_whole(options, reduction, weighte
     def value(x, y, raw_kappa, raw_d, *weight):
         return functional_call(loss, {"raw_kappa": raw_kappa, "raw_d": raw_d}, (x, y, *weight))
 
-    given = [leaf(one.detach()) for one in (x, y, loss.raw_kappa, loss.raw_d)]
+    given = [leaf(entry.detach()) for entry in (x, y, loss.raw_kappa, loss.raw_d)]
     assert gradcheck(value, (*given, *weight))
     assert gradgradcheck(value, (*given, *weight))
 
@@ -207,7 +207,7 @@ def test_under_the_likelihood_value_and_gradients_are_the_same_in_training_and_e
     loss = annealing(**options)
     found = []
     for mode in (True, False):
-        x, y = (leaf(one) for one in data(30, 2, seed=7))
+        x, y = (leaf(entry) for entry in data(30, 2, seed=7))
         value = loss.train(mode)(x, y)  # evaluation sees the state after the batch
         found.append([value.detach(), *torch.autograd.grad(value, [x, y, *loss.parameters()])])
     torch.testing.assert_close(*found, rtol=0.0, atol=0.0)
@@ -256,7 +256,7 @@ def test_elements_and_sums_pull_like_the_mean_times_the_weight(reduction, option
 @each_reduction
 @each_robust
 def test_the_gradient_by_the_target_is_minus_that_by_the_prediction(reduction, options):
-    loss, (x, y) = annealing(reduction=reduction, **options), (leaf(one) for one in data(40, 2))
+    loss, (x, y) = annealing(reduction=reduction, **options), (leaf(value) for value in data(40, 2))
     by_input, by_target = torch.autograd.grad(loss(x, y).sum(), (x, y))
     torch.testing.assert_close(by_input, -by_target, rtol=0.0, atol=0.0)
 
@@ -279,7 +279,7 @@ def test_the_gradient_by_a_weight_is_the_value_of_its_element(options):
 @each_robust
 @pytest.mark.parametrize("options_too", [{}, NOT_LEARNED], ids=["learned", "fixed"])
 def test_backward_passes_of_one_graph_agree_to_the_bit_and_scale_with_the_upstream_gradient(options, options_too):
-    loss, (x, y) = annealing(**options, **options_too), (leaf(one) for one in data(40, 2))
+    loss, (x, y) = annealing(**options, **options_too), (leaf(entry) for entry in data(40, 2))
     wanted = [x, y, *loss.parameters()]
     value = loss(x, y)
     loss(*data(40, 2, seed=9))  # another batch in between changes the running state, not this graph
@@ -287,7 +287,7 @@ def test_backward_passes_of_one_graph_agree_to_the_bit_and_scale_with_the_upstre
     second = torch.autograd.grad(value, wanted, retain_graph=True)
     torch.testing.assert_close(first, second, rtol=0.0, atol=0.0)
     scaled = torch.autograd.grad(65536.0 * value, wanted, retain_graph=True)
-    torch.testing.assert_close(scaled, tuple(65536.0 * one for one in first), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(scaled, tuple(65536.0 * entry for entry in first), rtol=0.0, atol=0.0)
     differentiable = torch.autograd.grad(value, wanted, create_graph=True)
     torch.testing.assert_close(differentiable, first, rtol=1e-8, atol=1e-12)
     by_terms = [*torch.autograd.grad(loss_at(loss, value, x, y)[0], wanted[:2])]
@@ -353,7 +353,7 @@ def test_a_loss_that_is_frozen_on_its_floor_can_be_learned_on():
     loss.freeze_scale()
     torch.testing.assert_close(loss.d, loss.d_min)
     slopes = torch.autograd.grad(loss(1e-9 * noise, torch.zeros(50, 1)), list(loss.parameters()))
-    assert all(bool(torch.isfinite(one).all()) for one in (*slopes, *loss.parameters()))
+    assert all(bool(torch.isfinite(value).all()) for value in (*slopes, *loss.parameters()))
 
 
 def minimised(loss, steps):
@@ -386,7 +386,7 @@ def minimised(loss, steps):
         return value
 
     optimiser.step(closure)
-    slopes = torch.cat([one.grad.flatten() for one in groups])
+    slopes = torch.cat([entry.grad.flatten() for entry in groups])
     return model, slopes, values
 
 

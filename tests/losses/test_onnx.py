@@ -63,8 +63,8 @@ def refuse_other(module, make, sizes=(1, 3, 17)):
         found = session.run(None, {i.name: v.numpy() for i, v in zip(session.get_inputs(), given, strict=True)})
         with torch.no_grad():
             expected = module(*given)
-        for one, other in zip(found, expected if isinstance(expected, tuple) else (expected,), strict=True):
-            torch.testing.assert_close(torch.from_numpy(one), other, rtol=RTOL, atol=1e-7)
+        for value, other in zip(found, expected if isinstance(expected, tuple) else (expected,), strict=True):
+            torch.testing.assert_close(torch.from_numpy(value), other, rtol=RTOL, atol=1e-7)
 
 
 def trained(loss):

@@ -214,7 +214,7 @@ def test_channels_are_apart():
 @given(values=st.lists(st.tuples(st.integers(0, 20), st.integers(0, 3)), min_size=1, max_size=12))
 @settings(max_examples=200, deadline=None)
 def test_a_weighted_quantile_is_the_least_value_up_to_which_the_share_of_the_weight_lies(values):
-    numbers, weights = (torch.tensor([one], dtype=torch.float64) for one in zip(*values, strict=True))
+    numbers, weights = (torch.tensor([value], dtype=torch.float64) for value in zip(*values, strict=True))
     total = sum(weight for _, weight in values)
     reached = [
         number
@@ -374,6 +374,6 @@ def test_a_state_dict_continues_to_the_bit():
     scale, resumed = updated(*batches[:13]), ResidualScale(2).double()
     resumed.load_state_dict(copy.deepcopy(scale.state_dict()))
     for batch in batches[13:]:
-        for one in (scale, resumed):
-            one.update(batch, torch.zeros_like(batch))
+        for value in (scale, resumed):
+            value.update(batch, torch.zeros_like(batch))
     torch.testing.assert_close(scale.state_dict(), resumed.state_dict(), rtol=0.0, atol=0.0)

@@ -1,4 +1,4 @@
-"""Robust Levenberg-Marquardt and MKC-EM on residuals: against SciPy, closed forms, and repeated experiments."""
+"""Robust Levenberg-Marquardt and MKC-EM on residuals: comparison with SciPy, closed forms and repeated experiments."""
 
 import itertools
 import math
@@ -12,8 +12,9 @@ from scipy.optimize import least_squares
 from scipy.optimize import minimize as scipy_minimize
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.linear import MKCRegression
-from mkc_torch.nonlinear import GaussianPrior, fit, make_dual, minimise
+from mkc_torch.nonlinear import GaussianPrior, fit, minimise
 
 
 def sample(seed: int, *shape: int) -> Tensor:
@@ -30,7 +31,7 @@ def decay(theta: Tensor) -> Tensor:
 
 
 def noisy(seed: int, share: float = 0.0, noise: float = 0.05) -> Tensor:
-    """The decay with noise and a share of outliers spread over it, on one side."""
+    """The decay with noise and a share of one-sided outliers spread over it."""
     y = decay(TRUTH) + noise * sample(seed, len(T))
     bad = torch.randperm(len(T), generator=torch.Generator().manual_seed(seed))[: int(share * len(T))]
     y[bad] += 3.0 + sample(seed + 1, len(bad)).abs()
@@ -155,11 +156,11 @@ def test_rosenbrock_is_solved_from_its_usual_start():
     assert bool(found.converged)
 
 
-def test_what_has_not_come_to_rest_says_so():
+def test_missing_convergence_is_reported():
     residual = residual_to(noisy(1, 0.3))
     assert not bool(minimise(residual, START, sigma=1.0, d=0.2, max_iter=2).converged)
     assert not bool(fit(residual, START, max_iter=1).converged)
-    # an exponential that runs away to a straight line has no minimum
+    # an exponential that diverges to a straight line has no minimum
     line = minimise(lambda t: (t[0] * torch.exp(-t[1] * T) + t[2] - T).unsqueeze(-1), START, max_iter=30)
     assert not bool(line.converged)
 
@@ -247,7 +248,7 @@ def test_reverse_mode_gives_what_forward_mode_gives(jacobian):
 
 
 class Once(torch.autograd.Function):
-    """The exponential, with a derivative in each mode and no second one."""
+    """The exponential, with a derivative in each mode but no second derivative."""
 
     @staticmethod
     def forward(x):
@@ -425,7 +426,7 @@ def test_an_exponential_decay_survives_thirty_per_cent_of_outliers_and_least_squ
         assert float(found.weights.squeeze(-1)[outlying].max()) < 0.01
 
 
-def test_a_bad_start_is_survived():
+def test_a_bad_start_is_overcome():
     for start in ([10.0, 3.0, -5.0], [0.1, 0.01, 3.0], [-2.0, 0.5, 2.0]):
         found = fit(residual_to(noisy(1, 0.3)), torch.tensor(start).double())
         torch.testing.assert_close(found.theta, TRUTH, rtol=0, atol=0.12)
@@ -519,7 +520,7 @@ def test_a_prior_is_weighed_against_the_likelihood():
     assert float(between.standard_error()[0]) == pytest.approx(error / math.sqrt(2), rel=0.1)
 
 
-def test_an_exact_fit_is_no_nan():
+def test_an_exact_fit_has_no_nan():
     found = fit(residual_to(decay(TRUTH)), START)
     torch.testing.assert_close(found.theta, TRUTH, rtol=1e-6, atol=0)
     assert bool(torch.isfinite(found.d).all())
@@ -570,7 +571,7 @@ def test_a_converged_solution_is_a_stationary_point_no_higher_than_its_start(see
     found = minimise(residual_to(noisy(seed, 0.2)), start, sigma=sigma, d=0.2, max_iter=200, tol=1e-14)
     begin = minimise(residual_to(noisy(seed, 0.2)), start, sigma=sigma, d=0.2, max_iter=1)
     assert float(found.objective) <= float(begin.objective)
-    # a draw in a hundred has its minimum at infinity or along a flat valley, and is told as not converged
+    # a draw in a hundred has its minimum at infinity or along a flat valley, and is reported as not converged
     assume(bool(found.converged))
     gradient = torch.einsum("nmp,nm->p", found.jacobian, found.weights * found.residual) / 0.04
     size = found.jacobian.square().sum((0, 1)).sqrt() / 0.2
@@ -594,7 +595,7 @@ def test_hac_errors_cover_under_correlated_noise_and_those_for_independent_sampl
     for kind in ("hac", "sandwich"):
         found = fit(residual, start, data=y, covariance=kind)
         covered[kind] = ((found.theta - truth).abs() < 1.96 * found.standard_error()).double().mean(0)
-    # binomial: three standard deviations of 150 draws are 0.06; HAC falls short of 0.95 by a few per cent at this N
+    # binomial: three standard deviations of 150 draws are 0.06; HAC is below 0.95 by a few per cent at this N
     assert bool((covered["hac"] > 0.84).all())
     assert bool((covered["hac"] < 0.99).all())
     assert bool((covered["sandwich"] < 0.8).all())
@@ -699,20 +700,20 @@ def test_arguments_of_another_kind_are_refused(function, arguments, message):
         function(given.pop("residual"), given.pop("start"), **given)
 
 
-def test_a_bandwidth_below_that_of_the_normaliser_is_refused_where_there_is_one():
+def test_sigma_below_its_limit_is_refused_where_the_density_is_normalised():
     minimise(residual_to(noisy(0)), START, sigma=0.04)
     with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
         fit(residual_to(noisy(0)), START, sigma=0.04)
 
 
 def test_a_narrow_bound_is_refused():
-    with pytest.raises(ValueError, match=r"begins too far from the data.*robust scale of.*Begin nearer"):
+    with pytest.raises(ValueError, match=r"too far from the data.*`bound` of at least two robust scales .* but got 0\.01"):
         fit(residual_to(noisy(0)), START, bound=0.01)
     with pytest.raises(ValueError, match="'sandwich' or 'hac'"):
         fit(residual_to(noisy(0)), START, covariance="classical")
 
 
-def test_a_constant_beside_what_moves_keeps_its_value_and_has_no_slope():
+def test_a_constant_next_to_a_parameter_keeps_its_value_and_has_no_derivative():
     constant = torch.tensor([1.0, torch.inf, -2.0], dtype=torch.float64)
     theta = torch.tensor([3.0, 4.0], dtype=torch.float64)
     assert make_dual(constant, theta[0]) is constant

@@ -1,4 +1,4 @@
-"""Residuals of many minima: many starts, of which the likeliest is kept, and what a fit explains."""
+"""Residuals with many minima: several starts, of which the most likely result is kept, and the explained share."""
 
 import math
 
@@ -12,7 +12,7 @@ LOW, HIGH = torch.tensor([0.5]).double(), torch.tensor([8.5]).double()
 
 
 def wave(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """x, sin(kx) with noise of 0.1 and one value in ten wrong by far, k, and a start anywhere."""
+    """x, sin(kx) with noise of 0.1 and one value in ten a gross outlier, k, and a random start."""
     generator = torch.Generator().manual_seed(seed)
     draw = torch.rand(62, generator=generator, dtype=torch.float64)
     x, k, start = 6.0 * draw[:60], 1.0 + 7.0 * draw[60:61], 0.5 + 8.0 * draw[61:]
@@ -55,7 +55,7 @@ def test_thirty_two_starts_find_what_one_does_not(many, single):
 
 
 @pytest.mark.e2e
-def test_what_a_fit_explains_tells_the_right_minimum_from_another(many, single):
+def test_the_explained_share_distinguishes_the_right_minimum(many, single):
     right = (single.theta - K).abs().squeeze(-1) < 0.05
     share = single.explained(Y.unsqueeze(-1)).squeeze(-1)
     assert float(share[~right].max()) < 0.8
@@ -85,13 +85,13 @@ def test_a_domain_and_a_density_that_are_given_are_kept():
     assert (float(found.bound), float(found.sigma), float(found.d)) == pytest.approx((12.0, 2.0, 0.1))
 
 
-def test_a_prior_says_where_to_draw_what_has_no_bounds():
+def test_starts_without_bounds_are_drawn_from_the_prior():
     prior = GaussianPrior(torch.tensor([4.5]), torch.tensor([0.2]))
     found = fit(one(3), START[3], prior=prior, starts=32)
     assert float((found.theta - K[3]).abs()) < 0.05
 
 
-def test_weights_count_in_which_end_is_best():
+def test_weights_enter_the_choice_of_the_best_result():
     weight = torch.ones(60).double()
     weight[:6] = 0.0
     spoiled = {"x": X[4], "y": torch.where(weight > 0, Y[4], math.nan)}
@@ -137,12 +137,12 @@ def test_bad_starts_are_refused(options, message):
     ("target", "error", "message"),
     [
         (torch.ones(59), ValueError, r"`target` of shape \(60, 1\).*\(60,\)"),
-        (torch.ones(60), ValueError, "`target` to scatter"),
+        (torch.ones(60), ValueError, "`target` to vary"),
         (torch.full((60,), math.nan), ValueError, "`target` to be finite"),
         ([1.0] * 60, TypeError, "`target` to be"),
     ],
 )
-def test_targets_that_are_none_are_refused(target, error, message):
+def test_invalid_targets_are_refused(target, error, message):
     found = fit(one(0), K[0], covariance=None)
     with pytest.raises(error, match=message):
         found.explained(target)

@@ -110,7 +110,7 @@ BAD = {
     "two sensors": ("mag0_x,mag0_y,mag0_z,mag1_x,mag1_y,mag1_z\n1,2,3,4,5,6\n", "`mag0`, `mag1`; choose one with"),
     "a field in gauss": (
         "mag_x,mag_y,mag_z\n" + "0.3,0.2,0.3\n0.3,-0.2,0.3\n0.3,0.2,-0.3\n" * 9,
-        "in gauss .* it would be.*`--unit mag=gauss`",
+        "in gauss .* it would be.*`--convert mag=gauss`",
     ),
     "axes in different units": ("magX [uT],magY [counts],magZ [uT]\n1,2,3\n", "different units, counts, µT"),
     "no axis z": ("mag_x,mag_y\n1,2\n3,4\n", "there is no column `mag_z`"),

@@ -86,7 +86,7 @@ def test_units_and_names_are_the_new_ones():
     assert recording["mag_x"].tolist() == [100.0, 200.0]
     assert Recording.from_frame(frame, columns={"mag_x": "mx"}, units={"mag_x": "LSB"}).units == {"mag_x": "LSB"}
     assert Recording(frame, units={"mx": "G"}, warnings=["w"]).warnings == ("w",)
-    with pytest.raises(MissingColumnError, match="`--unit mx=G` names no column"):
+    with pytest.raises(MissingColumnError, match="`--convert mx=G` names no column"):
         Recording.from_frame(frame, columns={"mag_x": "mx"}, units={"mx": "G"})
     with pytest.raises(MissingColumnError, match="no column `my` to be `mag_y`; the frame has `mx`"):
         Recording.from_frame(frame, columns={"mag_y": "my"})

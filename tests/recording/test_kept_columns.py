@@ -13,7 +13,7 @@ pytest.importorskip("polars")
 
 import polars
 
-from mkc_torch.recording.kept_columns import write_beside
+from mkc_torch.recording.kept_columns import write_with_columns
 from mkc_torch.recording.recording import Recording
 
 NEW = {"field_x": torch.tensor([1.0, 2.0, float("nan")], dtype=torch.float64)}
@@ -54,7 +54,7 @@ def test_types_and_missing_values_of_parquet_stay(typed, tmp_path):
     source, frame = typed
     target = tmp_path / "deep" / "out.parquet"
     target.parent.mkdir()
-    write_beside(source, target, NEW)
+    write_with_columns(source, target, NEW)
     written = polars.read_parquet(target)
     assert written.drop("field_x").equals(frame, null_equal=True)
     assert dict(written.drop("field_x").schema) == dict(frame.schema)
@@ -65,7 +65,7 @@ def test_types_and_missing_values_of_parquet_stay(typed, tmp_path):
 def test_parquet_becomes_text_with_all_its_digits(typed, tmp_path, ending):
     source, frame = typed
     target = tmp_path / f"out.{ending}"
-    write_beside(source, target, NEW)
+    write_with_columns(source, target, NEW)
     header, *rows = read_csv(target)
     cells = dict(zip(header, zip(*rows, strict=True), strict=True))
     assert header == [*frame.columns, "field_x"]
@@ -91,7 +91,7 @@ def test_text_becomes_numbers_in_parquet_where_none_is_lost(tmp_path):
         encoding="utf-8",
     )
     target = tmp_path / "out.parquet"
-    write_beside(source, target, {"field_x": torch.ones(2)})
+    write_with_columns(source, target, {"field_x": torch.ones(2)})
     written = polars.read_parquet(target)
     assert written["ns"].to_list() == [1735689600000000001, 1735689600000000003]
     assert written["value"].to_list() == [1.5, None]
@@ -107,7 +107,7 @@ def test_columns_without_a_name_are_kept_without_one(tmp_path):
     source.write_text(",mag_x,\n0,1.50,\n1,2.50,\n", encoding="utf-8")
     for ending in ("csv", "parquet"):
         target = tmp_path / f"out.{ending}"
-        write_beside(source, target, {"field_x": torch.ones(2)})
+        write_with_columns(source, target, {"field_x": torch.ones(2)})
         assert Recording.read(target).names == ("mag_x", "field_x")
     header, *rows = read_csv(tmp_path / "out.csv")
     assert [name.strip() for name in header] == ["", "mag_x", "", "field_x"]
@@ -117,7 +117,7 @@ def test_columns_without_a_name_are_kept_without_one(tmp_path):
 def test_a_column_of_that_name_is_replaced_in_its_place(tmp_path):
     source = tmp_path / "in.csv"
     source.write_text("field_x,a\n9,1\n9,2\n", encoding="utf-8")
-    assert write_beside(source, tmp_path / "out.csv", {"field_x": torch.ones(2)}) == ("field_x", "a")
+    assert write_with_columns(source, tmp_path / "out.csv", {"field_x": torch.ones(2)}) == ("field_x", "a")
     assert read_csv(tmp_path / "out.csv") == [["field_x", "a"], ["1.0", "1"], ["1.0", "2"]]
 
 
@@ -134,5 +134,5 @@ def test_every_cell_of_a_csv_is_written_as_it_stands(tmp_path_factory, rows):
         csv.writer(file, lineterminator="\n").writerows(
             [("word", "mag_x", "other"), *((a, "1.50", b) for a, b in rows)]
         )
-    write_beside(source, target, {"field_x": torch.ones(len(rows))})
+    write_with_columns(source, target, {"field_x": torch.ones(len(rows))})
     assert read_csv(target)[1:] == [[a, "1.50", b, "1.0"] for a, b in rows]

@@ -68,7 +68,7 @@ def test_what_was_done_to_read_it_is_told(name):
 
 
 def test_a_field_in_gauss_is_asked_for_and_then_converted(whole):
-    with pytest.raises(RecordingError, match=r"in gauss .* it would be.*`--unit mag=gauss`"):
+    with pytest.raises(RecordingError, match=r"in gauss .* it would be.*`--convert mag=gauss`"):
         read("gauss")
     assert_centre(calibrate(read("gauss", {"mag": "gauss"})), whole)
 

@@ -256,7 +256,7 @@ def test_units_that_are_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("units", "message"),
     [
-        ({"speed": "m/s"}, "`--unit speed=m/s` names no column of the file and no quantity"),
+        ({"speed": "m/s"}, "`--convert speed=m/s` names no column of the file and no quantity"),
         ({"gyro": "furlongs"}, "no unit of gyro that is known; known: rad/s, mrad/s, °/s"),
         ({"time": "fortnights"}, "no unit of time that is known; known: s, ms, µs, ns"),
     ],
@@ -290,8 +290,8 @@ def test_differences_of_times_keep_every_digit(cells, unit, expected):
 
 def test_nanoseconds_of_an_uptime_are_no_milliseconds_since_1970():
     """1.2e12 is 2008 in ms since 1970, and twenty minutes of uptime in ns; the interval tells."""
-    assert clock_of(pl.Series([1_200_000_000_000, 1_200_010_000_000])).told == ""
-    assert clock_of(pl.Series([1_200_000_000_000, 1_200_000_000_010])).told == "ms since 1970"
+    assert clock_of(pl.Series([1_200_000_000_000, 1_200_010_000_000])).format == ""
+    assert clock_of(pl.Series([1_200_000_000_000, 1_200_000_000_010])).format == "ms since 1970"
 
 
 def test_a_cell_that_is_no_time_is_named_by_its_row():

@@ -272,13 +272,13 @@ def test_the_named_sensor_is_read_and_not_the_one_with_the_usual_names(tmp_path)
 def test_a_unit_that_the_numbers_contradict_is_told_with_the_one_that_fits(tmp_path):
     path = write(tmp_path, table("time,mx [gauss],my [gauss],mz [gauss]", TIME, *XYZ))
     told = " ".join(calibrate(Recording.read(path)).warnings)
-    assert "converted from gauss; they may be in another unit than was said; say `--unit mag=uT`" in told
+    assert "converted from gauss; they may be in another unit than was said; say `--convert mag=uT`" in told
     assert "Nothing was converted" not in told
 
 
 def test_an_accelerometer_alone_is_told_how_it_is_calibrated(tmp_path):
     path = write(tmp_path, table("time,acc_x,acc_y,acc_z", TIME, *XYZ))
-    with pytest.raises(RecordingError, match="An accelerometer is calibrated by: `--sensor accel`") as refusal:
+    with pytest.raises(RecordingError, match="An accelerometer is calibrated by: `--quantity accel`") as refusal:
         read_magnetometer(path, {}, {}, None)
     assert "mag_x=acc_x" not in str(refusal.value)
 

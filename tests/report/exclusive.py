@@ -94,12 +94,12 @@ Rule = Callable[[Diagnosis], bool]
 
 
 def _claims(d: Diagnosis) -> list[Finding]:
-    return [f for f in d.findings if f.grade in ("left out", "real but small")]
+    return [f for f in d.findings if f.grade in ("left_out", "small")]
 
 
 def _moments(f: Finding) -> list[float]:
     onset = [] if f.onset is None else [f.onset]
-    return [*onset, *(f.onset_interval or ()), *f.moments, *(moment for pair in f.intervals for moment in pair)]
+    return [*onset, *(f.onset_interval or ()), *f.event_times, *(moment for pair in f.intervals for moment in pair)]
 
 
 def _outside(d: Diagnosis) -> bool:
@@ -117,8 +117,8 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
     """The same name is to be corrected for and not to be."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
     corrected = set(re.split(", | for ", use)[1:])
-    refused = [re.sub(r"(Do not correct for|Do not build|Leave) (.*?)( yet| in:| alone).*", r"\2", one)
-               for start in ("Do not correct", "Do not build", "Leave") for one in _advised(d, start)]  # fmt: skip
+    refused = [re.sub(r"(Do not correct for|Do not build|Leave) (.*?)( yet| in:| alone).*", r"\2", item)
+               for start in ("Do not correct", "Do not build", "Leave") for item in _advised(d, start)]  # fmt: skip
     return bool(corrected.intersection(refused))
 
 
@@ -146,8 +146,8 @@ RULES: dict[str, Rule] = {
         f.shape is not None and f.shape.curve is not None for f in _claims(d)
     ),
     "adequate with a finding": lambda d: d.verdict == "adequate" and bool(d.findings),
-    "adequate with a push": lambda d: d.verdict == "adequate" and bool(d.world.pushes),
-    "adequate with a forcing": lambda d: d.verdict == "adequate" and bool(d.world.forcing),
+    "adequate with a push": lambda d: d.verdict == "adequate" and bool(d.environment.process_noise),
+    "adequate with a forcing": lambda d: d.verdict == "adequate" and bool(d.environment.disturbance),
     "adequate with what remains": lambda d: d.verdict == "adequate" and bool(d.remaining),
     "adequate with a warning of a disturbance": lambda d: (
         d.verdict == "adequate"
@@ -157,26 +157,26 @@ RULES: dict[str, Rule] = {
     "explained with a finding that is no claim": lambda d: (
         d.verdict == "explained" and len(_claims(d)) < len(d.findings)
     ),
-    "explained with a push of a rate": lambda d: d.verdict == "explained" and any(p.at_rate for p in d.world.pushes),
+    "explained with a push of a rate": lambda d: d.verdict == "explained" and any(p.at_rate for p in d.environment.process_noise),
     "unfit with a finding": lambda d: d.verdict == "unfit" and bool(d.findings),
     "unfit where every output is followed": lambda d: (
-        d.verdict == "unfit" and bool(d.world.follows) and all(one.explained > 0.9 for one in d.world.follows)
+        d.verdict == "unfit" and bool(d.environment.goodness_of_fit) and all(fit.explained > 0.9 for fit in d.environment.goodness_of_fit)
     ),
-    "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.world.reasons),
+    "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.environment.reasons),
     "to be corrected and not to be": _claimed_and_refused,
     "a model to apply that nothing is worth": lambda d: (
         bool(_advised(d, "The model found here")) and not any(transfers(f) for f in d.findings)
     ),
     "not plausible, and to be corrected": lambda d: any(transfers(f) and not f.plausible for f in d.findings),
     "not to be told apart from itself": lambda d: any(
-        (a.effect, a.drivers, a.at) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
+        (a.effect, a.drivers, a.port) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
     ),
     "two residuals of the simulation as it is": _two_residuals,
     "shares of runs that are no shares": lambda d: any(
         f.experiments and not math.isclose(sum(f.experiments), 1.0, abs_tol=0.02) for f in d.findings
     ),
     "a floor above what is left by far, and adequate": lambda d: (
-        d.verdict == "adequate" and any(one.residual > 3.0 * one.noise_floor for one in d.world.follows)
+        d.verdict == "adequate" and any(fit.residual > 3.0 * fit.noise_floor for fit in d.environment.goodness_of_fit)
     ),
     "worth correcting in an unfit simulation": lambda d: (
         d.verdict == "unfit" and any(map(worth_correcting, d.findings))
@@ -197,13 +197,13 @@ def contradictions(diagnosis: Diagnosis, *, page: bool = True) -> list[str]:
         diagnosis: the result.
         page: with the whole page, whose pictures take a second; else with the box at its top.
     """
-    told = [f"by its numbers: {name}" for name, broken in RULES.items() if broken(diagnosis)]
+    sentences = [f"by its numbers: {name}" for name, broken in RULES.items() if broken(diagnosis)]
     texts = {"terminal": terminal_rows(diagnosis), "box": box_rows(diagnosis)}
     if page:
         texts["page"] = page_rows(diagnosis_report(diagnosis))
     for place, rows in texts.items():
-        told += [f"{place}: {found}" for found in _in_text(rows, diagnosis)]
-    return told
+        sentences += [f"{place}: {found}" for found in _in_text(rows, diagnosis)]
+    return sentences
 
 
 def _in_text(rows: Sequence[str], d: Diagnosis) -> Iterator[str]:
@@ -278,4 +278,4 @@ def page_rows(page: str) -> list[str]:
     """The text of a page, a row of a table, a paragraph or a heading at a time."""
     parser = _Rows()
     parser.feed(page)
-    return [told for row in parser.rows if (told := " ".join(row.replace("\u00a0", " ").split()))]
+    return [text for row in parser.rows if (text := " ".join(row.replace("\u00a0", " ").split()))]

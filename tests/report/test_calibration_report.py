@@ -290,8 +290,8 @@ def test_no_text_of_a_picture_is_cut_at_its_edge_or_covers_another_panel(recordi
             assert box.y0 >= -2.0
             assert box.x1 <= figure.bbox.width + 2.0
             assert box.y1 <= figure.bbox.height + 2.0
-        for one, other in itertools.combinations(panels, 2):
-            assert not any(a.overlaps(b) for a in one for b in other)
+        for item, other in itertools.combinations(panels, 2):
+            assert not any(a.overlaps(b) for a in item for b in other)
 
 
 def _texts(ax):

@@ -333,7 +333,7 @@ def test_moments_and_what_each_number_is_are_told():
         "heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c")
     )
     changed = first_changed(
-        make_diagnosis(1, samples=4500), onset=61.1, moments=(61.1, 77.8), parameters=(jumps,), channels=("heading",)
+        make_diagnosis(1, samples=4500), onset=61.1, event_times=(61.1, 77.8), parameters=(jumps,), channels=("heading",)
     )
     page = diagnosis_report(changed)
     text = text_of(page)
@@ -349,8 +349,8 @@ def test_a_step_that_comes_and_goes_says_so():
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
     text = text_of(diagnosis_report(diagnosis))
-    told = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then it comes and goes, mainly in 4 intervals, the longest from 34.0"
-    assert text.count(told) == 2
+    label = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then it comes and goes, mainly in 4 intervals, the longest from 34.0"
+    assert text.count(label) == 2
     assert top.headline(diagnosis) == "Left out of the simulation: hard-iron step that comes and goes."
     assert "from 6.2 s on" not in text
     assert "switched on and off, and that no column recorded, would look like this" in text
@@ -450,25 +450,25 @@ def test_a_long_name_is_whole_where_there_is_room():
 def test_whether_a_finding_extrapolates_is_said():
     diagnosis = make_diagnosis(2, samples=300)
     assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
-    for gain, interval, told in (
+    for gain, interval, label in (
         (0.31, (0.28, 0.35), "it predicts where that is high: +0.310 nats a sample (95 %: 0.280 to 0.350)"),
         (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
         (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
     ):
         said = extrapolation.said(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
         text = text_of(diagnosis_report(first_changed(diagnosis, said)))
-        assert f"beyond its range fitted where its driver is low, {told}" in text
+        assert f"beyond its range fitted where its driver is low, {label}" in text
 
 
 def test_what_shifted_copies_of_the_driver_gain_is_said():
-    for as_good, told in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
+    for as_good, text in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
             make_diagnosis(1, samples=240),
             driver_shift.said(DriverShift(38, as_good, 22.5), BY_LOAD, EvidenceSettings()),
             drivers=("load",),
         )
         verb = "gain" if as_good > 1 else "gains"
-        assert f"driven by load; {told} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
+        assert f"driven by load; {text} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
 
 
 def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():

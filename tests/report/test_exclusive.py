@@ -74,7 +74,7 @@ def findings(draw, place):
         evidence=(held_out_gain.said(held, "" if held else "One side of it is too short."),),
     )
     shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
-    grade = "nearest in the catalogue" if shape is not None and shape.curve is not None else grade_of(finding)
+    grade = "nearest" if shape is not None and shape.curve is not None else grade_of(finding)
     return dataclasses.replace(finding, shape=shape, grade=grade)
 
 
@@ -86,14 +86,14 @@ class Case:
 
     def __repr__(self):
         d = self.diagnosis
-        return f"{d.verdict}: {[(f.effect, f.grade, f.held_out) for f in d.findings]}, {d.world.pushes}, {d.remaining}"
+        return f"{d.verdict}: {[(f.effect, f.grade, f.held_out) for f in d.findings]}, {d.environment.process_noise}, {d.remaining}"
 
 
 @st.composite
 def diagnoses(draw):
     """A diagnosis put together as ``assembled`` does it: grades, verdict and advice are the project's own."""
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
-    found = [one for one in found if not (one.grade == "not confirmed" and is_zero_within_error(one))]
+    found = [item for item in found if not (item.grade == "unconfirmed" and is_zero_within_error(item))]
     white = draw(st.booleans())
     pushes = () if draw(st.booleans()) else (dataclasses.replace(PUSHED, at_rate=draw(st.booleans())),)
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not pushes else st.floats(1.0, 20.0))
@@ -110,7 +110,7 @@ def diagnoses(draw):
     reasons = ("Another start reaches 0.006 rad.",) if verdict == "unfit" else ()
     world = NoiseEnvironment((one,), reasons, pushes, {"torque": "held"})
     made = make_diagnosis(
-        0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, world=world, remaining=remaining,
+        0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, environment=world, remaining=remaining,
         warnings=(),
     )  # fmt: skip
     made = dataclasses.replace(made, findings=tuple(found))
@@ -170,7 +170,7 @@ def test_a_pair_excludes_something_and_allows_either_alone(pair):
 SPOILT = {
     "adequate with a finding": {"verdict": "adequate"},
     "unfit with a finding": {"verdict": "unfit"},
-    "not confirmed": {"grade": "not confirmed"},
+    "not confirmed": {"grade": "unconfirmed"},
     "outside of the recording": {"onset": 99.0},
     "a claim above the level": {"p_value": 0.3},
     "a claim whose size is 0": {"parameters": (EffectParameter("size", 0.1, 0.4, "µT"),)},
@@ -200,7 +200,7 @@ def test_a_report_that_contradicts_itself_is_caught(name):
     of_finding = {k: v for k, v in SPOILT[name].items() if hasattr(finding, k) and k != "advice"}
     of_all = {k: v for k, v in SPOILT[name].items() if k not in of_finding}
     spoilt = dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], **of_finding),), **of_all)
-    assert any(name in told for told in contradictions(spoilt, page=False)), contradictions(spoilt, page=False)
+    assert any(name in result for result in contradictions(spoilt, page=False)), contradictions(spoilt, page=False)
 
 
 @pytest.mark.parametrize(

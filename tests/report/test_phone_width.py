@@ -13,14 +13,14 @@ pytest.importorskip("jinja2")
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.challenge.page import challenge_page
-from mkc_torch.challenge.scenarios.page import worlds_page
+from mkc_torch.challenge.scenarios.page import scenarios_page
 from mkc_torch.challenge.score import score
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.challenge.test_score import NOTHING, finding, key, says
 from tests.challenge.worlds import test_score as of_worlds
-from tests.diagnosis.factory import make_diagnosis, make_follows, make_unfit, make_world, nearest
+from tests.diagnosis.factory import make_diagnosis, make_follows, make_unfit, make_environment, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -80,15 +80,15 @@ def widths_of(places, folder):
     result = dumped(folder)
     found = re.search(r"widths (.+?) end", result.stdout)
     assert found, f"{CHROMIUM} measured nothing: {result.stderr[-1000:]}"
-    return {name: int(width) for name, width in (one.rsplit(" ", 1) for one in found[1].split(", "))}
+    return {name: int(width) for name, width in (item.rsplit(" ", 1) for item in found[1].split(", "))}
 
 
 def long_names():
     """A page on which whatever comes from a file is too long."""
     made = make_diagnosis(3, samples=200, channels=4, recording=LONG, simulation=LONG, warnings=(LONG,))
     findings = tuple(dataclasses.replace(f, drivers=(LONG,), equation=LONG, explanation=LONG) for f in made.findings)
-    world = make_world(follows=(make_follows(LONG, LONG),), reasons=(LONG,), between={LONG: "held"})
-    return dataclasses.replace(made, findings=findings, advice=(LONG,), world=world)
+    world = make_environment(goodness_of_fit=(make_follows(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"})
+    return dataclasses.replace(made, findings=findings, advice=(LONG,), environment=world)
 
 
 def first_nearest():
@@ -98,9 +98,9 @@ def first_nearest():
 
 
 PAGES = {
-    "adequate": lambda: make_diagnosis(0, samples=200, world=make_world(pushes=(), forcing=())),
+    "adequate": lambda: make_diagnosis(0, samples=200, environment=make_environment(process_noise=(), disturbance=())),
     "unfit": make_unfit,
-    "pushed": lambda: make_diagnosis(0, samples=200, verdict="unexplained", world=make_world()),
+    "pushed": lambda: make_diagnosis(0, samples=200, verdict="unexplained", environment=make_environment()),
     "nearest": first_nearest,
     "long names": long_names,
 }
@@ -121,7 +121,7 @@ def others():
     settings = {"seed": 1, "key_sha256": "0" * 64, "hidden": 3, "empty": 1, LONG: LONG}
     result = score(keys, {"a": says(finding("hard_iron_step")), "b": NOTHING, "c": says(finding("offset_drift"))})
     yield "challenge", challenge_page(result, {LONG: result}, keys, settings)
-    yield "worlds", worlds_page(of_worlds.all_kinds(), of_worlds.SETTINGS | {LONG: LONG})
+    yield "worlds", scenarios_page(of_worlds.all_kinds(), of_worlds.SETTINGS | {LONG: LONG})
 
 
 def test_no_other_page_needs_more_than_a_telephone_has(tmp_path):

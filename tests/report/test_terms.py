@@ -84,8 +84,8 @@ def test_changing_one_term_changes_terminal_and_report(monkeypatch, key, changed
     was = [terminal(diagnosis), diagnosis_report(diagnosis)]
     assert not any(seen in text for text in was)
     monkeypatch.setitem(TERMS, key, changed)
-    told = [terminal(diagnosis), diagnosis_report(diagnosis)]
-    assert all(seen in text for text in told)
+    sentences = [terminal(diagnosis), diagnosis_report(diagnosis)]
+    assert all(seen in text for text in sentences)
 
 
 def test_nothing_of_a_changed_term_is_left(monkeypatch):

@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 from mkc_torch.diagnosis.evidence import held_out_gain
-from mkc_torch.diagnosis.result import HeldOut, ResidualSizes
+from mkc_torch.diagnosis.result import DivergedBlock, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis import unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
@@ -23,7 +23,7 @@ from tests.diagnosis.factory import (
     make_follows,
     make_forcing,
     make_unfit,
-    make_world,
+    make_environment,
     nearest,
     with_evidence,
 )
@@ -32,7 +32,7 @@ from tests.report.test_calibration_report import parsed, text_of
 
 def pushed(**changes):
     return make_diagnosis(
-        0, simulation="Pendulum", samples=200, verdict="unexplained", p_value=0.4, world=make_world(**changes)
+        0, simulation="Pendulum", samples=200, verdict="unexplained", p_value=0.4, environment=make_environment(**changes)
     )
 
 
@@ -43,13 +43,13 @@ def with_first(diagnosis, change):
 
 def box_of(page):
     """What stands in the box at the top."""
-    told = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
-    return re.sub(" ([.,:])", r"\1", told)  # after code
+    text = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
+    return re.sub(" ([.,:])", r"\1", text)  # after code
 
 
 def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
     followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
-    quiet = make_diagnosis(0, samples=200, world=make_world(follows=followed, pushes=(), forcing=()))
+    quiet = make_diagnosis(0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=()))
     page = diagnosis_report(quiet)
     box = box_of(page)
     assert "Nothing is missing that this recording could show." in box
@@ -62,13 +62,13 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
 
 def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
     still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
-    (line,) = world.output_lines(make_diagnosis(0, samples=50, world=make_world(follows=(still,))))
+    (line,) = world.output_lines(make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,))))
     assert line == ("angle is off by 0.00510 rad; noise floor 0.00500 rad (declared); it hardly varies beyond that")
 
 
 def test_of_many_outputs_the_table_has_all():
-    many = tuple(make_follows(f"motor_{i}", "rad/s", last_value_predicts=math.nan) for i in range(9))
-    page = diagnosis_report(make_diagnosis(0, samples=100, world=make_world(follows=many, pushes=(), forcing=())))
+    many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
+    page = diagnosis_report(make_diagnosis(0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())))
     assert "and 3 more outputs; see the table of all" in box_of(page)
     assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s not known" in text_of(page)
 
@@ -89,7 +89,7 @@ def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
 
 
 def test_one_colour_for_adequate_another_for_unfit_and_unexplained():
-    quiet = make_diagnosis(0, samples=50, world=make_world(pushes=(), forcing=()))
+    quiet = make_diagnosis(0, samples=50, environment=make_environment(process_noise=(), disturbance=()))
     assert [top.tone(d) for d in (quiet, make_unfit(), pushed(), make_diagnosis(1, samples=50))] == [
         "good", "open", "open", "found",
     ]  # fmt: skip
@@ -116,7 +116,7 @@ def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
 def test_a_forcing_of_any_length_with_any_number_of_curves(samples, curves):
     forcing = make_forcing(samples)
     forcing = dataclasses.replace(forcing, curves=tuple(forcing.curves[i % 3] for i in range(curves)))
-    page = diagnosis_report(pushed(forcing=(forcing,)))
+    page = diagnosis_report(pushed(disturbance=(forcing,)))
     assert page.count("<svg ") == 2
     assert len(page) < 500_000
 
@@ -131,7 +131,7 @@ def test_runs_are_not_joined_by_a_line():
 
 def test_something_slow_in_a_sensor_is_told_as_such():
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
-    text = text_of(diagnosis_report(pushed(pushes=(slow,), forcing=(make_forcing(200, slow),))))
+    text = text_of(diagnosis_report(pushed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
     assert "Something slow is added to angle beside the sensor's noise, and no physics" in text
     assert "Something slow is added to angle beside its noise: 0.0120 ± 0.0020 rad, for about 0.7 s at a time." in text
     assert "What is added to angle" in text
@@ -161,28 +161,28 @@ def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
 @pytest.mark.parametrize(
     ("grade", "told"),
     [
-        ("left out", "Left out of the simulation: hard-iron step"),
-        ("real but small", "Real, but small beside the noise: hard-iron step"),
-        ("not confirmed", "Found, but not confirmed on unseen blocks: hard-iron step"),
+        ("left_out", "Left out of the simulation: hard-iron step"),
+        ("small", "Real, but small beside the noise: hard-iron step"),
+        ("unconfirmed", "Found, but not confirmed on unseen blocks: hard-iron step"),
     ],
 )
-def test_the_headline_is_by_grade_alone(grade, told):
+def test_the_headline_is_by_grade_alone(grade, text):
     made = with_first(make_diagnosis(1, samples=50), lambda f: graded(f, grade))
-    assert top.headline(made).startswith(told)
+    assert top.headline(made).startswith(text)
 
 
 def test_what_is_small_beside_an_adequate_simulation_is_said():
-    small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "real but small"))
+    small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "small"))
     assert top.headline(small).startswith("Nothing is missing that is worth correcting. Real, but small")
-    weak = with_first(small, lambda f: graded(f, "not confirmed"))
+    weak = with_first(small, lambda f: graded(f, "unconfirmed"))
     assert top.headline(weak) == "Nothing is missing that this recording could show."
 
 
 def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_reason():
-    left = "In 1 of 25 blocks the free run leaves the recording's range."
+    diverged = {"diverged_blocks": (DivergedBlock(3, before=True, after=False),), "blocks": 25}
     for held, reason in (
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "from block to block the gain differs by more than itself"),
-        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", left=left), left[1:].rstrip(".")),
+        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", **diverged), "diverges in 1 of 25 blocks without the finding"),
         (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
         (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
         (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on unseen blocks: what is less likely is in the tail"),
@@ -193,8 +193,9 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
         (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not speak against it: the free run is closer"),
     ):
         assert reason in unseen.better(held)
-        assert unseen.left(held) == ""
-    assert unseen.left(HeldOut(0.3, (0.2, 0.4), 1.0, 0.5, "m", left=left)) == left
+        assert unseen.diverged(held) == ""
+    sentence = unseen.diverged(HeldOut(0.3, (0.2, 0.4), 1.0, 0.5, "m", **diverged))
+    assert "in 1 of 25 blocks without the finding" in sentence
     assert unseen.better(HeldOut(0.001, (-0.4, 0.4), 1.0, 0.99, "m")) == "not shown to be better on unseen blocks"
 
 
@@ -202,15 +203,15 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
     held = HeldOut(
         0.3, (0.2, 0.4), 15671.0, 0.661, "",
         {"angle": ResidualSizes(0.02, 0.0051, "rad"), "rate": ResidualSizes(0.3, 0.1, "rad/s")},
-        "In 1 of 25 blocks the free run of the simulation alone leaves the recording's range.",
+        (DivergedBlock(3, before=True, after=False),), 25,
     )  # fmt: skip
-    made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", world=make_world(pushes=(), forcing=()))
+    made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", environment=make_environment(process_noise=(), disturbance=()))
     traces = dataclasses.replace(made.traces, channels=("angle", "rate"), unit="")
     made = dataclasses.replace(made, traces=traces, findings=tuple(
         with_evidence(f, held_out_gain.said(held, "")) for f in made.findings
     ))  # fmt: skip
-    for one in (made, dataclasses.replace(made, findings=made.findings[:1])):
-        text = text_of(diagnosis_report(one))
+    for item in (made, dataclasses.replace(made, findings=made.findings[:1])):
+        text = text_of(diagnosis_report(item))
         assert "angle 0.0200 → 0.00510 rad (74 % less), noise floor 0.00500 rad" in text
         assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
         assert "15671" not in text
@@ -240,7 +241,7 @@ def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
 
 
 def test_the_statisticians_numbers_are_one_click_below():
-    page = diagnosis_report(pushed(pushes=(PUSHED,)))
+    page = diagnosis_report(pushed(process_noise=(PUSHED,)))
     closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
     assert closed[:4] == [
         "How the simulation follows", "What pushes it", "On data the fit had not seen",
@@ -249,37 +250,37 @@ def test_the_statisticians_numbers_are_one_click_below():
 
 
 def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
-    made = make_diagnosis(0, samples=200, world=make_world(follows=(make_follows("norm", "µT"),), pushes=()))
+    made = make_diagnosis(0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=()))
     page = diagnosis_report(made)
     assert "Dotted: the sensor's noise floor." in text_of(page)
-    without = diagnosis_report(dataclasses.replace(made, world=make_world(pushes=())))  # of no channel
+    without = diagnosis_report(dataclasses.replace(made, environment=make_environment(process_noise=())))  # of no channel
     assert "Dotted" not in without
     assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
 
 
 def test_nats_are_explained_once_where_they_are_met():
-    told = "How much likelier one model is than another is told in nats"
+    text = "How much likelier one model is than another is told in nats"
     for made in (make_diagnosis(3, samples=100, channels=2), pushed()):
         page = diagnosis_report(made)
-        assert page.count(told) == 1
-        assert page.index(told) < page.index("<h2>")
-    assert told not in diagnosis_report(make_unfit())
+        assert page.count(text) == 1
+        assert page.index(text) < page.index("<h2>")
+    assert text not in diagnosis_report(make_unfit())
 
 
 def test_names_of_the_world_are_escaped():
     bad = "<b>x</b> & $a$"
     push = dataclasses.replace(PUSHED, place=bad, unit=bad)
     forcing = dataclasses.replace(make_forcing(50, push), sentences=(bad,))
-    hostile = make_world(
-        follows=(make_follows(bad, bad),), pushes=(push,), between={bad: "linear"}, forcing=(forcing,), reasons=(bad,)
+    hostile = make_environment(
+        goodness_of_fit=(make_follows(bad, bad),), process_noise=(push,), input_hold={bad: "linear"}, disturbance=(forcing,), reasons=(bad,)
     )
     for verdict in ("unfit", "unexplained"):
-        page = diagnosis_report(make_diagnosis(0, samples=100, verdict=verdict, world=hostile))
+        page = diagnosis_report(make_diagnosis(0, samples=100, verdict=verdict, environment=hostile))
         assert "<b>" not in page
         parsed(page)
 
 
 def test_a_contradiction_is_not_called_nothing():
-    lost = make_diagnosis(0, samples=50, world=make_world(follows=LOST, pushes=(), forcing=()))
+    lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=()))
     assert top.tone(lost) == "open"
     assert top.headline(lost) == "The simulation does not follow the recording."

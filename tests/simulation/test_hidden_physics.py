@@ -219,9 +219,9 @@ class TestMemory:
         theta = parameters[: model.base]
         seen = model.prepared.signals(theta, changes)
         nothing, something = (torch.full((len(seen[port]), 1), one).double() for one in (0.0, 0.1))
-        torch.testing.assert_close(model.pushed(parameters, port, nothing), model.residual(parameters))
-        pushed = model.pushed(parameters, port, something)
-        other = model.pushed(parameters, "rate of speed", something)
+        torch.testing.assert_close(model.residual_with_change(parameters, port, nothing), model.residual(parameters))
+        pushed = model.residual_with_change(parameters, port, something)
+        other = model.residual_with_change(parameters, "rate of speed", something)
         torch.testing.assert_close(pushed, other, rtol=0.0, atol=1e-9)
 
     def test_without_it_there_is_no_internal_state(self):

@@ -66,8 +66,8 @@ def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
         found = correction.unit if of_measured is None else correction.field_unit
         raise ExportError(
             f"the calibration is in {found or 'no known unit'}, and {kind} needs {unit}, so nothing was exported to "
-            "it. If the columns are in a unit of the magnetic field, calibrate again and name it, such as `--unit "
-            "mag=gauss`; raw counts have to be scaled by the sensor's data sheet first."
+            "it. If the columns are in a unit of the magnetic field, calibrate again with, for example, "
+            "`--convert mag=gauss`; raw counts have to be scaled by the sensor's data sheet first."
         )
     current = correction.current
     return Converted(

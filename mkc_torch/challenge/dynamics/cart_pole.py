@@ -18,9 +18,9 @@ GRAVITY = 9.81
 
 def rate(x: Array, u: Array, p: Array) -> Array:
     _, speed, angle, turn = x
-    push = p[0] * u[0] - p[1] * speed
-    swing = -(push * np.cos(angle) + GRAVITY * np.sin(angle)) / p[2] - p[3] * turn
-    return np.array([speed, push, turn, swing])
+    drive = p[0] * u[0] - p[1] * speed
+    swing = -(drive * np.cos(angle) + GRAVITY * np.sin(angle)) / p[2] - p[3] * turn
+    return np.array([speed, drive, turn, swing])
 
 
 def draw(g: Generator) -> Setting:
@@ -48,10 +48,10 @@ def trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Forces in N about the pole's own period."""
     time = moments(STEP, samples)
     period = 2.0 * np.pi * np.sqrt(plant.parameters["length"] / GRAVITY)
-    pushes = [uniform(g, 4.0, 8.0) * excitation(g, time, period) for _ in range(runs)]
+    forces = [uniform(g, 4.0, 8.0) * excitation(g, time, period) for _ in range(runs)]
     reach = ((-0.2, 0.2), (-0.3, 0.3), (-0.8, 0.8), (-0.5, 0.5))
     begin = np.array([[uniform(g, *ends) for _ in range(runs)] for ends in reach])
-    return RunSet(STEP, runs_of(pushes), begin)
+    return RunSet(STEP, runs_of(forces), begin)
 
 
 INSIDE = (

@@ -42,7 +42,7 @@ def holding(values: Array, parts: int) -> Array:
 
 
 def simulate(
-    plant: Plant, trial: RunSet, hidden: HiddenTerm | None = None, size: float = 0.0, push: Array | None = None
+    plant: Plant, trial: RunSet, hidden: HiddenTerm | None = None, size: float = 0.0, disturbance: Array | None = None
 ) -> Course:
     """The runs of a trial, with something hidden or nothing.
 
@@ -56,7 +56,7 @@ def simulate(
     h = trial.step / plant.fine
     half = _sent(plant, trial)
     sent = half if hidden is None else hidden.inputs(half, 0.5 * h, size)
-    states = _states(plant, h, sent, trial, hidden, np.full(trial.runs, size), push)
+    states = _states(plant, h, sent, trial, hidden, np.full(trial.runs, size), disturbance)
     return Course(states, half[:, ::2], _measured(plant, states, sent[:, ::2], h, hidden, size))
 
 
@@ -83,18 +83,18 @@ def _states(
     trial: RunSet,
     hidden: HiddenTerm | None,
     sizes: Array,
-    push: Array | None = None,
+    disturbance: Array | None = None,
 ) -> Array:
     """(n, F, R) for inputs (k, 2F - 1, R), a trial's first states (n, R) and the size of what is hidden (R,)."""
     own = 0 if hidden is None else hidden.own
     n, p = len(plant.states), plant.values
 
-    def rate(x: Array, u: Array, pushed: Array | None) -> Array:
+    def rate(x: Array, u: Array, disturbed: Array | None) -> Array:
         known, inner = plant.rate(x[:n], u, p), x[n:]
         if hidden is not None and hidden.rate is not None:
             known, inner = hidden.rate(x[:n], x[n:], u, known, sizes)
-        if pushed is not None:
-            known = known + pushed
+        if disturbed is not None:
+            known = known + disturbed
         return np.concatenate([known, inner]) if own else known
 
     inner = np.zeros((own, trial.begin.shape[1]))
@@ -107,7 +107,7 @@ def _states(
         a, b, c = sent[:, 2 * k], sent[:, 2 * k + 1], sent[:, 2 * k + 2]
         if trial.held:
             c = b  # the next value begins where this step ends
-        w = None if push is None else push[:, k]
+        w = None if disturbance is None else disturbance[:, k]
         k1 = rate(x, a, w)
         k2 = rate(x + 0.5 * h * k1, b, w)
         k3 = rate(x + 0.5 * h * k2, b, w)

@@ -40,9 +40,9 @@ class CartPole(Dynamics):
     }
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
-        push = p.gain * u.force - p.drag * x.speed
-        swing = -(push * torch.cos(x.angle) + 9.81 * torch.sin(x.angle)) / p.length - p.damping * x.turn
-        return {"position": x.speed, "speed": push, "angle": x.turn, "turn": swing}
+        drive = p.gain * u.force - p.drag * x.speed
+        swing = -(drive * torch.cos(x.angle) + 9.81 * torch.sin(x.angle)) / p.length - p.damping * x.turn
+        return {"position": x.speed, "speed": drive, "angle": x.turn, "turn": swing}
 
 
 class Tanks(Dynamics):

@@ -19,7 +19,7 @@ def dynamics() -> Subject:
         draw=_draw,
         ratio=ratio_to_oracle,
         thresholds=THRESHOLDS,
-        simulations=Path(__file__).with_name("naive.py"),
+        simulations=Path(__file__).with_name("nominal_models.py"),
     )
 
 

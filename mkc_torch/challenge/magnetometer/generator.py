@@ -111,23 +111,23 @@ def draw(
     columns = draw_columns(stream("columns"), plan, scene, noise)
     name = name or f"case_{index:05d}"
     if empty:
-        spoilt = spoil_scene(stream("errors"), scene, noise, outliers, torch.zeros_like(scene.field))
-        key = key_of(name, "empty", plan, scene, noise, outliers, spoilt, columns)
-        return Case(recording_of(name, scene, spoilt, columns), None, key)
+        contaminated = contaminate_scene(stream("errors"), scene, noise, outliers, torch.zeros_like(scene.field))
+        key = key_of(name, "empty", plan, scene, noise, outliers, contaminated, columns)
+        return Case(recording_of(name, scene, contaminated, columns), None, key)
     found = size_effects(stream("size"), kind, effects, scene, noise, outliers, plan, columns)
     sizes = [size for size, _ in found]
-    spoilt = spoil_scene(stream("errors"), scene, noise, outliers, total_of(effects, sizes, scene))
+    contaminated = contaminate_scene(stream("errors"), scene, noise, outliers, total_of(effects, sizes, scene))
     later = later_scene(stream("later"), scene)
     later_columns = draw_columns(stream("later columns"), plan, later, noise)
-    again = spoil_scene(stream("later errors"), later, noise, outliers, total_of(effects, sizes, later))
+    again = contaminate_scene(stream("later errors"), later, noise, outliers, total_of(effects, sizes, later))
     traces = [[effect.trace(at) for effect in effects] for at in (scene, later)]
     rms = second_residual(
         (Metric(scene, noise, False), Metric(later, noise, False)),
         traces,
-        (spoilt.errors, again.errors),
-        (~spoilt.mask, ~again.mask),
+        (contaminated.errors, again.errors),
+        (~contaminated.mask, ~again.mask),
     )
-    key = key_of(name, kind, plan, scene, noise, outliers, spoilt, columns)
+    key = key_of(name, kind, plan, scene, noise, outliers, contaminated, columns)
     key = replace(
         key,
         effects=tuple(
@@ -137,7 +137,7 @@ def draw(
         oracle_rms=rms,
     )
     second = recording_of(f"{name}_second", later, again, later_columns)
-    return Case(recording_of(name, scene, spoilt, columns), second, key)
+    return Case(recording_of(name, scene, contaminated, columns), second, key)
 
 
 def draw_scene(g: Generator, duration: float = DURATION, rate: float = RATE) -> Scene:
@@ -237,7 +237,7 @@ def _own_family(
     return None
 
 
-def spoil_scene(
+def contaminate_scene(
     g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]
 ) -> Contaminated:
     """The measurement of a scene with an effect, noise and outliers, µT."""
@@ -272,8 +272,8 @@ def _drivers(effect: Hidden, plan: Plan) -> tuple[str, ...]:
     return POSITION if effect.driver == "position" else (effect.driver,)
 
 
-def recording_of(name: str, scene: Scene, spoilt: Contaminated, columns: Mapping[str, Tensor]) -> Recording:
-    axes = zip(("mag_x", "mag_y", "mag_z"), spoilt.measured.unbind(-1), strict=True)
+def recording_of(name: str, scene: Scene, contaminated: Contaminated, columns: Mapping[str, Tensor]) -> Recording:
+    axes = zip(("mag_x", "mag_y", "mag_z"), contaminated.measured.unbind(-1), strict=True)
     return Recording({"time": scene.time.round(decimals=6), **rounded(dict(axes)), **columns}, name=name)
 
 
@@ -288,7 +288,7 @@ def key_of(
     scene: Scene,
     noise: Noise,
     outliers: Outliers,
-    spoilt: Contaminated,
+    contaminated: Contaminated,
     columns: Mapping[str, Tensor],
 ) -> Key:
     return Key(
@@ -298,7 +298,7 @@ def key_of(
         effects=(),
         noise=noise.numbers(),
         outlier_kind=asdict(outliers),
-        outliers=_numbers(spoilt.mask),
+        outliers=_numbers(contaminated.mask),
         second_outliers=(),
         decoys={name: decoy.kind for name, decoy in plan.decoys.items()},
         sensor={"soft": scene.sensor.soft.tolist(), "hard": scene.sensor.hard.tolist()},

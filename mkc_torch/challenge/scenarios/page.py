@@ -1,4 +1,4 @@
-"""The result of the proof in worlds for a reader: one HTML page, each world a row, and a summary in Markdown."""
+"""The result of the proof in scenarios: an HTML page with a row for each scenario, and a summary in Markdown."""
 
 from __future__ import annotations
 
@@ -19,40 +19,39 @@ HELD, NOT_HELD, TOO_FEW, NOT_MEASURED = "held", "not held", "too few", "not meas
 
 Column = tuple[str, Callable[[ScenarioScore], str]]
 
-SAID: Sequence[Column] = (
-    ("recordings", lambda world: str(world.empty)),
-    ("false alarms", lambda world: share_text(world.false_alarms)),
-    *((verdict, lambda world, verdict=verdict: str(world.verdicts[verdict])) for verdict in VERDICTS),
-    ("unexplained, at the right state", lambda world: share_text(world.unexplained_located)),
-    ("at the right state", lambda world: share_text(world.located)),
-    ("told as the sensor's", lambda world: share_text(world.sensor_told)),
+VERDICT_COLUMNS: Sequence[Column] = (
+    ("recordings", lambda scenario: str(scenario.empty)),
+    ("false alarms", lambda scenario: share_text(scenario.false_alarms)),
+    *((verdict, lambda scenario, verdict=verdict: str(scenario.verdicts[verdict])) for verdict in VERDICTS),
+    ("unexplained, at the right state", lambda scenario: share_text(scenario.unexplained_located)),
+    ("at the right state", lambda scenario: share_text(scenario.located)),
+    ("attributed to the sensor", lambda scenario: share_text(scenario.sensor_reported)),
 )
-"""Of recordings with nothing hidden, and of useless simulations."""
+"""Columns on recordings without hidden physics, and on unusable simulations."""
 
-NAMED: Sequence[Column] = (
-    ("hidden", lambda world: str(world.hidden)),
-    ("z, z_sep ≥ 10", lambda world: str(world.strong)),
-    ("named right", lambda world: share_text(world.named)),
-    ("with a push", lambda world: share_text(world.named_pushed)),
-    ("without", lambda world: share_text(world.named_quiet)),
-    ("a wrong name claimed", lambda world: share_text(world.wrong)),
-    ("nearest in the catalogue", lambda world: share_text(world.nearest)),
-    ("outside: a name claimed", lambda world: share_text(world.outside_wrong)),
-    ("outside: nearest, or unknown", lambda world: share_text(world.outside_nearest)),
+NAMED_COLUMNS: Sequence[Column] = (
+    ("hidden", lambda scenario: str(scenario.hidden)),
+    ("z, z_sep ≥ 10", lambda scenario: str(scenario.strong)),
+    ("named right", lambda scenario: share_text(scenario.named)),
+    ("with a disturbance", lambda scenario: share_text(scenario.named_disturbed)),
+    ("without", lambda scenario: share_text(scenario.named_undisturbed)),
+    ("a wrong name claimed", lambda scenario: share_text(scenario.wrong)),
+    ("nearest in the catalogue", lambda scenario: share_text(scenario.nearest)),
+    ("outside: a name claimed", lambda scenario: share_text(scenario.outside_wrong)),
+    ("outside: nearest, or unknown", lambda scenario: share_text(scenario.outside_nearest)),
 )
-"""Of recordings with something hidden."""
+"""Columns on recordings with hidden physics."""
 
-
-APART: Sequence[Column] = (
-    ("recordings", lambda world: str(world.empty + world.hidden)),
-    ("a name alone, not the hidden one's", lambda world: share_text(world.alone)),
-    ("said that it cannot be told", lambda world: share_text(world.undecided)),
+APART_COLUMNS: Sequence[Column] = (
+    ("recordings", lambda scenario: str(scenario.empty + scenario.hidden)),
+    ("a single wrong name", lambda scenario: share_text(scenario.alone)),
+    ("undecided", lambda scenario: share_text(scenario.undecided)),
 )
-"""Of worlds that are counted apart, with something hidden or nothing."""
+"""Columns on scenarios that are counted apart, with and without hidden physics."""
 
 
 def held(measured: MeasuredThreshold) -> str:
-    """Whether an aim holds, in words.
+    """Return in words whether an aim holds.
 
     Example:
         >>> from mkc_torch.challenge.aims import FALSE_ALARMS
@@ -66,8 +65,8 @@ def held(measured: MeasuredThreshold) -> str:
     return TOO_FEW if math.isinf(measured.threshold.high) else NOT_HELD
 
 
-def worlds_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
-    """The page. Needs the ``cli`` extra."""
+def scenarios_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
+    """Return the HTML page. Needs the ``cli`` extra."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
@@ -78,52 +77,53 @@ def worlds_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(share=share_text, measured=measured_text, held=held)
-    asked = [measured for world in _rows(score) for measured in world.measured if held(measured) != NOT_MEASURED]
+    asked = [measured for scenario in _rows(score) for measured in scenario.measured if held(measured) != NOT_MEASURED]
     return environment.get_template("worlds.html.j2").render(
         score=score,
         rows=_rows(score),
-        hiding=[world for world in _rows(score) if world.hidden],
-        said=SAID,
-        named=NAMED,
-        counted=APART,
-        apart=[world for world in _rows(score) if world.apart],
+        hiding=[scenario for scenario in _rows(score) if scenario.hidden],
+        verdict_columns=VERDICT_COLUMNS,
+        named=NAMED_COLUMNS,
+        counted=APART_COLUMNS,
+        apart=[scenario for scenario in _rows(score) if scenario.apart],
         passed=sum(m.holds for m in asked),
         asked=len(asked),
         settings=settings,
-        failed=[name for world in score.worlds for name in world.failed],
+        failed=[name for scenario in score.scenarios for name in scenario.failed],
         verdicts=VERDICTS,
     )
 
 
-def worlds_summary(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
-    """The numbers in Markdown."""
-    lines = ["# The blind proof, in worlds", "", *(f"- {name}: {value}" for name, value in settings.items()), ""]
-    lines += _table(SAID, _rows(score))
-    if hiding := [world for world in _rows(score) if world.hidden]:
-        lines += ["", *_table(NAMED, hiding)]
-    if apart := [world for world in _rows(score) if world.apart]:
-        lines += ["", *_table(APART, apart)]
-    lines += ["", "| world | asked | measured | holds |", "|---|---|---|---|"]
+def scenarios_summary(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
+    """Return the numbers in Markdown."""
+    lines = ["# The blind proof, in scenarios", "", *(f"- {name}: {value}" for name, value in settings.items()), ""]
+    lines += _table(VERDICT_COLUMNS, _rows(score))
+    if hiding := [scenario for scenario in _rows(score) if scenario.hidden]:
+        lines += ["", *_table(NAMED_COLUMNS, hiding)]
+    if apart := [scenario for scenario in _rows(score) if scenario.apart]:
+        lines += ["", *_table(APART_COLUMNS, apart)]
+    lines += ["", "| scenario | aim | measured | holds |", "|---|---|---|---|"]
     lines += [
-        f"| {world.name} | {m.threshold.sentence} | {measured_text(m)} | {_marked(held(m))} |"
-        for world in _rows(score)
-        for m in world.measured
+        f"| {scenario.name} | {m.threshold.sentence} | {measured_text(m)} | {_marked(held(m))} |"
+        for scenario in _rows(score)
+        for m in scenario.measured
     ]
-    lines += ["", "| world | what it is like | right | not right |", "|---|---|---|---|"]
+    lines += ["", "| scenario | description | right | wrong |", "|---|---|---|---|"]
     lines += [
-        f"| {world.name} | {world.sentence} | {world.right_to_say} | {world.wrong_to_say} |" for world in score.worlds
+        f"| {scenario.name} | {scenario.sentence} | {scenario.right_to_say} | {scenario.wrong_to_say} |"
+        for scenario in score.scenarios
     ]
-    for world in score.worlds:
-        lines += [""] * bool(world.reasons)
+    for scenario in score.scenarios:
+        lines += [""] * bool(scenario.reasons)
         lines += [
-            f"- {why}: {', '.join(f'{verdict} {count}' for verdict, count in told.items())}"
-            for why, told in world.reasons.items()
+            f"- {why}: {', '.join(f'{verdict} {count}' for verdict, count in counts.items())}"
+            for why, counts in scenario.reasons.items()
         ]
     return "\n".join(lines) + "\n"
 
 
 def _table(columns: Sequence[Column], rows: Sequence[ScenarioScore]) -> list[str]:
-    lines = [f"| world | {' | '.join(name for name, _ in columns)} |", "|---" * (len(columns) + 1) + "|"]
+    lines = [f"| scenario | {' | '.join(name for name, _ in columns)} |", "|---" * (len(columns) + 1) + "|"]
     return lines + [f"| {row.name} | {' | '.join(cell(row) for _, cell in columns)} |" for row in rows]
 
 
@@ -132,4 +132,4 @@ def _marked(word: str) -> str:
 
 
 def _rows(score: ScenariosScore) -> list[ScenarioScore]:
-    return [*score.worlds, score.total]
+    return [*score.scenarios, score.total]

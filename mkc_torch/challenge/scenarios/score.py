@@ -1,4 +1,4 @@
-"""The score of each world: what was said there against what the keys know, and which of its aims hold."""
+"""The score of each scenario: diagnoses compared with keys, and the aims that hold."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from mkc_torch.challenge.verdict import (
     UNKNOWN,
     VERDICTS,
     StatedDiagnosis,
-    answer,
     named_right,
+    stated_diagnosis,
 )
 
 TOTAL = "all useful"
-"""Name of the row of all worlds in which the simulation is of use, but for those that are counted apart."""
+"""Name of the row of all scenarios with usable simulations, without those counted apart."""
 
-LEAST_PUSH = 2.0
-"""From this share of the sensor's noise on, a push has to be seen and located."""
+LEAST_DISTURBANCE = 2.0
+"""A disturbance of at least this multiple of the sensor's noise has to be found and located."""
 
 
 @dataclass(frozen=True)
 class ScoredCase:
-    """A case and what was said of it.
+    """A case and its diagnosis.
 
-    ``state`` is the one that the diagnosis says is driven; ``sensor`` whether it says that a sensor errs slowly.
+    ``state`` is the state reported as disturbed; ``sensor`` says whether a drift of a sensor is reported.
     """
 
     key: ScenarioKey
-    said: StatedDiagnosis
+    stated: StatedDiagnosis
     state: str | None
     sensor: bool = False
 
@@ -50,83 +50,83 @@ class ScoredCase:
 
     @property
     def visible(self) -> bool:
-        """An effect is hidden that the best test would see at ten standard deviations."""
+        """Whether an effect is hidden that the best test detects at ten standard errors."""
         return self.hides and self.key.key.effects[0].z >= STRONG_Z
 
     @property
     def strong(self) -> bool:
-        """One of the catalogue, told from its rivals as well as from nothing."""
+        """Whether the hidden effect is of the catalogue, and z and z_sep are at least ten."""
         inside = self.key.key.kind == "single"
         return self.visible and inside and self.key.key.effects[0].z_sep >= STRONG_Z
 
     @property
-    def pushed(self) -> bool:
-        """Something pushes a state, or the sensor's offset wanders, beyond the noise."""
-        return self.key.push is not None and self.key.push.over_noise > 0.0
+    def disturbed(self) -> bool:
+        """Whether a state is disturbed, or the sensor drifts, beyond the noise."""
+        return self.key.disturbance is not None and self.key.disturbance.over_noise > 0.0
 
     @property
     def named(self) -> bool:
-        """The first claim is right."""
-        return bool(self.said.claims) and self._right(self.said.claims[0].named)
+        """Whether the first claim is right."""
+        return bool(self.stated.claims) and self._right(self.stated.claims[0].named)
 
     @property
     def wrong(self) -> bool:
-        """The first claim has a name, and it is the wrong one."""
-        return bool(self.said.claims) and self.said.claims[0].named.effect != UNKNOWN and not self.named
+        """Whether the first claim has a wrong name."""
+        return bool(self.stated.claims) and self.stated.claims[0].named.effect != UNKNOWN and not self.named
 
     @property
     def alone(self) -> bool:
-        """The first claim has a name, beside which no other is possible, and which is not the hidden one's."""
-        first = self.said.claims[0] if self.said.claims else None
+        """Whether the first claim has a wrong name without alternatives."""
+        first = self.stated.claims[0] if self.stated.claims else None
         if first is None or first.others or first.named.effect == UNKNOWN:
             return False
         return not (self.hides and self.named)
 
     @property
     def undecided(self) -> bool:
-        """It is said that it cannot be told: unexplained without a claim, or a claim with alternatives."""
-        if self.said.claims:
-            return bool(self.said.claims[0].others)
-        return self.said.verdict == UNEXPLAINED
+        """Whether the diagnosis is undecided: unexplained without a claim, or a claim with alternatives."""
+        if self.stated.claims:
+            return bool(self.stated.claims[0].others)
+        return self.stated.verdict == UNEXPLAINED
 
     @property
     def nearest(self) -> bool:
-        """Nothing is claimed, but something is said to be the nearest in the catalogue."""
-        return not self.said.claims and bool(self.said.nearest)
+        """Whether nothing is claimed, but a nearest effect of the catalogue is reported."""
+        return not self.stated.claims and bool(self.stated.nearest)
 
     @property
     def located(self) -> bool:
-        return self.key.push is not None and self.state == self.key.push.at
+        return self.key.disturbance is not None and self.state == self.key.disturbance.at
 
     def _right(self, named: Any) -> bool:
         return named_right(named, self.key.key.effects[0])
 
     def numbers(self) -> dict[str, Any]:
-        """One row of the result's list of cases."""
+        """Return the case as a row of the result."""
         effect = self.key.key.effects[0] if self.hides else None
         return {
             "name": self.key.name,
-            "world": self.key.world,
+            "scenario": self.key.scenario,
             "index": self.key.index,
             "kind": self.key.key.kind,
             "hidden": effect.effect if effect else "",
             "z": effect.z if effect else None,
             "z_sep": effect.z_sep if effect else None,
-            "push": asdict(self.key.push) if self.key.push else None,
+            "disturbance": asdict(self.key.disturbance) if self.key.disturbance else None,
             "useless": self.key.useless,
-            "verdict": self.said.verdict,
+            "verdict": self.stated.verdict,
             "driven": self.state,
             "sensor_errs": self.sensor,
-            "findings": [{"effect": f.named.effect, "grade": f.grade} for f in self.said.findings],
+            "findings": [{"effect": f.named.effect, "grade": f.grade} for f in self.stated.findings],
         }
 
 
 @dataclass(frozen=True)
 class ScenarioScore:
-    """One world. Shares are of recordings with nothing hidden, or of useless ones, but for those after ``hidden``.
+    """One scenario. Shares are of recordings with nothing hidden, or of useless ones, but for those after ``hidden``.
 
     Attributes:
-        name, sentence, right_to_say, wrong_to_say, apart: of the world.
+        name, sentence, right_to_say, wrong_to_say, apart: of the scenario.
         empty: how many of those there were.
         verdicts: what was said of them, and what failed.
         false_alarms: physics claimed to be missing, of those that were diagnosed.
@@ -136,12 +136,12 @@ class ScenarioScore:
         located: the pushed state, whatever the verdict, of the same.
         sensor_told: said that a sensor errs slowly, of those whose sensor does so by at least twice its white noise.
         alone: a name beside which no other is possible and which is not the hidden one's, of all, hidden or not.
-        undecided: "it cannot be told", unexplained or with alternatives, of the same.
+        undecided: "it cannot be cases", unexplained or with alternatives, of the same.
         useful_unfit: that verdict, of those of use with nothing hidden, or an effect at z of at least ten.
         reasons: of useless ones, why to what was said.
         hidden: how many recordings had something hidden, ``strong`` of them an effect of the catalogue with z and z_sep
             of at least ten.
-        named: of the strong; ``named_pushed`` with a push beside it, ``named_quiet`` without.
+        named: of the strong; ``named_disturbed`` with a disturbance beside it, ``named_undisturbed`` without.
         wrong: of the strong, those with a wrong name claimed first; ``nearest`` with nothing but a nearest name.
         outside_wrong: of the effects outside the catalogue at z of at least ten, those with a wrong name claimed;
             ``outside_nearest`` with nothing but a nearest name or none.
@@ -159,7 +159,7 @@ class ScenarioScore:
     unfit: Share
     unexplained_located: Share
     located: Share
-    sensor_told: Share
+    sensor_reported: Share
     alone: Share
     undecided: Share
     useful_unfit: Share
@@ -167,8 +167,8 @@ class ScenarioScore:
     hidden: int
     strong: int
     named: Share
-    named_pushed: Share
-    named_quiet: Share
+    named_disturbed: Share
+    named_undisturbed: Share
     wrong: Share
     nearest: Share
     outside_wrong: Share
@@ -182,83 +182,88 @@ class ScenarioScore:
 
 @dataclass(frozen=True)
 class ScenariosScore:
-    """All worlds, the row of all useful ones, and the cases."""
+    """The scores of all scenarios, their total, and the cases."""
 
-    worlds: tuple[ScenarioScore, ...]
+    scenarios: tuple[ScenarioScore, ...]
     total: ScenarioScore
     cases: tuple[ScoredCase, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """As JSON has it; infinite and undefined numbers become null."""
+        """Return the score as JSON data; infinite and undefined numbers become null."""
         return plain_numbers(
             {
-                "worlds": [_with_holds(world) for world in self.worlds],
+                "scenarios": [_with_holds(scenario) for scenario in self.scenarios],
                 "total": _with_holds(self.total),
                 "cases": [case.numbers() for case in self.cases],
             }
         )
 
 
-def score_worlds(
-    worlds: Scenarios, keys: Sequence[ScenarioKey], diagnoses: Mapping[str, Mapping[str, Any] | None]
+def score_scenarios(
+    scenarios: Scenarios, keys: Sequence[ScenarioKey], diagnoses: Mapping[str, Mapping[str, Any] | None]
 ) -> ScenariosScore:
-    """Compare diagnoses with keys, world by world.
+    """Compare diagnoses with keys, scenario by scenario.
 
     Args:
-        worlds: of the family; those without a key are left out.
-        keys: of all cases.
-        diagnoses: name of a recording to the content of its ``diagnosis.json``; a name that is missing failed.
+        scenarios: those of the family; scenarios without a key are left out.
+        keys: keys of all cases.
+        diagnoses: contents of ``diagnosis.json`` by the recording's name; a missing name counts as failed.
     """
-    told = [_told(key, diagnoses.get(key.name)) for key in keys]
-    drawn = [world for world in worlds.worlds if any(case.key.world == world.name for case in told)]
+    cases = [_scored(key, diagnoses.get(key.name)) for key in keys]
+    drawn = [scenario for scenario in scenarios.scenarios if any(case.key.scenario == scenario.name for case in cases)]
     scores = tuple(
         replace(
-            score_of(world.name, world.sentence, [case for case in told if case.key.world == world.name], world.aims),
-            right_to_say=world.right_to_say,
-            wrong_to_say=world.wrong_to_say,
-            apart=world.apart,
+            score_of(
+                scenario.name,
+                scenario.sentence,
+                [case for case in cases if case.key.scenario == scenario.name],
+                scenario.aims,
+            ),
+            right_to_say=scenario.right_to_say,
+            wrong_to_say=scenario.wrong_to_say,
+            apart=scenario.apart,
         )
-        for world in drawn
+        for scenario in drawn
     )
-    apart = {world.name for world in drawn if world.apart}
-    useful = [case for case in told if not case.key.useless and case.key.world not in apart]
+    apart = {scenario.name for scenario in drawn if scenario.apart}
+    useful = [case for case in cases if not case.key.useless and case.key.scenario not in apart]
     total = score_of(
-        TOTAL, "every world in which the simulation is of use, but for those counted apart", useful, worlds.totals
+        TOTAL, "all scenarios with usable simulations, without those counted apart", useful, scenarios.totals
     )
-    return ScenariosScore(scores, total, tuple(told))
+    return ScenariosScore(scores, total, tuple(cases))
 
 
-def _told(key: ScenarioKey, diagnosis: Mapping[str, Any] | None) -> ScoredCase:
-    return ScoredCase(key, answer(diagnosis), driven_state(diagnosis), sensor_errs(diagnosis))
+def _scored(key: ScenarioKey, diagnosis: Mapping[str, Any] | None) -> ScoredCase:
+    return ScoredCase(key, stated_diagnosis(diagnosis), driven_state(diagnosis), sensor_errs(diagnosis))
 
 
 def score_of(name: str, sentence: str, cases: Sequence[ScoredCase], asked: Sequence[Threshold]) -> ScenarioScore:
-    """The score of some cases.
+    """Return the score of some cases.
 
-    A recording that was refused is no false alarm and leaves that share alone; every other share counts it.
+    A refused recording is not counted among the false alarms or their total; all other shares count it.
     """
     empty, hidden = [case for case in cases if not case.hides], [case for case in cases if case.hides]
     strong = [case for case in hidden if case.strong]
     outside = [case for case in hidden if case.visible and case.key.key.kind == "outside"]
-    pushed = [case for case in empty if _to_be_located(case)]
+    disturbed = [case for case in empty if _to_be_located(case)]
     useless = [case for case in empty if case.key.useless]
     useful = [case for case in cases if not case.key.useless and (case.visible or not case.hides)]
-    diagnosed = [case for case in empty if case.said.verdict != FAILED]
+    diagnosed = [case for case in empty if case.stated.verdict != FAILED]
     results: dict[str, Any] = {
         "empty": len(empty),
         "verdicts": _verdicts(empty),
-        "false_alarms": share_of(diagnosed, lambda case: case.said.alarm),
-        "alarms": dict(Counter(case.said.claims[0].named.effect for case in diagnosed if case.said.alarm)),
-        "adequate": share_of(empty, lambda case: case.said.verdict == ADEQUATE),
-        "unfit": share_of(empty, lambda case: case.said.verdict == UNFIT),
-        "unexplained_located": share_of(pushed, lambda case: case.said.verdict == UNEXPLAINED and case.located),
-        "located": share_of(pushed, lambda case: case.located),
-        "sensor_told": share_of([case for case in empty if _sensor_to_be_told(case)], lambda case: case.sensor),
+        "false_alarms": share_of(diagnosed, lambda case: case.stated.alarm),
+        "alarms": dict(Counter(case.stated.claims[0].named.effect for case in diagnosed if case.stated.alarm)),
+        "adequate": share_of(empty, lambda case: case.stated.verdict == ADEQUATE),
+        "unfit": share_of(empty, lambda case: case.stated.verdict == UNFIT),
+        "unexplained_located": share_of(disturbed, lambda case: case.stated.verdict == UNEXPLAINED and case.located),
+        "located": share_of(disturbed, lambda case: case.located),
+        "sensor_reported": share_of([case for case in empty if _drift_to_be_reported(case)], lambda case: case.sensor),
         "alone": share_of(
-            [case for case in cases if case.said.verdict != FAILED and not case.key.useless], lambda case: case.alone
+            [case for case in cases if case.stated.verdict != FAILED and not case.key.useless], lambda case: case.alone
         ),
         "undecided": share_of([case for case in cases if not case.key.useless], lambda case: case.undecided),
-        "useful_unfit": share_of(useful, lambda case: case.said.verdict == UNFIT),
+        "useful_unfit": share_of(useful, lambda case: case.stated.verdict == UNFIT),
         "reasons": {
             why: _verdicts([case for case in useless if case.key.useless == why])
             for why in sorted({case.key.useless for case in useless})
@@ -266,38 +271,38 @@ def score_of(name: str, sentence: str, cases: Sequence[ScoredCase], asked: Seque
         "hidden": len(hidden),
         "strong": len(strong),
         "named": share_of(strong, lambda case: case.named),
-        "named_pushed": share_of([case for case in strong if case.pushed], lambda case: case.named),
-        "named_quiet": share_of([case for case in strong if not case.pushed], lambda case: case.named),
+        "named_disturbed": share_of([case for case in strong if case.disturbed], lambda case: case.named),
+        "named_undisturbed": share_of([case for case in strong if not case.disturbed], lambda case: case.named),
         "wrong": share_of(strong, lambda case: case.wrong),
         "nearest": share_of(strong, lambda case: case.nearest),
         "outside_wrong": share_of(outside, lambda case: case.wrong),
-        "outside_nearest": share_of(outside, lambda case: case.said.found and not case.wrong),
-        "failed": tuple(case.key.name for case in cases if case.said.verdict == FAILED),
+        "outside_nearest": share_of(outside, lambda case: case.stated.found and not case.wrong),
+        "failed": tuple(case.key.name for case in cases if case.stated.verdict == FAILED),
     }
     measured = tuple(MeasuredThreshold(threshold, _value(results[threshold.measure])) for threshold in asked)
     return ScenarioScore(name=name, sentence=sentence, **results, measured=measured)
 
 
 def _to_be_located(case: ScoredCase) -> bool:
-    """A state is pushed, and by enough; a sensor that is disturbed has none."""
-    push = case.key.push
-    return push is not None and push.at != "sensor" and push.over_noise >= LEAST_PUSH
+    """Whether a state is disturbed enough to be located; a drift of a sensor has no state."""
+    disturbance = case.key.disturbance
+    return disturbance is not None and disturbance.at != "sensor" and disturbance.over_noise >= LEAST_DISTURBANCE
 
 
-def _sensor_to_be_told(case: ScoredCase) -> bool:
-    push = case.key.push
-    return push is not None and push.at == "sensor" and push.over_noise >= LEAST_PUSH
+def _drift_to_be_reported(case: ScoredCase) -> bool:
+    disturbance = case.key.disturbance
+    return disturbance is not None and disturbance.at == "sensor" and disturbance.over_noise >= LEAST_DISTURBANCE
 
 
 def _verdicts(cases: Sequence[ScoredCase]) -> dict[str, int]:
-    return {verdict: sum(case.said.verdict == verdict for case in cases) for verdict in VERDICTS}
+    return {verdict: sum(case.stated.verdict == verdict for case in cases) for verdict in VERDICTS}
 
 
 def _value(measured: Share | int) -> float:
     return measured.value if isinstance(measured, Share) else float(measured)
 
 
-def _with_holds(world: ScenarioScore) -> dict[str, Any]:
-    """With what holds of its aims, None for what could not be measured."""
-    holds = {m.threshold.measure: None if math.isnan(m.value) else m.holds for m in world.measured}
-    return asdict(world) | {"holds": holds}
+def _with_holds(scenario: ScenarioScore) -> dict[str, Any]:
+    """Return the score with the aims that hold; None for an aim that could not be measured."""
+    holds = {m.threshold.measure: None if math.isnan(m.value) else m.holds for m in scenario.measured}
+    return asdict(scenario) | {"holds": holds}

@@ -84,7 +84,7 @@ def ceiling(model: JointModel, fit: FittedModel, drivers: Sequence[Driver], bloc
     problem = _problem(model, parameters, residual, smooth, fit.d)
     paths = _paths(problem, smooth, fit.weights, blocks)
     chosen = _chosen(paths)
-    taken = [{smooth.names[k] for k in one.groups} for one in chosen]
+    taken = [{smooth.names[k] for k in item.groups} for item in chosen]
     common = [name for name in curves if name != TIME and 2 * sum(name in names for names in taken) > len(taken)]
     return Ceiling(_judged(problem, chosen, fit, blocks), tuple(common))
 
@@ -177,7 +177,7 @@ def _path(problem: _Problem, smooth: Smooth, train: Tensor, held: Tensor, allowe
     groups: tuple[int, ...] = ()
     path: list[list[_Step]] = []
     while True:
-        path.append([_fit(problem, train, held, gradient, groups, index, one) for one in _PENALTIES])
+        path.append([_fit(problem, train, held, gradient, groups, index, item) for item in _PENALTIES])
         free = [k for k in range(len(smooth.groups)) if allowed[k] and k not in groups]
         if len(groups) == _MOST or not free:
             return path

@@ -74,9 +74,9 @@ def common_cause(linearised: LinearisedSearch, slow: SlowBasis | None) -> Common
     Returns:
         None where nothing wanders, or in one channel alone.
     """
-    if slow is None or slow.channels < 2 or not linearised.wanders:
+    if slow is None or slow.channels < 2 or not linearised.has_drift:
         return None
-    part = linearised.search.slow_part(linearised.series)
+    part = linearised.search.drift_statistics(linearised.series)
     c = slow.channels
     start = torch.diag(part.size * torch.ones(c, dtype=part.inner.dtype))
     apart, alone, _ = _likeliest(part, start, _diagonal)
@@ -89,9 +89,9 @@ def common_cause(linearised: LinearisedSearch, slow: SlowBasis | None) -> Common
     amplitudes = part.scale[::c] * (courses @ along)
     course = course_of(amplitudes, len(slow.tangents))
     span = float(course.max() - course.min())
-    told = amplitudes.abs() > _TOLD * amplitudes.abs().max()
+    text = amplitudes.abs() > _TOLD * amplitudes.abs().max()
     shape = {
-        f"{COURSE}{k + 1}": math.sqrt(2.0) * float(amplitudes[k]) / span for k in told.nonzero().flatten().tolist()
+        f"{COURSE}{k + 1}": math.sqrt(2.0) * float(amplitudes[k]) / span for k in text.nonzero().flatten().tolist()
     }
     return CommonCause(gain, p_value, span * relative * along, shape)
 

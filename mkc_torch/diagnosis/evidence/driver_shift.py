@@ -98,7 +98,7 @@ def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
     def gains(steps: Sequence[int]) -> Float[Tensor, " steps"]:
         copies = [_moved(term, by) for by in steps]
         moved = Candidates(model, parameters, copies, located.scene.tangents.pointwise)
-        return search.gains_of([one[middle] for one in moved], counts).ratio[:, 0]
+        return search.gains_of([tangent[middle] for tangent in moved], counts).ratio[:, 0]
 
     steps = [most * k // _COPIES for k in range(-_COPIES, _COPIES + 1) if k]
     found = torch.cat([gains(steps[k : k + _AT_ONCE]) for k in range(0, len(steps), _AT_ONCE)])
@@ -121,6 +121,6 @@ def _cut(tangents: ModelTangents, rows: slice) -> ModelTangents:
     return ModelTangents(
         tangents.nuisance[rows],
         (),
-        {name: None if one is None else one[rows] for name, one in tangents.pointwise.items()},
+        {name: None if item is None else item[rows] for name, item in tangents.pointwise.items()},
         None if slow is None else replace(slow, tangents=slow.tangents[rows]),
     )

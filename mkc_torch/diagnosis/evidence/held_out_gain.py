@@ -40,10 +40,11 @@ def test(case: EvidenceContext) -> EvidenceResult:
         before, after, note = case.ahead, case.held_out[-1], _BESIDE
         worse, better = before, after
     gain, interval = gain_interval(better.log_likelihood - worse.log_likelihood, case.blocks.block, _draws(case))
-    outputs, left = sizes_of(case.prepared, case.units, before, after, case.blocks)
+    outputs, diverged = sizes_of(case.prepared, case.units, before, after, case.blocks)
     one = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
     sizes = (case.rms(before), case.rms(after)) if one is None else (one.before, one.after)
-    held = HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, left, not case.located.with_noise)
+    count, decides = int(case.blocks.block.max()) + 1, not case.located.with_noise
+    held = HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, diverged, count, decides)
     return said(held, note)
 
 

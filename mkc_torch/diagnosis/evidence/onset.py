@@ -98,7 +98,7 @@ def _spread(place: int, count: int) -> list[int]:
     while away[-1] < count:
         away.append(away[-1] + math.ceil(step))
         step *= _GROWTH
-    numbers = {place - one for one in away} | {place + one for one in away}
+    numbers = {place - element for element in away} | {place + item for item in away}
     return sorted({min(max(number, 1), count - 1) for number in numbers})
 
 

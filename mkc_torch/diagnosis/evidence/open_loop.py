@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.parallel import run_parallel
-from mkc_torch.diagnosis.model.process_noise import open_loop, refit_open_loop, with_noise_of_fit
+from mkc_torch.diagnosis.model.process_noise import open_loop, refit_open_loop, has_process_noise
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
@@ -52,17 +52,17 @@ def open_loop_evidence(
         blocks: the blocks.
     """
     as_it_is = OpenLoop(base, found, evidence)
-    if not any(with_noise_of_fit(fit) for fit in (base, *(one.fit for one in found))) or alone is None:
+    if not any(has_process_noise(fit) for fit in (base, *(one.fit for one in found))) or alone is None:
         return as_it_is
     works = [
-        partial(_released if _of_sensors(one.fit) else _refitted, one.fit, known, blocks, alone)
-        for one, known in zip(found, evidence[1:], strict=True)
+        partial(_released if _of_sensors(element.fit) else _refitted, element.fit, known, blocks, alone)
+        for element, known in zip(found, evidence[1:], strict=True)
     ]
     runs = run_parallel([partial(_judged, alone, evidence[0], blocks), *works], alone.model.prepared)
-    known_runs = [one for one in runs if one is not None]
+    known_runs = [run for run in runs if run is not None]
     if len(known_runs) < len(runs):
         return as_it_is
-    again = tuple(replace(one, fit=fit) for one, (fit, _) in zip(found, known_runs[1:], strict=True))
+    again = tuple(replace(item, fit=fit) for item, (fit, _) in zip(found, known_runs[1:], strict=True))
     return OpenLoop(alone, again, tuple(judged for _, judged in known_runs))
 
 
@@ -73,11 +73,11 @@ def running_unjudged(base: FittedModel, alone: FittedModel | None, found: tuple[
         base, alone, found: as of :func:`open_loop_evidence`.
     """
     fits = [base, *(one.fit for one in found)]
-    if any(with_noise_of_fit(fit) for fit in fits) and alone is not None:
-        free = [alone, *(refit_open_loop(one.fit) for one in found)]
-        known = [one for one in free if one is not None]
+    if any(has_process_noise(fit) for fit in fits) and alone is not None:
+        free = [alone, *(refit_open_loop(element.fit) for element in found)]
+        known = [run for run in free if run is not None]
         fits = known if len(known) == len(free) else fits
-    again = tuple(replace(one, fit=fit) for one, fit in zip(found, fits[1:], strict=True))
+    again = tuple(replace(item, fit=fit) for item, fit in zip(found, fits[1:], strict=True))
     return OpenLoop(fits[0], again, tuple(on_all(fit) for fit in fits))
 
 
@@ -85,7 +85,7 @@ def _of_sensors(fit: FittedModel) -> bool:
     """Whether only errors of sensors are left beside a fit: its parameters are then those of a free run."""
     prepared = fit.model.prepared
     observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
-    return observer is not None and not any(one.at_rate for one in observer.disturbances)
+    return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
 
 
 _Run = tuple[FittedModel, Evidence]
@@ -123,7 +123,7 @@ def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: F
 def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
     """A fit of the free run: from the parameters beside process noise, which may need it, and from those without."""
     ways = [partial(refit_open_loop, fit), partial(_from_alone, fit, alone)]
-    tried = [one for one in run_parallel(ways, alone.model.prepared, fit.model.terms) if one is not None]
+    tried = [model_fit for model_fit in run_parallel(ways, alone.model.prepared, fit.model.terms) if model_fit is not None]
     return _judged(max(tried, key=lambda one: one.log_likelihood), None, blocks) if tried else None
 
 

@@ -44,14 +44,14 @@ def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], s
         ('Most samples were rejected from 4.0 to 7.0 s. ...',)
     """
     stretches = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
-    long = [one for one in stretches if _length(one) >= settings.evidence.disturbed]
+    long = [interval for interval in stretches if _length(interval) >= settings.evidence.disturbed]
     found = sorted(long, key=_length, reverse=True)
     if not found:
         return ()
-    told = ", ".join(f"from {one.start:.1f} to {one.end:.1f} s" for one in sorted(found[:_TOLD]))
+    text = ", ".join(f"from {item.start:.1f} to {item.end:.1f} s" for item in sorted(found[:_TOLD]))
     more = f" and in {len(found) - _TOLD} shorter stretches" if len(found) > _TOLD else ""
     return (
-        f"Most samples were rejected {told}{more}. Something disturbed the measurement there that no effect follows: "
+        f"Most samples were rejected {text}{more}. Something disturbed the measurement there that no effect follows: "
         "something that passed by, say, or a burst of outliers.",
     )
 

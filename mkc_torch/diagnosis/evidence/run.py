@@ -42,9 +42,9 @@ def run_tests(case: EvidenceContext, done: Sequence[Any], tests: Sequence[Eviden
     warnings: list[str] = []
     for test in tests:
         cases = _cases(test, case)
-        for one, done_ahead in zip(cases, known.get(test, [None] * len(cases)), strict=True):
-            said = test.test(replace(one, ahead=done_ahead))
-            (of_findings[one.number] if test.each_finding else of_all).append(said)
+        for test_case, done_ahead in zip(cases, known.get(test, [None] * len(cases)), strict=True):
+            said = test.test(replace(test_case, ahead=done_ahead))
+            (of_findings[test_case.number] if test.each_finding else of_all).append(said)
             warnings += said.warnings
     return EvidenceReport(case, tuple(of_all), tuple(tuple(said) for said in of_findings), tuple(warnings))
 
@@ -61,7 +61,7 @@ def _cases(test: EvidenceTest, case: EvidenceContext) -> list[EvidenceContext]:
 
 def _ahead(test: EvidenceTest, case: EvidenceContext) -> list[Any]:
     assert test.ahead is not None
-    return [test.ahead(one) for one in _cases(test, case)]
+    return [test.ahead(_case) for _case in _cases(test, case)]
 
 
 def _final(case: EvidenceContext) -> FinalEstimate:

@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
-from mkc_torch.diagnosis.noise.innovations import either_way
+from mkc_torch.diagnosis.noise.innovations import agreed_innovation_gain
 from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
 from mkc_torch.diagnosis.settings import NamingSettings, Settings
 from mkc_torch.nonlinear import NoFitError
@@ -53,7 +53,7 @@ def simplified(
             continue
         after = held_out(other, blocks)
         lost = float((evidence.log_likelihood - after.log_likelihood).sum())
-        as_well = lost <= settings.separable or either_way(after.residual, evidence.residual) <= 0.0
+        as_well = lost <= settings.separable or agreed_innovation_gain(after.residual, evidence.residual) <= 0.0
         if as_well and holds(other, after):
             fit, evidence = other, after
     return fit, evidence

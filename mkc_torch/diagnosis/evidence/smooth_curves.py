@@ -125,7 +125,7 @@ class _Around:
         zero = left.new_zeros(len(left), len(entrance.channels))
 
         def residual(change: Tensor) -> Tensor:
-            return self.model.pushed(self.parameters, port, entrance.at(change))
+            return self.model.residual_with_change(self.parameters, port, entrance.at(change))
 
         pulled: Tensor = torch.func.vjp(residual, zero)[1](left)[0]
         return pulled
@@ -204,7 +204,7 @@ def _scores(
     around: _Around, basis: Float[Tensor, "D N degree"], weights: Sequence[Float[Tensor, "N m"]]
 ) -> Float[Tensor, "folds D"]:
     """The square of what is left beside the parameters, along the curves of each column, over all ports."""
-    left = [_left(around, one) for one in weights]
+    left = [_left(around, weight) for weight in weights]
     total = basis.new_zeros(len(weights), len(basis))
     for port in around.ports:
         back = torch.stack([around.backward(port, one) for one in left])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.common_cause import common_cause
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.ranking import Ranked
@@ -34,13 +34,13 @@ def located_cause(base: FittedModel, located: SearchResult, level: float, surrog
         surrogates: draws of noise that other p-values are from, than which none can be smaller.
     """
     slow, share = located.scene.tangents.slow, located.scene.settings.confirmation.unrecorded
-    cause = common_cause(located.beside_nothing, slow)
+    cause = common_cause(located.tested_search, slow)
     if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > share * level:
         return None
     model, start = _with_cause(base, cause.direction, cause.shape)
     term = model.terms[-1]
-    fit = fitted_beside(base, model, start, graduate=False)
-    others = [replace(one, gap=max(cause.gain - one.gain, 0.0)) for one in located.ranking]
+    fit = fitted_with_effect(base, model, start, graduate=False)
+    others = [replace(ranked, gap=max(cause.gain - ranked.gain, 0.0)) for ranked in located.ranking]
     return replace(
         located,
         term=term,

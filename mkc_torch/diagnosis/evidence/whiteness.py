@@ -126,7 +126,7 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings
     N = len(values)
     farthest = max(int(_FARTHEST * N), 1)
     centred = counts * (values - values.sum() / counts.sum().clamp(min=1.0))
-    products, pairs = (_lagged_sums(one.double())[: farthest + 1] for one in (centred, counts))
+    products, pairs = (_lagged_sums(count.double())[: farthest + 1] for count in (centred, counts))
     pairs = pairs.round().clamp(min=1.0)
     variance = products[0] / pairs[0]
     if float(variance) <= 0.0:

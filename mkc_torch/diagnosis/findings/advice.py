@@ -19,7 +19,7 @@ def nothing_shows(diagnosis: Diagnosis) -> bool:
     """Whether the simulation may be used as it is: it follows, and what is left is the sensor's noise."""
     d = diagnosis
     quiet = bool(d.findings) or d.p_value is None or d.p_value > d.level
-    return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.world)
+    return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.environment)
 
 
 def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -47,22 +47,22 @@ def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _mend_first(diagnosis: Diagnosis) -> tuple[str, ...]:
-    known = "what stands under the reasons" if diagnosis.world.reasons else "its signs, units, delays and start values"
+    known = "what stands under the reasons" if diagnosis.environment.reasons else "its signs, units, delays and start values"
     return (f"Do not rely on this simulation yet: check {known}, then diagnose again.",)
 
 
 def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
     d = diagnosis
-    rates = [push for push in d.world.pushes if push.at_rate]
+    rates = [push for push in d.environment.process_noise if push.at_rate]
     if d.remaining:
         yield f"Find out what else goes along with {', '.join(d.remaining)}: something smooth remains there."
     elif d.verdict == "unexplained" and rates:
         yield _find_what_pushes(rates[0])
-    elif d.verdict == "unexplained" and d.world.pushes:
+    elif d.verdict == "unexplained" and d.environment.process_noise:
         yield (
-            f"Find out what moves the sensor of `{d.world.pushes[0].place}` slowly, such as warming up, and record it."
+            f"Find out what moves the sensor of `{d.environment.process_noise[0].place}` slowly, such as warming up, and record it."
         )
-    elif any(f.grade == "nearest in the catalogue" for f in d.findings):
+    elif any(f.grade == "nearest" for f in d.findings):
         return  # its curve is where to look
     elif not d.findings or d.verdict == "unexplained":
         yield (
@@ -82,7 +82,7 @@ def _find_what_pushes(push: ProcessNoise) -> str:
 def _of(finding: Finding, d: Diagnosis) -> Iterator[str]:
     f = finding
     near = [a for a in f.alternatives if not a.separable]
-    if f.grade == "nearest in the catalogue":
+    if f.grade == "nearest":
         yield _by_its_curve(f, d)
         return
     if not worth_correcting(f):
@@ -118,7 +118,7 @@ def _by_its_curve(finding: Finding, d: Diagnosis) -> str:
 def _hold_back(finding: Finding, d: Diagnosis) -> str:
     """Why not to correct for it."""
     f = finding
-    if f.grade == "real but small" and f.held_out is not None:
+    if f.grade == "small" and f.held_out is not None:
         return (
             f"Leave {_called(f, d)} alone, unless means over many samples matter: it makes the residual of a sample "
             f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
@@ -155,8 +155,8 @@ def _called(finding: Finding, d: Diagnosis) -> str:
 
 
 def _tell_apart(finding: Finding, near: Sequence[Alternative]) -> str:
-    told = ", ".join(dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near))
-    asked = f"To tell {finding.effect} from {told}, record again{_how(finding, near)}."
+    text = ", ".join(dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near))
+    asked = f"To tell {finding.effect} from {text}, record again{_how(finding, near)}."
     return f"{asked} {near[0].distinguishing_state}".rstrip()
 
 
@@ -167,7 +167,7 @@ def _how(finding: Finding, near: Sequence[Alternative]) -> str:
         if len(columns) == 1:
             return f" with {columns[0]} over a wider range"
         return " while they go different ways: change one and hold the other"
-    clauses = list(dict.fromkeys(one.recurrence for one in every if one.recurrence and not one.drivers))
+    clauses = list(dict.fromkeys(candidate.recurrence for candidate in every if candidate.recurrence and not candidate.drivers))
     if columns:
         clauses.append(f"what follows {', '.join(columns)} goes along with it, so let that change at other times")
     return f": {'; '.join(clauses)}" if clauses else _OTHERWISE.get(finding.kind, " with other inputs and amplitudes")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, ProcessNoise
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.simulation.dynamics.noise import DisturbancePath, StateSpaceNoise, pushes_over_time
+from mkc_torch.simulation.dynamics.noise import DisturbancePath, StateSpaceNoise, disturbance_paths
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 if TYPE_CHECKING:
@@ -31,13 +31,13 @@ _PLAIN = 0.3
 
 def pushes_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tuple[ProcessNoise, ...]:
     """The disturbances of a noise, strongest first, with their units."""
-    found = noise.disturbed
-    told = []
-    for one, error, gain in zip(found.disturbances, found.errors, found.gains, strict=True):
-        unit = prepared.ports[f"rate of {one.place}"].unit if one.at_rate else _unit_of(prepared, one.place)
-        of_size = one.size * error if math.isfinite(error) else one.size
-        told.append(ProcessNoise(one.place, one.at_rate, one.lasting, one.size, of_size, unit, gain))
-    return tuple(told)
+    found = noise.selected
+    sentences = []
+    for disturbance, error, gain in zip(found.disturbances, found.errors, found.gains, strict=True):
+        unit = prepared.ports[f"rate of {disturbance.place}"].unit if disturbance.at_rate else _unit_of(prepared, disturbance.place)
+        of_size = disturbance.size * error if math.isfinite(error) else disturbance.size
+        sentences.append(ProcessNoise(disturbance.place, disturbance.at_rate, disturbance.lasting, disturbance.size, of_size, unit, gain))
+    return tuple(sentences)
 
 
 def forcing_of(fit: FittedModel, noise: StateSpaceNoise) -> tuple[DisturbanceEstimate, ...]:
@@ -50,7 +50,7 @@ def forcing_of(fit: FittedModel, noise: StateSpaceNoise) -> tuple[DisturbanceEst
     prepared, model = fit.model.prepared, fit.model
     assert isinstance(prepared, PreparedDynamics)
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
-    courses = pushes_over_time(prepared, theta, changes, model.near, noise.disturbed)
+    courses = disturbance_paths(prepared, theta, changes, model.near, noise.selected)
     states = prepared.trajectory(theta, changes, model.near).states.detach()[prepared.rows]
     beside = {
         **dict(zip(prepared.system.states, states.unbind(-1), strict=False)),
@@ -67,7 +67,7 @@ def forcing_of(fit: FittedModel, noise: StateSpaceNoise) -> tuple[DisturbanceEst
                 prepared.time,
                 course.value,
                 _NORMAL_95 * course.error,
-                tuple(one for one in curves if one is not None),
+                tuple(curve for curve in curves if curve is not None),
                 _sentences(push, course, prepared),
             )
         )
@@ -96,7 +96,7 @@ def _error_of_means(values: Float[Tensor, " N"], parts: Sequence[Tensor]) -> Flo
     # beyond where it first vanishes there is nothing but chance
     memory = int((alike <= 0).long().argmax()) or N
     count = inside.sum(-1)
-    of_pairs = torch.stack([one[0] * alike[0] + 2.0 * (one[1:memory] * alike[1:memory]).sum() for one in pairs])
+    of_pairs = torch.stack([pair[0] * alike[0] + 2.0 * (pair[1:memory] * alike[1:memory]).sum() for pair in pairs])
     return (of_pairs / N).clamp(min=0.0).sqrt() / count
 
 
@@ -109,18 +109,18 @@ def _lagged(series: Float[Tensor, "k N"]) -> Float[Tensor, "k N"]:
 def _sentences(push: ProcessNoise, course: DisturbancePath, prepared: PreparedDynamics) -> tuple[str, ...]:
     what = f"rate of {push.place}" if push.at_rate else push.place
     step = float(prepared.time.diff().median())
-    if push.lasting > 0.0:
-        told = [f"What pushes {what} is not white: it keeps its value for about {push.lasting:.2g} s."]
+    if push.correlation_time > 0.0:
+        sentences = [f"What pushes {what} is not white: it keeps its value for about {push.correlation_time:.2g} s."]
     else:
-        told = [f"What pushes {what} is white: it is new at each sample."]
+        sentences = [f"What pushes {what} is white: it is new at each sample."]
     for name, values in zip(prepared.system.inputs, prepared.inputs_at_rows.unbind(-1), strict=True):
-        lag, size, chance = _strongest(course.value, values, push.lasting / step if step > 0 else 0.0)
+        lag, size, chance = _strongest(course.value, values, push.correlation_time / step if step > 0 else 0.0)
         if size > max(chance, _PLAIN):
             when = "at once" if lag == 0 else f"{lag * step:.2g} s after it"
-            told.append(f"It goes along with {name}, {when} (correlation {size:.2f}).")
+            sentences.append(f"It goes along with {name}, {when} (correlation {size:.2f}).")
         else:
-            told.append(f"It is independent of {name} at every lag.")
-    return tuple(told)
+            sentences.append(f"It is independent of {name} at every lag.")
+    return tuple(sentences)
 
 
 def _strongest(push: Float[Tensor, " N"], given: Float[Tensor, " N"], memory: float) -> tuple[int, float, float]:

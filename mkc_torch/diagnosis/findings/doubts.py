@@ -68,9 +68,9 @@ def _ended(term: Term, prepared: PreparedSimulation, context: Context) -> Iterat
         for side, end in zip(("least", "greatest"), ends, strict=True):
             if side in term.effect.natural_ends.get(name, ()) or not _near(value, end):
                 continue
-            told = sized(value, tidy(term.effect.unit_of_shape(name, context)))
+            text = sized(value, tidy(term.effect.unit_of_shape(name, context)))
             yield (
-                f"{term.effect.id}: its {name.replace('_', ' ')} ended at {told}, the {side} that is tried, so this "
+                f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} that is tried, so this "
                 "recording does not tell it: something else may act there, or the recording is too short for it."
             )
 

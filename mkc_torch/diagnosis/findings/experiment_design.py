@@ -55,12 +55,12 @@ def distinguishing_state(located: SearchResult, own: int, rival: int) -> str:
     often = f"about {more:.1f} times as many samples" if more > 1.0 else "as many samples again"
     if more > _MOST:
         often = "far more samples"
-    told = f"In a recording like this one {often} would tell them apart"
+    text = f"In a recording like this one {often} would tell them apart"
     left = _left(located, own, rival)
     times, words = max(((state.times(left), state.display_name) for state in _states(located)), default=(0.0, ""))
     if times < _BETTER:
-        return f"{told}."
-    return f"{told}; those while {words} do it best, {times:.1f} times as well as one on average."
+        return f"{text}."
+    return f"{text}; those while {words} do it best, {times:.1f} times as well as one on average."
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import ratio, tidy
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
@@ -23,7 +24,6 @@ from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Nu
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
-from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -60,7 +60,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     gamma, covariance = _own(final, number)
     context = _context(final, term)
     channels = places_of(term, context.channels)
-    plausible, told = _plausibility(term, gamma, context)
+    plausible, text = _plausibility(term, gamma, context)
     cannot_be = far_from_plausible(term, gamma, context)
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
@@ -80,14 +80,14 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         p_value=None if quick else located.p_value,
         alternatives=_alternatives(located, term),
         plausible=plausible and not cannot_be,
-        plausibility=cannot_be or told,
+        plausibility=cannot_be or text,
         cannot_be=bool(cannot_be),
         doubts=shape_at_ends(term, final.fit.model.prepared, context),
         curve=curve,
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),
-        moments=moments,
+        event_times=moments,
         references=_references(term),
         advice=term.effect.advised(gamma.tolist(), term.shape, context),
         recurrence=term.effect.recurrence,
@@ -100,7 +100,7 @@ def _references(term: Term) -> tuple[Reference, ...]:
     if term.driver is None:
         return ()
     values = term.driver.reference.tolist()
-    return tuple(Reference(*one) for one in zip(term.columns, values, term.driver.units, strict=True))
+    return tuple(Reference(*item) for item in zip(term.columns, values, term.driver.units, strict=True))
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
@@ -174,10 +174,10 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
         return True, f"Its size is in {first.unit or 'no unit'}; what is plausible is known in {known} alone."
     limit *= times
     unit = f" {tidy(first.unit)}" if first.unit else ""
-    told = f"Its largest value, {largest:.3g}{unit}, is"
+    text = f"Its largest value, {largest:.3g}{unit}, is"
     if largest <= limit:
-        return True, f"{told} within the {limit:g}{unit} that is plausible ({term.effect.source})."
-    return False, f"{told} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
+        return True, f"{text} within the {limit:g}{unit} that is plausible ({term.effect.source})."
+    return False, f"{text} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
 
 
 def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
@@ -195,10 +195,10 @@ def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        again, told = rival.effect.recurrence, ""
+        again, text = rival.effect.recurrence, ""
         if own and gap < separable:
-            told = distinguishing_state(located, own[0], ranked.number)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= separable, rival.at, again, told))
+            text = distinguishing_state(located, own[0], ranked.number)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= separable, rival.at, again, text))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 

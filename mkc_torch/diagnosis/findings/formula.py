@@ -82,9 +82,9 @@ def _formula(
     assert best is not None
     _, names, coefficients = best
     off = (_summed(names, columns, coefficients) - value).square().mean().sqrt()
-    told = _told(names, coefficients, driver, float(size))
+    text = _told(names, coefficients, driver, float(size))
     return (
-        f"δ({channel}) = {told}{f' {unit}' if unit else ''} ({100.0 * float(off / size.clamp(min=1e-300)):.0f} % off)"
+        f"δ({channel}) = {text}{f' {unit}' if unit else ''} ({100.0 * float(off / size.clamp(min=1e-300)):.0f} % off)"
     )
 
 

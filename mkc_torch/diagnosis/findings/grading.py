@@ -91,9 +91,9 @@ def vetoed(held_out: HeldOut) -> bool:
 def is_zero_within_error(finding: Finding) -> bool:
     """Whether each of its numbers is as well 0, within one standard error; of what has no standard errors, never."""
     known = [
-        (torch.as_tensor(one.value), torch.as_tensor(one.standard_error))
-        for one in finding.parameters
-        if one.standard_error is not None
+        (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
+        for parameter in finding.parameters
+        if parameter.standard_error is not None
     ]
     return bool(known) and all(bool((value.abs() < error).all()) for value, error in known)
 
@@ -114,7 +114,7 @@ def change(held_out: HeldOut) -> float:
 
 def _sizes(held_out: HeldOut) -> list[tuple[float, float]]:
     """Residuals before and after, of each output."""
-    each = [(one.before, one.after) for one in held_out.outputs.values()]
+    each = [(output.before, output.after) for output in held_out.outputs.values()]
     return each or [(held_out.rmse_before, held_out.rmse_after)]
 
 
@@ -136,11 +136,11 @@ def grade_of(finding: Finding) -> Grade:
         >>> held = HeldOut(0.02, (0.01, 0.03), 2.0, 1.96, "µT")
         >>> seen = (Told("held_out", (held, "")),)
         >>> grade_of(Finding("time_lag", (), (), (), None, "", "", (), 0.01, (), True, "", evidence=seen))
-        'real but small'
+        'small'
     """
     if not confirmed(finding):
-        return "not confirmed"
-    return "real but small" if small(finding) else "left out"
+        return "unconfirmed"
+    return "small" if small(finding) else "left_out"
 
 
 def grade_in_short(finding: Finding) -> Grade:
@@ -150,13 +150,13 @@ def grade_in_short(finding: Finding) -> Grade:
     """
     held = finding.held_out
     if held is None or not held.decides:
-        return "not confirmed"
+        return "unconfirmed"
     return grade_of(finding)
 
 
 def worth_correcting(finding: Finding) -> bool:
     """Whether a simulation is clearly better with it, in this form."""
-    return finding.grade == "left out"
+    return finding.grade == "left_out"
 
 
 def transfers(finding: Finding) -> bool:

@@ -20,9 +20,9 @@ def follows(one: GoodnessOfFit) -> bool:
         >>> follows(still), follows(lost)
         (True, False)
     """
-    return one.residual < one.mean_predicts or one.residual <= _FLOOR * one.noise_floor
+    return one.residual < one.rmse_of_mean or one.residual <= _FLOOR * one.noise_floor
 
 
 def follows_all(world: NoiseEnvironment) -> bool:
     """Whether each output is that is known of."""
-    return all(follows(one) for one in world.follows)
+    return all(follows(fit) for fit in world.goodness_of_fit)

@@ -15,13 +15,13 @@ def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary
     fit, drift = final.fit, final.noise
     prepared = fit.model.prepared
     orders = final.spectrum.coefficients
-    coloured = any(float(phi.square().sum()) > settings.told_colour for phi in orders)
+    coloured = any(float(phi.square().sum()) > settings.reported_autocorrelation for phi in orders)
     parameters: dict[str, Number] = {}
     units: dict[str, str] = {}
-    clear = drift.size > 0 and drift.gain > settings.told_wander
+    clear = drift.size > 0 and drift.gain > settings.reported_drift
     if clear:
-        parameters["wander"] = final.wander_spread
-        units["wander"] = next(port.unit for port in prepared.ports.values() if port.wanders)
+        parameters["wander"] = final.drift_spread
+        units["wander"] = next(port.unit for port in prepared.ports.values() if port.allows_drift)
         if drift.family > 0:
             length = float(prepared.time[-1] - prepared.time[0])
             parameters["wander_period"] = 2.0 * length / settings.plateaus[drift.family - 1][0]
@@ -31,11 +31,11 @@ def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary
     if clear and drift.family == 0:
         model = "random_walk"
         size = f"{parameters['wander']:.2g} {units['wander']}"
-        told = f"noise around an offset that wanders like a random walk, by {size} in all"
+        text = f"noise around an offset that wanders like a random walk, by {size} in all"
     elif clear or coloured:
-        model, told = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
+        model, text = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
     else:
-        model, told = "white", "white noise"
+        model, text = "white", "white noise"
     tails = time_series_tails(fit.residual)
     tail = "Gaussian" if all(channel.is_gaussian for channel in tails) else "heavy-tailed"
     return NoiseSummary(
@@ -44,7 +44,7 @@ def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary
         tuple(fit.sigma.tolist()),
         tuple(fit.d.tolist()),
         tuple(fit.bound.tolist()),
-        f"{tail} {told}",
+        f"{tail} {text}",
         units,
         prepared.unit,
         tails,

@@ -83,20 +83,20 @@ def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) ->
     if not isinstance(prepared, PreparedDynamics):
         return ("Look at signs, units and the order of columns: what is compared may be another quantity.",)
     prepared = prepared.observed(None)
-    told = _of_trials(prepared, fits, follows)
+    sentences = _of_trials(prepared, fits, follows)
     ends = at_ends(fits[0])
-    told += [
+    sentences += [
         f"The fit drives `{name}` to the end of its range, {_value(fits[0], prepared, name):.4g}: the recording asks "
         "for more than the range allows, often for the other sign of its term."
         for name in ends
     ]
-    told += _of_sizes(prepared, fits[-1], ends)
-    if not told:
-        told = [
+    sentences += _of_sizes(prepared, fits[-1], ends)
+    if not sentences:
+        sentences = [
             "No other start, sign or delay of an input mends it: compare the recording's columns, their units and "
             "order with what the simulation means by them, or the simulation is of another system."
         ]
-    return tuple(told)
+    return tuple(sentences)
 
 
 def _value(fit: FittedModel, prepared: PreparedDynamics, name: str) -> float:
@@ -104,54 +104,54 @@ def _value(fit: FittedModel, prepared: PreparedDynamics, name: str) -> float:
 
 
 def _of_sizes(prepared: PreparedDynamics, fit: FittedModel, ends: Sequence[str]) -> list[str]:
-    told = []
+    sentences = []
     for number, (name, known) in enumerate(prepared.known.items()):
         value, begun = abs(float(fit.parameters[number])), abs(known.value)
         if name in ends or begun == 0.0:
             continue
         if value < _NOUGHT * begun:
-            told.append(f"The free run follows best with `{name}` nearly 0, as if its term was not there.")
+            sentences.append(f"The free run follows best with `{name}` nearly 0, as if its term was not there.")
         elif value > _AWAY * begun:
-            told.append(
+            sentences.append(
                 f"The free run follows best with `{name}` at {value / begun:.2g} times the value it began with."
             )
-    return told
+    return sentences
 
 
 def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> list[str]:
     """What each trial brings, where it mends the fit; and the inputs that do not matter."""
-    now = torch.tensor([one.residual for one in follows], dtype=fits[0].parameters.dtype)
+    now = torch.tensor([model_fit.residual for model_fit in follows], dtype=fits[0].parameters.dtype)
     trials = _trials(prepared)
     sizes = run_parallel([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
-    told = []
+    sentences = []
     shares = [float((size / now).max()) if size is not None else torch.inf for size, _ in sizes]
     for number in sorted(range(len(trials)), key=shares.__getitem__):
         size, theta = sizes[number]
         if size is not None and theta is not None and shares[number] < _MENDS:
             parts = zip(follows, size.tolist(), strict=True)
-            reach = ", ".join(f"{one.output} to {value:.3g} {one.unit}".rstrip() for one, value in parts)
-            told.append(f"{trials[number].told(theta)} it follows {reach}.")
-    if told:
+            reach = ", ".join(f"{item.output} to {value:.3g} {item.unit}".rstrip() for item, value in parts)
+            sentences.append(f"{trials[number].told(theta)} it follows {reach}.")
+    if sentences:
         # with its sign turned round, say, an input matters that did not before
-        return told[:3]
+        return sentences[:3]
     still = [
         (name, _size(_with_inputs(prepared, _still(prepared, number)), fits)[0])
         for number, name in enumerate(prepared.system.inputs)
     ]
-    known = [one.output for one in follows]
+    known = [fit.output for fit in follows]
     for name, size in still:
         if size is not None and bool((size <= now / _MATTERS).all()):
-            told.append(
+            sentences.append(
                 f"`{name}` does not matter: held at its mean the simulation follows {', '.join(known)} as well."
             )
-    return told[:3]
+    return sentences[:3]
 
 
 def _trials(prepared: PreparedDynamics) -> list[_Trial]:
     trials = []
     freed = copy.copy(prepared)
     freed.bounds = tuple(
-        torch.full_like(one, sign) for one, sign in zip(prepared.bounds, (-torch.inf, torch.inf), strict=True)
+        torch.full_like(bound, sign) for bound, sign in zip(prepared.bounds, (-torch.inf, torch.inf), strict=True)
     )  # type: ignore[assignment]
     names = list(prepared.known)
 
@@ -173,13 +173,13 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
         for lag in (lag for lag in _LAGS if lag < len(prepared.time) // 10):
             late = prepared.inputs_at_rows.clone()
             late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
-            told = f"With `{name}` late by {lag * step:.3g} s"
-            trials.append(_Trial(_always(told), _with_inputs(prepared, late)))
+            text = f"With `{name}` late by {lag * step:.3g} s"
+            trials.append(_Trial(_always(text), _with_inputs(prepared, late)))
     return trials
 
 
-def _always(told: str) -> Callable[[Tensor], str]:
-    return lambda _: told
+def _always(text: str) -> Callable[[Tensor], str]:
+    return lambda _: text
 
 
 def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "N u"]:
@@ -191,7 +191,7 @@ def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "N u"]:
 def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "N u"]) -> PreparedDynamics:
     other = copy.copy(prepared)
     other.inputs_at_rows = inputs
-    return other.holding({})
+    return other.with_input_hold({})
 
 
 def _size(
@@ -203,8 +203,8 @@ def _size(
         ends, begun = at_ends(fits[0]), prepared.given.clone()
         for number, name in enumerate(prepared.known):
             begun[number] = -begun[number] if name in ends else begun[number]
-        found = [multiple_shooting_start(prepared, one) for one in (prepared.given, begun)]
-        starts = [one for one in found if one is not None] or starts
+        found = [multiple_shooting_start(prepared, element) for element in (prepared.given, begun)]
+        starts = [item for item in found if item is not None] or starts
     best: tuple[Tensor | None, Tensor | None] = None, None
     for start in starts:
         try:

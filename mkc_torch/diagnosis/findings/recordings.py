@@ -27,15 +27,15 @@ def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]
     units, error = dict(zip(prepared.channels, units_of(prepared), strict=True)), final.standard_error
     row = {name: k for k, name in enumerate(prepared.parameter_names)}
     fitted = {(one.output, one.recording): row[one.name] for one in own}
-    told = []
-    for output in dict.fromkeys(one.output for one in own):
+    sentences = []
+    for output in dict.fromkeys(offset.output for offset in own):
         for number, name in enumerate(names):
             at = fitted.get((output, number))
             value = 0.0 if at is None else float(final.fit.parameters[at])
-            told.append(
+            sentences.append(
                 Offset(output, units[output], number + 1, name, value, math.nan if at is None else float(error[at]))
             )
-    return tuple(told)
+    return tuple(sentences)
 
 
 def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence[int]) -> tuple[Run, ...]:
@@ -56,4 +56,4 @@ def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence
         for run in range(count)
     ]
     first = (prepared.run.diff(prepend=prepared.run[:1] - 1) != 0).nonzero().flatten()
-    return tuple(each[int(one)] for one in prepared.recording["experiment"][first])
+    return tuple(each[int(item)] for item in prepared.recording["experiment"][first])

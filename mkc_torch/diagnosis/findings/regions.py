@@ -93,7 +93,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
         there = model.signals(parameters)[term.port]
 
         def likelihood(change: Tensor, parameters: Tensor = parameters) -> Tensor:
-            return scored(model.pushed(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
+            return scored(model.residual_with_change(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
 
         slope = torch.func.grad(likelihood)(there.new_zeros(len(there), width))
         added = term.effect.change(gamma, term.shape, term.context(prepared, there))[:, :width]

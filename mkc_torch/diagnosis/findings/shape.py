@@ -46,7 +46,7 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     if term.effect.is_curve or not curves:
         return None
     found = run_parallel([partial(_instead, fit, number, curve) for curve in curves], fit.model.prepared, curves)
-    fits = [one for one in found if one is not None]
+    fits = [item for item in found if item is not None]
     if not fits:
         return None
     best = max(fits, key=lambda one: one.log_likelihood - schwarz(one) * one.model.sizes[number])
@@ -66,10 +66,10 @@ def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
     """Curves at the rate that a named effect acts on."""
     channels = fit.model.prepared.ports[term.port].channels
     found: dict[tuple[str, str], Term] = {}
-    for one in terms:
-        same = one.columns == term.columns and fit.model.prepared.ports[one.port].channels == channels
-        if one.effect.is_curve and same:
-            found.setdefault((one.port, one.effect.plot_axis), one)
+    for other_term in terms:
+        same = other_term.columns == term.columns and fit.model.prepared.ports[other_term.port].channels == channels
+        if other_term.effect.is_curve and same:
+            found.setdefault((other_term.port, other_term.effect.plot_axis), other_term)
     return list(found.values())
 
 

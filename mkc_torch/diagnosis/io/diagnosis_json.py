@@ -1,7 +1,4 @@
-"""diagnosis.json: the text of a diagnosis, of the schema "mkc-diagnosis/2", and the check that a file is one.
-
-Files of "mkc-diagnosis/1" can still be checked.
-"""
+"""Write and validate diagnosis.json, schema "mkc-diagnosis/3"."""
 
 from __future__ import annotations
 
@@ -15,7 +12,13 @@ from importlib.resources import files
 from typing import Any
 
 from mkc_torch.diagnosis.environment import ShapeCheck
-from mkc_torch.diagnosis.io.environment_json import follows_of, forcing_of, noise_of, of_recordings, remaining_of
+from mkc_torch.diagnosis.io.environment_json import (
+    disturbance_json,
+    goodness_of_fit_json,
+    noise_json,
+    recordings_json,
+    remaining_json,
+)
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -27,30 +30,26 @@ from mkc_torch.diagnosis.result import (
     Number,
 )
 
-__all__ = ["SCHEMA", "SCHEMAS", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
+__all__ = ["SCHEMA", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
 
-SCHEMA = "mkc-diagnosis/2"
-"""That of what is written."""
-
-SCHEMAS = ("mkc-diagnosis/1", SCHEMA)
-"""Those that can be read."""
+SCHEMA = "mkc-diagnosis/3"
+"""Value of the key "schema"."""
 
 Path = tuple[str | int, ...]
 
 
 class DiagnosisFileError(ValueError):
-    """Content that is no diagnosis; the sentence says where and why."""
+    """Content that does not fit the schema; the message has the key and the reason."""
 
 
 def diagnosis_to_json(diagnosis: Diagnosis) -> str:
-    """The diagnosis as JSON of the schema "mkc-diagnosis/2", checked against it. Needs the ``cli`` extra.
+    """Return the diagnosis as JSON, validated by the schema "mkc-diagnosis/3". Needs the ``cli`` extra.
 
-    Numbers round-trip exactly. JSON has no infinity and no NaN: a bandwidth is the string "inf" where the density is
-    Gaussian, and a standard error, a bound of an interval or a gap that is not known is null. Any other number that
-    is not finite is refused.
+    Numbers round-trip exactly. JSON has no infinity and no NaN: the bandwidth of a Gaussian is the string "inf"; an
+    unknown standard error, interval bound or log-likelihood gap is null.
 
     Raises:
-        DiagnosisFileError: the diagnosis does not fit the schema.
+        DiagnosisFileError: the diagnosis does not fit the schema, or another number is not finite.
     """
     d = diagnosis
     content = {
@@ -61,23 +60,23 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "level": d.level,
         "p_value": d.p_value,
         "verdict": d.verdict,
-        "follows": follows_of(d.world),
-        "reasons": d.world.reasons,
-        **of_recordings(d.world),
-        "noise": _noise(d.noise) | noise_of(d.world),
+        "goodness_of_fit": goodness_of_fit_json(d.environment),
+        "reasons": d.environment.reasons,
+        **recordings_json(d.environment),
+        "noise": _noise(d.noise) | noise_json(d.environment),
         "search": {
             "candidates": d.candidates_tried,
             "surrogates": d.surrogates,
             "seed": d.seed,
-            "starts": d.world.starts,
+            "starts": d.environment.starts,
             "quick": d.quick,
             "stopped": None if d.stop is None else asdict(d.stop),
         },
         "findings": [_finding(f) for f in d.findings],
-        "forcing": forcing_of(d.world),
-        "remaining": remaining_of(d),
-        "baseline": _spread(d.baseline),
-        "corrected": _spread(d.corrected),
+        "disturbance": disturbance_json(d.environment),
+        "remaining": remaining_json(d),
+        "baseline": _score(d.baseline),
+        "corrected": _score(d.corrected),
         "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
@@ -86,58 +85,52 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
     _refuse_not_finite(content)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     validate(json.loads(text))
-    # lists of numbers on one line; a text in JSON holds no line end, so none is touched
+    # Put lists of numbers on one line; JSON strings contain no line break, so they stay unchanged.
     return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
 
 
 def validate(content: Mapping[str, Any]) -> None:
-    """Check the content of a diagnosis.json, as ``json.loads`` gives it, by its own schema. Needs the ``cli`` extra.
+    """Validate the content of a diagnosis.json, as ``json.loads`` returns it. Needs the ``cli`` extra.
 
     Raises:
-        DiagnosisFileError: the content does not fit the schema that it names, or contradicts itself.
+        DiagnosisFileError: the content does not fit the schema, or contradicts itself.
 
     Example:
-        >>> validate({"schema": "mkc-diagnosis/1"})
+        >>> validate({"schema": "mkc-diagnosis/3"})
         Traceback (most recent call last):
-        mkc_torch.diagnosis.io.diagnosis_json.DiagnosisFileError: this is no diagnosis: ...
+        mkc_torch.diagnosis.io.diagnosis_json.DiagnosisFileError: Expected content of schema mkc-diagnosis/3 but ...
     """
-    from jsonschema import Draft202012Validator  # here, so that diagnoses need no such package until one is written
+    from jsonschema import Draft202012Validator  # imported here: only writing needs jsonschema
     from jsonschema.exceptions import best_match
 
     _refuse_not_finite(content)
-    named = content.get("schema") if isinstance(content, Mapping) else None
-    schema = json_schema(named if named in SCHEMAS else SCHEMA)
-    error = best_match(Draft202012Validator(schema).iter_errors(content))
+    error = best_match(Draft202012Validator(json_schema()).iter_errors(content))
     if error is not None:
         message = error.message if len(error.message) <= 200 else error.message[:199] + "…"
-        raise DiagnosisFileError(f"this is no diagnosis: {_where(tuple(error.absolute_path))}: {message}.")
+        raise _invalid(tuple(error.absolute_path), f"is invalid: {message}")
     for i, finding in enumerate(content["findings"]):
         for k, parameter in enumerate(finding["parameters"]):
             if not _alike(parameter["value"], parameter["standard_error"]):
-                place = _where(("findings", i, "parameters", k, "standard_error"))
-                raise DiagnosisFileError(f"this is no diagnosis: {place} has not the shape of the value.")
+                raise _invalid(("findings", i, "parameters", k, "standard_error"), "differs in shape from `value`")
             if "components" in parameter and len(parameter["components"]) != _count(parameter["value"]):
-                place = _where(("findings", i, "parameters", k, "components"))
-                raise DiagnosisFileError(f"this is no diagnosis: {place} are not as many as the numbers of the value.")
+                raise _invalid(("findings", i, "parameters", k, "components"), "differs in length from `value`")
         for k, (start, end) in enumerate(finding["intervals"]):
             if end < start:
-                place = _where(("findings", i, "intervals", k))
-                raise DiagnosisFileError(f"this is no diagnosis: {place} ends before it starts.")
-    for i, forcing in enumerate(content.get("forcing", ())):
-        if not len(forcing["time"]) == len(forcing["value"]) == len(forcing["band"]):
-            raise DiagnosisFileError(f"this is no diagnosis: {_where(('forcing', i))} has lists of different lengths.")
+                raise _invalid(("findings", i, "intervals", k), "ends before it starts")
+    for i, course in enumerate(content["disturbance"]):
+        if not len(course["time"]) == len(course["value"]) == len(course["band"]):
+            raise _invalid(("disturbance", i), "has lists of different lengths")
 
 
 @cache
-def json_schema(named: str = SCHEMA) -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of diagnosis.json, or of one that older files have; a file of this package.
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of diagnosis.json.
 
     Example:
-        >>> json_schema()["title"], json_schema("mkc-diagnosis/1")["title"]
-        ('mkc-diagnosis/2', 'mkc-diagnosis/1')
+        >>> json_schema()["title"]
+        'mkc-diagnosis/3'
     """
-    edition = named.rpartition("/")[2]
-    file = files("mkc_torch.diagnosis.io").joinpath("schema", f"diagnosis_{edition}.schema.json")
+    file = files("mkc_torch.diagnosis.io").joinpath("schema", "diagnosis_3.schema.json")
     schema: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return schema
 
@@ -156,12 +149,12 @@ def _noise(noise: NoiseSummary) -> dict[str, Any]:
     }
 
 
-def _spread(spread: HeldOutScore) -> dict[str, Any]:
+def _score(score: HeldOutScore) -> dict[str, Any]:
     return {
-        "log_likelihood": spread.log_likelihood,
-        "rmse": spread.rmse,
-        "sigma": [_sigma(s) for s in spread.sigma],
-        "d": spread.d,
+        "log_likelihood": score.log_likelihood,
+        "rmse": score.rmse,
+        "sigma": [_sigma(s) for s in score.sigma],
+        "d": score.d,
     }
 
 
@@ -185,8 +178,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "drivers": a.drivers,
                 "log_likelihood_gap": _known(a.log_likelihood_gap),
                 "separable": a.separable,
-                **({"at": a.at} if a.at else {}),
-                **({"told_by": a.distinguishing_state} if a.distinguishing_state else {}),
+                **({"port": a.port} if a.port else {}),
+                **({"distinguishing_state": a.distinguishing_state} if a.distinguishing_state else {}),
             }
             for a in f.alternatives
         ],
@@ -194,8 +187,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "plausibility": f.plausibility,
         **({} if f.region is None else {"region": asdict(f.region)}),
         **({"experiments": f.experiments} if f.experiments else {}),
-        **({"moments": f.moments} if f.moments else {}),
-        **({"references": [asdict(one) for one in f.references]} if f.references else {}),
+        **({"event_times": f.event_times} if f.event_times else {}),
+        **({"references": [asdict(reference) for reference in f.references]} if f.references else {}),
         **({"advice": f.advice} if f.advice else {}),
     }
     return _with_evidence(content, f.evidence, json_schema()["$defs"]["finding"])
@@ -204,23 +197,23 @@ def _finding(finding: Finding) -> dict[str, Any]:
 def _with_evidence(
     content: Mapping[str, Any], evidence: Sequence[EvidenceResult], schema: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """With what the tests say of it, its keys in the order in which the schema has them."""
+    """Add the results of the tests of evidence; sort the keys as in the schema."""
     whole = dict(content)
-    for told in evidence:
-        for key, value in told.keys.items():
+    for result in evidence:
+        for key, value in result.keys.items():
             known = whole.get(key)
             whole[key] = {**known, **_json(value)} if isinstance(known, Mapping) else _json(value)
-    more = {told.test: _json(told.content) for told in evidence if told.content}
+    more = {result.test: _json(result.content) for result in evidence if result.content}
     if more:
         whole["evidence"] = more
-    order = {key: place for place, key in enumerate(schema["properties"])}
+    order = {key: position for position, key in enumerate(schema["properties"])}
     return dict(sorted(whole.items(), key=lambda item: order.get(item[0], len(order))))
 
 
 def _json(value: Any) -> Any:
-    """A value of JSON as it is, and results as this file writes them."""
+    """Convert results to JSON values; JSON values are returned unchanged."""
     if isinstance(value, HeldOutScore):
-        return _spread(value)
+        return _score(value)
     if isinstance(value, HeldOut):
         return _held_out(value)
     if is_dataclass(value) and not isinstance(value, type):
@@ -236,8 +229,8 @@ def _shape(shape: ShapeCheck) -> dict[str, Any]:
 
 def _parameter(parameter: EffectParameter) -> dict[str, Any]:
     p = parameter
-    told = {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
-    return {**told, **({"components": p.components} if p.components else {})}
+    content = {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
+    return {**content, **({"components": p.components} if p.components else {})}
 
 
 def _held_out(held_out: HeldOut) -> dict[str, Any]:
@@ -248,10 +241,11 @@ def _held_out(held_out: HeldOut) -> dict[str, Any]:
         "rmse_after": held_out.rmse_after,
         "unit": held_out.unit,
         "outputs": {
-            name: {"before": _known(one.before), "after": _known(one.after), "unit": one.unit}
-            for name, one in held_out.outputs.items()
+            name: {"before": _known(sizes.before), "after": _known(sizes.after), "unit": sizes.unit}
+            for name, sizes in held_out.outputs.items()
         },
-        "left": held_out.left,
+        "diverged_blocks": [asdict(block) for block in held_out.diverged_blocks],
+        "blocks": held_out.blocks,
     }
 
 
@@ -260,14 +254,14 @@ def _sigma(sigma: float) -> float | str:
 
 
 def _known(value: Number | None) -> Any:
-    """The value with None where it is not finite."""
+    """Replace numbers that are not finite by None."""
     if isinstance(value, Sequence):
         return [_known(v) for v in value]
     return value if value is not None and math.isfinite(value) else None
 
 
 def _alike(value: Any, error: Any) -> bool:
-    """Whether a standard error has the shape of its value; None has any."""
+    """Whether a standard error has the shape of its value; None fits any shape."""
     if isinstance(value, list) and isinstance(error, list):
         return len(value) == len(error) and all(_alike(v, e) for v, e in zip(value, error, strict=True))
     return error is None or not (isinstance(value, list) or isinstance(error, list))
@@ -280,7 +274,7 @@ def _count(value: Any) -> int:
 def _refuse_not_finite(content: Mapping[str, Any]) -> None:
     for path, value in _leaves(content, ()):
         if isinstance(value, float) and not math.isfinite(value):
-            raise DiagnosisFileError(f"this is no diagnosis: {_where(path)} is {value}, which JSON has no number for.")
+            raise _invalid(path, f"is {value}; JSON has only finite numbers")
 
 
 def _leaves(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
@@ -294,5 +288,6 @@ def _leaves(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
         yield path, value
 
 
-def _where(path: Path) -> str:
-    return f"`{'.'.join(str(key) for key in path)}`" if path else "the whole"
+def _invalid(path: Path, reason: str) -> DiagnosisFileError:
+    key = f"`{'.'.join(str(part) for part in path)}`" if path else "the file"
+    return DiagnosisFileError(f"Expected content of schema {SCHEMA} but {key} {reason}.")

@@ -1,4 +1,4 @@
-"""What diagnosis.json has of the world around a simulation: how it follows, what pushes it, and what remains."""
+"""Sections of diagnosis.json: goodness of fit, process noise and drift, disturbances, and the residual's whiteness."""
 
 from __future__ import annotations
 
@@ -12,116 +12,116 @@ from torch import Tensor
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise
 from mkc_torch.diagnosis.result import Diagnosis
 
-__all__ = ["follows_of", "forcing_of", "noise_of", "of_recordings", "remaining_of"]
+__all__ = ["disturbance_json", "goodness_of_fit_json", "noise_json", "recordings_json", "remaining_json"]
 
 _MOST_POINTS = 500
-"""Of a course that are written."""
+"""Largest number of samples of a disturbance that are written."""
 
 _DIGITS = 5
-"""Significant ones of what is written of a course."""
+"""Significant digits of a disturbance's values."""
 _TIME_DIGITS = 6
-"""Decimals of a moment in s."""
+"""Decimals of a time in s."""
 
 
-def follows_of(world: NoiseEnvironment) -> dict[str, Any]:
-    """How the simulation follows each output, by its name.
+def goodness_of_fit_json(world: NoiseEnvironment) -> dict[str, Any]:
+    """Return the goodness of fit of each output, by its name.
 
     Example:
-        >>> from mkc_torch.diagnosis.environment import Follows
-        >>> one = Follows("angle", "rad", 0.0049, 0.35, 0.9997, 0.005, "declared", 0.35, 0.02)
-        >>> follows_of(NoiseEnvironment(follows=(one,)))["angle"]["explained"]
+        >>> from mkc_torch.diagnosis.environment import GoodnessOfFit
+        >>> fit = GoodnessOfFit("angle", "rad", 0.0049, 0.35, 0.9997, 0.005, "declared", 0.35, 0.02)
+        >>> goodness_of_fit_json(NoiseEnvironment(goodness_of_fit=(fit,)))["angle"]["explained"]
         0.9997
     """
     return {
-        one.output: {
-            "unit": one.unit,
-            "residual": _finite(one.residual),
-            "variation": _finite(one.variation),
-            "explained": _finite(one.explained),
-            "noise_floor": _finite(one.noise_floor),
-            "floor_source": one.floor_source,
-            "mean_predicts": _finite(one.mean_predicts),
-            "last_value_predicts": _finite(one.last_value_predicts),
+        fit.output: {
+            "unit": fit.unit,
+            "residual": _finite(fit.residual),
+            "variation": _finite(fit.variation),
+            "explained": _finite(fit.explained),
+            "noise_floor": _finite(fit.noise_floor),
+            "floor_source": fit.floor_source,
+            "rmse_of_mean": _finite(fit.rmse_of_mean),
+            "rmse_of_last_value": _finite(fit.rmse_of_last_value),
         }
-        for one in world.follows
+        for fit in world.goodness_of_fit
     }
 
 
-def noise_of(world: NoiseEnvironment) -> dict[str, Any]:
-    """What the noise of the world adds to that of the fit: pushes on states, slow parts of sensors, and inputs."""
+def noise_json(world: NoiseEnvironment) -> dict[str, Any]:
+    """Return the process noise of states, the drift of outputs, and the input hold: the rest of the key "noise"."""
     return {
-        "process": _by_place(push for push in world.pushes if push.at_rate),
-        "sensor": _by_place(push for push in world.pushes if not push.at_rate),
-        "between": dict(world.input_hold),
+        "process": _by_place(process for process in world.process_noise if process.at_rate),
+        "sensor": _by_place(process for process in world.process_noise if not process.at_rate),
+        "input_hold": dict(world.input_hold),
     }
 
 
-def _by_place(pushes: Iterable[ProcessNoise]) -> dict[str, Any]:
-    """The strongest of each place, with the others of it."""
+def _by_place(processes: Iterable[ProcessNoise]) -> dict[str, Any]:
+    """Return the strongest process of each state or output, with the weaker ones under "besides"."""
     found: dict[str, Any] = {}
-    for push in pushes:
-        told = {
-            "size": push.size,
-            "standard_error": _finite(push.standard_error),
-            "unit": push.unit,
-            "lasting": _finite(push.lasting),
-            "nats": _finite(push.nats),
+    for process in processes:
+        content = {
+            "size": process.size,
+            "standard_error": _finite(process.standard_error),
+            "unit": process.unit,
+            "correlation_time": _finite(process.correlation_time),
+            "log_likelihood_gain": _finite(process.log_likelihood_gain),
         }
-        if push.place in found:
-            found[push.place].setdefault("besides", []).append(told)
+        if process.place in found:
+            found[process.place].setdefault("besides", []).append(content)
         else:
-            found[push.place] = told
+            found[process.place] = content
     return found
 
 
-def of_recordings(world: NoiseEnvironment) -> dict[str, Any]:
-    """The runs that shares are of, and the offsets of outputs in each of several recordings; neither where none is.
+def recordings_json(world: NoiseEnvironment) -> dict[str, Any]:
+    """Return the keys "runs" and "offsets" of several recordings; a key without entries is absent.
 
     Example:
         >>> from mkc_torch.diagnosis.environment import Offset
-        >>> of_recordings(NoiseEnvironment(offsets=(Offset("speed", "m/s", 2, "b.csv", -0.2, 0.001),)))
+        >>> recordings_json(NoiseEnvironment(offsets=(Offset("speed", "m/s", 2, "b.csv", -0.2, 0.001),)))
         {'offsets': [{'output': 'speed', 'unit': 'm/s', 'recording': 2, 'name': 'b.csv', 'value': -0.2, ...}]}
     """
-    offsets = [{**asdict(one), "standard_error": _finite(one.standard_error)} for one in world.offsets]
-    runs = [asdict(one) for one in world.runs]
+    offsets = [{**asdict(offset), "standard_error": _finite(offset.standard_error)} for offset in world.offsets]
+    runs = [asdict(run) for run in world.runs]
     return {**({"runs": runs} if runs else {}), **({"offsets": offsets} if offsets else {})}
 
 
-def forcing_of(world: NoiseEnvironment) -> list[dict[str, Any]]:
-    """The course of each push, of a long recording at evenly chosen samples."""
-    return [_course(forcing) for forcing in world.forcing]
+def disturbance_json(world: NoiseEnvironment) -> list[dict[str, Any]]:
+    """Return each estimated disturbance; a long recording is thinned evenly."""
+    return [_course(estimate) for estimate in world.disturbance]
 
 
-def _course(forcing: DisturbanceEstimate) -> dict[str, Any]:
-    step = max(-(-len(forcing.time) // _MOST_POINTS), 1)
+def _course(estimate: DisturbanceEstimate) -> dict[str, Any]:
+    step = max(-(-len(estimate.time) // _MOST_POINTS), 1)
     return {
-        "state": forcing.place,
-        "at_rate": forcing.at_rate,
-        "unit": forcing.unit,
-        "time": [round(float(t), _TIME_DIGITS) for t in forcing.time[::step]],
-        "value": _rounded(forcing.value[::step]),
-        "band": _rounded(forcing.band[::step]),
-        "sentences": forcing.sentences,
+        "state": estimate.place,
+        "at_rate": estimate.at_rate,
+        "unit": estimate.unit,
+        "time": [round(float(t), _TIME_DIGITS) for t in estimate.time[::step]],
+        "value": _rounded(estimate.value[::step]),
+        "band": _rounded(estimate.band[::step]),
+        "sentences": estimate.sentences,
     }
 
 
 def _rounded(values: Tensor) -> list[float | None]:
-    """Numbers to a few digits; None for what is not finite."""
+    """Round to ``_DIGITS`` significant digits; None for values that are not finite."""
     return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
 
 
-def remaining_of(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Whether what the corrected model leaves over is white, and if not, up to which lag and where."""
+def remaining_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return whether the residual of the corrected model is white, and if not, its correlation and location."""
     d = diagnosis
-    told: Mapping[str, Any] = next((said.content for said in d.evidence if said.test == "whiteness"), {})
-    channels = told.get("channels", ())
-    coloured = [one["channel"] for one in channels if not one["white"]]
+    test: Mapping[str, Any] = next((result.content for result in d.evidence if result.test == "whiteness"), {})
+    channels = test.get("channels", ())
+    coloured = [channel["channel"] for channel in channels if not channel["white"]]
     return {
         "white": not coloured if channels else None,
-        "largest_lag": max((one["lag"] for one in channels), default=None),
-        "unit": told.get("unit", ""),
+        "largest_lag": max((channel["lag"] for channel in channels), default=None),
+        "unit": test.get("unit", ""),
         "channels": coloured,
-        "driven": list(dict.fromkeys(push.place for push in d.world.pushes if push.at_rate)),
+        "disturbed_states": list(dict.fromkeys(process.place for process in d.environment.process_noise if process.at_rate)),
         "smooth_along": list(d.remaining),
     }
 

@@ -218,7 +218,7 @@ def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
     parameters = final.fit.parameters
-    of_recordings = {one.name for one in getattr(model.prepared, "own_offsets", ())}
+    of_recordings = {item.name for item in getattr(model.prepared, "own_offsets", ())}
     own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(
         model.prepared.name,

@@ -70,15 +70,15 @@ def python_source(
     outputs: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
-        lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
+        lines = _lines(term, [_rounded(float(item)) for item in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         if place is outputs and outputs:
             place.append("y = dict(shown)")  # the next one acts on what this one shows
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
-    told = ", ".join(term.effect.display_name for term in terms) or "nothing more"
+    label = ", ".join(term.effect.display_name for term in terms) or "nothing more"
     body = [
         f"class Corrected{kind.__name__}({kind.__name__}):",
-        f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',
+        f'    """{kind.__name__} with the parameters that a recording gave it, and {label}."""',
         "",
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
@@ -128,19 +128,19 @@ def _loaded(kind: type, folder: Path | None) -> str | None:
 
 def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
     lines = []
-    for (name, one), value in zip(system.parameters.items(), theta, strict=False):
+    for (name, parameter), value in zip(system.parameters.items(), theta, strict=False):
         number = repr(_rounded(value))
-        if isinstance(one, Parameter):
-            told = [
+        if isinstance(parameter, Parameter):
+            sentences = [
                 f"{key}={json.dumps(known, ensure_ascii=False)}"
                 for key, known, free in (
-                    ("lower", one.lower, -float("inf")),
-                    ("upper", one.upper, float("inf")),
-                    ("unit", one.unit, ""),
+                    ("lower", parameter.lower, -float("inf")),
+                    ("upper", parameter.upper, float("inf")),
+                    ("unit", parameter.unit, ""),
                 )
                 if known != free
             ]
-            number = f"Parameter({', '.join([number, *told])})"
+            number = f"Parameter({', '.join([number, *sentences])})"
         lines.append(f'"{name}": {number},')
     return lines
 
@@ -152,8 +152,8 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
     for name, like in memories.items():
         begun = first[system.states.index(like) :: len(system.states)] if like else ()
         guesses |= {name: sum(begun) / len(begun)} if begun else {}
-    told = ", ".join(json.dumps(name) for name in memories)
-    lines = [f"    states = (*{base}.states, {told})"] if memories else []
+    text = ", ".join(json.dumps(name) for name in memories)
+    lines = [f"    states = (*{base}.states, {text})"] if memories else []
     guessed = ", ".join(f"{json.dumps(name)}: {_rounded(value)!r}" for name, value in guesses.items())
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 
@@ -228,7 +228,7 @@ def _signed(expression: str) -> str:
 
 def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Expressions of what an effect on the rate of a state refers to."""
-    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
+    known = {name: parameter if isinstance(parameter, Parameter) else Parameter(parameter) for name, parameter in system.parameters.items()}
     position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
     zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
     return {
@@ -243,7 +243,7 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
 
 def _numbered(memories: Sequence[str]) -> dict[str, str]:
     """Expressions of internal states: memory, memory_2 and so on."""
-    return {"memory" if k == 0 else f"memory_{k + 1}": one for k, one in enumerate(memories)}
+    return {"memory" if k == 0 else f"memory_{k + 1}": memory for k, memory in enumerate(memories)}
 
 
 def _load(state: str) -> list[str]:

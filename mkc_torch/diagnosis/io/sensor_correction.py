@@ -42,7 +42,7 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
             "corrects is written by `mkc apply`."
         )
     unit = str(model.state.get("unit", ""))
-    kept, current, told = _kept(model, unit)
+    kept, current, text = _kept(model, unit)
     matrix, offset = _affine(_reduced(model, kept), unit, None)
     strength = model.state.get("strength")
     field = None
@@ -56,7 +56,7 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
         field_unit=unit,
         field_strength=strength if isinstance(strength, float) else None,
         current=field,
-        left_out=tuple(told),
+        left_out=tuple(text),
     )
 
 
@@ -65,20 +65,20 @@ def _kept(model: DiagnosedModel, unit: str) -> tuple[list[int], int | None, list
     ports = correction_of(model.simulation, model.state, _probe(unit, {})).ports
     kept: list[int] = []
     current: int | None = None
-    told = []
+    sentences = []
     for number, term in enumerate(model.terms):
         effect = term.effect.id
         if term.port not in ports:
-            told.append(f"{effect} belongs to the place of the diagnosed recording and is left out.")
+            sentences.append(f"{effect} belongs to the place of the diagnosed recording and is left out.")
         elif term.effect.persistent_change:
             kept.append(number)
-            told.append(f"{effect} is bound to the time of the diagnosed recording: its offset at the end is in.")
+            sentences.append(f"{effect} is bound to the time of the diagnosed recording: its offset at the end is in.")
         elif current is None and _is_current(term):
             kept.append(number)
             current = number
         else:
-            told.append(f"{effect} is left out: {_why(term, current is not None)}")
-    return kept, current, told
+            sentences.append(f"{effect} is left out: {_why(term, current is not None)}")
+    return kept, current, sentences
 
 
 def _is_current(term: Term) -> bool:

@@ -1,1 +1,1 @@
-"""The linearised problem: tangents, the search over them, noise that wanders beside them."""
+"""The linearised problem: tangents, the search over candidates, and drift of the sensors."""

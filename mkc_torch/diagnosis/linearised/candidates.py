@@ -1,4 +1,4 @@
-"""Candidates' tangents, a few at a time: all of a long recording's at once are more than a computer holds."""
+"""Tangents of the candidates, a few at a time, because all of them may not fit into memory."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 __all__ = ["AT_ONCE", "Candidates", "in_blocks", "one_after_the_other", "parts_of"]
 
 AT_ONCE = 8
-"""Candidates whose tangents are computed together at most: of a short recording they stay in a core's own memory."""
+"""Largest number of candidates whose tangents are computed together, so that a short recording's fit into the cache."""
 
 _CELLS = 4_000_000
-"""Numbers of a block of tangents that are worked on at once: 32 MB, of which a Fourier transform makes four times."""
+"""Numbers per block of tangents: 32 MB, of which a Fourier transform needs four times."""
 
 HELD = 8_000_000
-"""Numbers of candidates' tangents that are kept, 64 MB; of the others each is made again whenever it is asked for."""
+"""Numbers of candidates' tangents that are cached, 64 MB; the others are recomputed on each access."""
 
 
 def in_blocks(columns: Sequence[Tensor], at_once: int = AT_ONCE) -> Iterator[list[Tensor]]:
-    """So many at a time, or fewer that are :data:`_CELLS` numbers together.
+    """Yield blocks of at most ``at_once`` matrices, or of about :data:`_CELLS` numbers.
 
     Example:
         >>> [len(block) for block in in_blocks([torch.ones(1000, 1)] * 10)]
@@ -36,8 +36,8 @@ def in_blocks(columns: Sequence[Tensor], at_once: int = AT_ONCE) -> Iterator[lis
         [3, 1]
     """
     block: list[Tensor] = []
-    for one in columns:
-        block.append(one)
+    for matrix in columns:
+        block.append(matrix)
         if len(block) == at_once or sum(known.numel() for known in block) >= _CELLS:
             yield block
             block = []
@@ -46,15 +46,15 @@ def in_blocks(columns: Sequence[Tensor], at_once: int = AT_ONCE) -> Iterator[lis
 
 
 class Candidates(Sequence[Tensor]):
-    """The tangents with each candidate's γ, (N, m, q); zeros where they are not finite.
+    """The tangents of each candidate's γ, (N, m, q); zeros if they are not finite.
 
-    Through a port whose samples are apart a tangent is a product, and made anew each time that it is asked for, but for
-    the first ones, of :data:`HELD` numbers. Trajectories are solved for side by side, and kept.
+    Through a pointwise port a tangent is a product, recomputed on each access except for the first :data:`HELD`
+    numbers. Tangents through trajectories are solved for in parallel and cached.
 
     Args:
-        model, parameters: where.
+        model, parameters: where to linearise.
         terms: the candidates.
-        pointwise: through each port whose samples are apart, (N, m, channels); of the others None.
+        pointwise: Jacobian through each pointwise port, (N, m, channels); None for the other ports.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Candidates(Sequence[Tensor]):
         pointwise: Mapping[str, Tensor | None],
     ) -> None:
         self._terms, self._prepared, self._pointwise = tuple(terms), model.prepared, dict(pointwise)
-        self._independent = parameters.new_tensor([float(one) for one in self._prepared.independent])
+        self._independent = parameters.new_tensor([float(channel) for channel in self._prepared.independent])
         self._signals: Mapping[str, Tensor] = {}
         self._held: dict[int, Tensor] = {}
         if not self._terms:
@@ -92,24 +92,24 @@ class Candidates(Sequence[Tensor]):
 
     def __getitem__(self, number: int | slice) -> Tensor | Sequence[Tensor]:
         numbers = range(len(self._terms))[number]
-        return self._one(numbers) if isinstance(numbers, int) else tuple(self._one(one) for one in numbers)
+        return self._tangent(numbers) if isinstance(numbers, int) else tuple(self._tangent(k) for k in numbers)
 
     def __len__(self) -> int:
         return len(self._terms)
 
     @property
     def parts(self) -> tuple[object, ...]:
-        """All that is large of it, itself included."""
+        """All large parts, itself included."""
         return (self, *self._held.values(), *self._signals.values())
 
-    def _one(self, number: int) -> Tensor:
+    def _tangent(self, number: int) -> Tensor:
         if number in self._held:
             return self._held[number]
         term = self._terms[number]
         known, context = self._pointwise[term.port], term.context(self._prepared, self._signals.get(term.port))
         assert known is not None
-        if term.effect.has_course and not term.effect.has_basis:
-            # a gain on a course: each channel's course is the same
+        if term.effect.has_waveform and not term.effect.has_basis:
+            # a gain of a waveform: all channels share it
             moved = known * term.effect.waveform(term.shape, context)[:, None, None]
         else:
             moved = torch.einsum("nmc,ncq->nmq", known, directions(term, context))
@@ -118,24 +118,24 @@ class Candidates(Sequence[Tensor]):
     def _along_trajectories(
         self, model: JointModel, parameters: Tensor, port: str, members: Sequence[int]
     ) -> dict[int, Tensor]:
-        """Those of candidates at one port, for which the trajectories are solved for together."""
+        """Compute the tangents of the candidates at one port by solving for their trajectories together."""
         terms = [self._terms[number] for number in members]
         courses = [directions(term, term.context(self._prepared, self._signals.get(port))) for term in terms]
         moved = through_port(model, parameters, port, torch.cat(courses, -1), None)
-        parts = moved.split([one.shape[-1] for one in courses], -1)
+        parts = moved.split([course.shape[-1] for course in courses], -1)
         return {number: self._usable(term, part) for number, term, part in zip(members, terms, parts, strict=True)}
 
     def _usable(self, term: Term, moved: Tensor) -> Tensor:
         if term.effect.follows_signal and not all(self._prepared.independent):
             moved = self._independent[:, None] * moved
-        # one that has no slope here is none that could be named
+        # a candidate without a finite slope here cannot be named
         return moved if bool(moved.isfinite().all()) else torch.zeros_like(moved)
 
 
 class _Chained(Sequence[Tensor]):
     def __init__(self, sets: Sequence[Sequence[Tensor]]) -> None:
         self._sets = tuple(sets)
-        self._places = [(one, number) for one in self._sets for number in range(len(one))]
+        self._places = [(members, number) for members in self._sets for number in range(len(members))]
 
     @overload
     def __getitem__(self, number: int) -> Tensor: ...
@@ -145,23 +145,23 @@ class _Chained(Sequence[Tensor]):
 
     def __getitem__(self, number: int | slice) -> Tensor | Sequence[Tensor]:
         if isinstance(number, slice):
-            return tuple(one[place] for one, place in self._places[number])
-        one, place = self._places[number]
-        return one[place]
+            return tuple(members[place] for members, place in self._places[number])
+        members, place = self._places[number]
+        return members[place]
 
     def __len__(self) -> int:
         return len(self._places)
 
     @property
     def parts(self) -> tuple[object, ...]:
-        return tuple(part for one in self._sets for part in parts_of(one))
+        return tuple(part for members in self._sets for part in parts_of(members))
 
 
 def one_after_the_other(*sets: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Several sets of candidates as one, whose tangents are still made when they are asked for."""
+    """Return several sets of candidates as one sequence, whose tangents are still computed on access."""
     return _Chained(sets)
 
 
 def parts_of(candidates: Sequence[Tensor]) -> tuple[object, ...]:
-    """All that is large of a set of candidates, itself included."""
+    """Return all large parts of a set of candidates, itself included."""
     return candidates.parts if isinstance(candidates, (Candidates, _Chained)) else tuple(candidates)

@@ -1,4 +1,4 @@
-"""What a search is about, in the slowest coefficients of the cosine basis, where a colour is a division."""
+"""Residual and tangents in the slowest coefficients of the cosine basis, where whitening is a division."""
 
 from __future__ import annotations
 
@@ -19,23 +19,28 @@ if TYPE_CHECKING:
 
 __all__ = ["FILLED_AT_ONCE", "CosineProjection", "each"]
 
-_MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
-"""Share of what moves that the slowest cosine coefficients hold, times as many that are kept, and how many at least."""
+_MOST = 0.9
+"""Share of the tangents' power that sets their bandwidth."""
+
+_MARGIN = 3.0
+"""Number of cosine coefficients that are kept, in multiples of that bandwidth."""
+
+_FEWEST = 1000
+"""Smallest number of cosine coefficients that are kept."""
 
 FILLED_AT_ONCE = 64
-"""Candidates whose coefficients are filled together: they stay in a core's own memory. To fill them, a large matrix
-passes by each time."""
+"""Candidates whose coefficients are imputed together: each block reads a large matrix once and fits into the cache."""
 
 
 @dataclass(frozen=True)
 class CosineProjection:
-    """Residual and tangents where residuals count, in their K slowest coefficients.
+    """Residual and tangents at the samples that count, in their K slowest coefficients.
 
     Attributes:
         pseudo: the pseudo-residual.
-        nuisance, candidates, slow: the tangents of the simulation's own parameters, of each candidate and of the slow
-            courses of a wander.
-        gaps: what does not count.
+        nuisance, candidates, slow: tangents of the simulation's own parameters, of each candidate, and of the slow
+            cosines of a drift.
+        gaps: the rejected samples.
     """
 
     pseudo: Float[Tensor, "K m"]
@@ -48,11 +53,11 @@ class CosineProjection:
     def of(
         cls, pseudo: Float[Tensor, "N m"], counts: Float[Tensor, "N m"], tangents: ModelTangents, slow: SlowBasis | None
     ) -> CosineProjection:
-        """Of all samples; candidates are taken up a few at a time, and of each no more is kept than its coefficients.
+        """Project all samples; candidates are processed a few at a time, and only their coefficients are kept.
 
         Args:
             pseudo, counts, tangents: of all samples.
-            slow: the wander that is allowed for, if one is.
+            slow: the drift's cosines; None without a drift.
         """
         kept = _bandwidth(tangents.nuisance)
 
@@ -71,11 +76,11 @@ class CosineProjection:
 
     @property
     def parts(self) -> tuple[object, ...]:
-        """All that is large of it, itself included."""
+        """All large parts, itself included."""
         return (self, self.pseudo, self.nuisance, *self.candidates, self.slow, self.gaps)
 
     def filled(self, filling: Imputation) -> CosineProjection:
-        """The same with what noise is expected at rejected samples, in all of it alike."""
+        """Impute the expected noise at rejected samples, in residual and tangents alike."""
         pseudo, nuisance, *candidates = each(
             filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates], FILLED_AT_ONCE
         )
@@ -89,11 +94,11 @@ class CosineProjection:
 
 
 def each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor], at_once: int = AT_ONCE) -> list[Tensor]:
-    """A function of columns, of each of these matrices, a few of them at a time.
+    """Apply a function of columns to each of these matrices, a few of them at a time.
 
     Example:
         >>> columns = [torch.ones(2, 1), torch.ones(2, 3)]
-        >>> [one.shape[-1] for one in each(lambda joined: 2.0 * joined, columns)]
+        >>> [doubled.shape[-1] for doubled in each(lambda joined: 2.0 * joined, columns)]
         [1, 3]
     """
     return [
@@ -104,7 +109,7 @@ def each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor], at_onc
 
 
 def _bandwidth(nuisance: Float[Tensor, "N m p"]) -> int:
-    """How many of the slowest cosine coefficients hold what moves: three times as many as hold nine tenths of it."""
+    """Return how many slow cosine coefficients to keep: three times as many as hold 90 % of the tangents' power."""
     N = len(nuisance)
     power = dct(nuisance).square().sum(1)
     share = (power / power.sum(0).clamp(min=1e-300)).cumsum(0)

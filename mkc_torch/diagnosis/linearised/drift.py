@@ -1,4 +1,4 @@
-"""Wander of a sensor's offset beside the simulation's own parameters: families of slow courses and their sizes."""
+"""Drift of a sensor's offset: families of slow random courses and their sizes."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 __all__ = ["DriftStatistics"]
 
 _SIZES = 36
-"""Sizes of wander tried, from none to a few times the largest that could fit."""
+"""Number of drift sizes tried, up to a few times the largest that could fit."""
 
 
 @dataclass(frozen=True)
 class DriftStatistics:
-    """All that a series says of its wander, in courses on the scales of one family.
+    """The statistics of a series for the drift of one family.
 
     Attributes:
-        power: of the series beside the simulation's own parameters; ``dof`` are its degrees of freedom.
-        inner, gram: inner products of the courses with the series, (k,), and with one another, (k, k).
-        scale: standard deviations of the courses up to one size, (k,).
-        size: squared, the likeliest one of equal channels.
+        power: of the series less the simulation's own parameters; ``dof`` are its degrees of freedom.
+        inner, gram: inner products of the cosines with the series, (k,), and with one another, (k, k).
+        scale: standard deviations of the cosines up to one size, (k,).
+        size: the most likely squared size for equal channels.
     """
 
     power: float
@@ -40,7 +40,7 @@ class DriftStatistics:
 
 @dataclass(frozen=True)
 class DriftFamily:
-    """One family of wander; its own axes are found once they are asked for."""
+    """A family of drift; its eigenvectors are computed on first use."""
 
     scale: Tensor  # (k,) standard deviations of the courses at size 1
     gram: Tensor  # (k, k) inner products of the courses, not yet on this scale
@@ -57,31 +57,31 @@ class DriftFamily:
 
     @property
     def axes(self) -> Float[Tensor, "k k"]:
-        """Their eigenvectors, one a column."""
+        """Their eigenvectors, in columns."""
         return self._decomposed[1]
 
     @cached_property
     def sizes(self) -> Float[Tensor, " sizes"]:
-        """Squared sizes that are tried; the first one is 0."""
+        """Squared sizes that are tried; the first is 0."""
         tried = torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / self.strength[-1]
         return torch.cat([tried.new_zeros(1), tried])
 
     @cached_property
     def shares(self) -> Float[Tensor, "S k"]:
-        """What a wander of each size, but none, takes of each course's power."""
+        """The share of each cosine's power that a drift of each positive size explains."""
         sizes = self.sizes[1:].unsqueeze(-1)
         return sizes / (1.0 + sizes * self.strength)
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """The wander of a series.
+    """The fitted drift of a series.
 
     Attributes:
         family: its number.
         size: squared, in units of the white part's variance.
         variance: of the white part.
-        log_likelihood, gain: in nats; the gain is over no wander.
+        log_likelihood, gain: in nats; the gain is over no drift.
     """
 
     family: int
@@ -91,7 +91,7 @@ class NoiseFit:
     gain: float
 
 
-def without_wander(power: Tensor, rotated: Tensor, family: DriftFamily) -> tuple[Tensor, Tensor]:
-    """Weighted sum of squares (S, B) and log-determinant (S, 1) at each size of wander."""
+def without_drift(power: Tensor, rotated: Tensor, family: DriftFamily) -> tuple[Tensor, Tensor]:
+    """Return the weighted sum of squares (S, B) and the log-determinant (S, 1) at each positive size of the drift."""
     left = torch.maximum(power - family.shares @ rotated.square(), 1e-12 * power)
     return left, torch.log1p(family.sizes[1:].unsqueeze(-1) * family.strength).sum(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""The final parameters: one step of generalised least squares from the robust fit, and their covariance."""
+"""The final estimate: a step of generalised least squares from the robust fit, and its covariance."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.diagnosis.linearised.drift import NoiseFit
 from mkc_torch.diagnosis.linearised.drift_residuals import Local, drift_residuals
 from mkc_torch.diagnosis.linearised.linearise import linearise
@@ -19,7 +20,6 @@ from mkc_torch.diagnosis.model.shaped import ShapedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
 from mkc_torch.diagnosis.settings import NoiseSettings
-from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -27,27 +27,28 @@ if TYPE_CHECKING:
 __all__ = ["FinalEstimate", "estimate"]
 
 _AT_END = 1e-6
-"""Distance from an end of its range, over that end, within which a shape's number is at the end, to rounding."""
+"""Relative distance from a limit of its range within which a shape number is at the limit."""
 
 _UNKNOWN = 0.5
-"""Share of a number beyond which its error says no more than that it is not known."""
+"""Relative error of a shape number above which it counts as unknown."""
 
 
 @dataclass(frozen=True)
 class FinalEstimate:
-    """A fit with its final parameters, their covariance (p, p), and the noise that is left.
+    """A fit with its final parameters, their covariance (p, p), and the remaining noise.
 
     Attributes:
-        fit, covariance: what was found.
-        noise, colour: that are left; ``wander_spread`` is that of the wander over the recording, in its port's unit.
-        shape_errors: standard errors of the numbers of each effect's shape that were fitted and are known.
+        fit, covariance: the estimate.
+        noise, spectrum: of the residual; ``drift_spread`` is the standard deviation of the drift over the recording,
+            in its port's unit.
+        shape_errors: standard errors of the fitted shape numbers of each effect, as far as they are known.
     """
 
     fit: FittedModel
     covariance: Float[Tensor, "p p"]
     noise: NoiseFit
     spectrum: NoiseSpectrum
-    wander_spread: float
+    drift_spread: float
     shape_errors: tuple[Mapping[str, float], ...]
 
     @property
@@ -55,18 +56,18 @@ class FinalEstimate:
         return self.covariance.diagonal().clamp(min=0.0).sqrt()
 
     def at_least(self, error: Float[Tensor, " p"]) -> FinalEstimate:
-        """The same with standard errors that are nowhere smaller than these; correlations stay."""
+        """Return the estimate with these errors as lower limits of the standard errors; correlations stay."""
         own = self.standard_error
         larger = torch.where(own > 0, torch.maximum(error / own.clamp(min=1e-300), torch.ones_like(own)), 1.0)
         return replace(self, covariance=larger.unsqueeze(-1) * self.covariance * larger)
 
 
 def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
-    """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
+    """Take a step of generalised least squares on the pseudo-residuals, with the spectrum and drift of their noise.
 
-    The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise
-    one, and its covariance respects the autocorrelation. A step of more than ``last_step`` standard errors, five if
-    not set, is a fit that the noise model does not describe, and is not taken.
+    The M-estimate weighs samples as if they were independent. For coloured noise this step is more precise, and its
+    covariance includes the autocorrelation. A step of more than ``last_step`` standard errors is not taken, because
+    the noise model does not describe the fit.
     """
     model, parameters = fit.model, fit.parameters
     tangents = tangents_of(model, parameters, settings)
@@ -87,12 +88,12 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
         if model.bounds is not None:
             parameters = parameters.clamp(*model.bounds)
         residual, nearby = model.answer(parameters)
-        # there may be no trajectory a step away
+        # the simulation may have no finite trajectory there
         if bool(residual.isfinite().all()):
             moved = model if nearby is None else model.begun_with(nearby.bare)
             fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
     noise = found.search.noise_fit(found.series)
-    spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
+    spread = found.search.drift_spread(noise) if noise.size > 0 else 0.0
     plain = FinalEstimate(fit, covariance, noise, found.spectrum, spread, tuple({} for _ in fit.model.terms))
     return _shapes_free(
         plain.at_least(found.search.doubted_error(0, found.series, settings.doubted_family)), tangents, local
@@ -100,9 +101,9 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
 
 
 def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) -> FinalEstimate:
-    """The same with what the fitted numbers of shapes leave unknown of the parameters, and of themselves.
+    """Add the uncertainty of the fitted shape numbers to the standard errors, and their own errors.
 
-    A number at the end of its range is held there, as it was in the fit.
+    A number at a limit of its range is held there, as in the fit.
     """
     model, parameters = plain.fit.model, plain.fit.parameters
     inside = [_inside(term, reach_of(term, model.prepared)) for term in model.terms]
@@ -124,9 +125,9 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
     errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())
     known = [
         {
-            name: one
-            for name, one in found.items()
-            if 0.0 < one < _UNKNOWN * (term.shape[name] if reach[name][0] > 0 else reach[name][1])
+            name: deviation
+            for name, deviation in found.items()
+            if 0.0 < deviation < _UNKNOWN * (term.shape[name] if reach[name][0] > 0 else reach[name][1])
         }
         for term, reach, found in zip(model.terms, inside, errors, strict=True)
     ]
@@ -134,7 +135,7 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
 
 
 def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """The numbers of a shape that are not at an end of their range."""
+    """Return the shape numbers that are not at a limit of their range."""
     return {
         name: (low, high)
         for name, (low, high) in reach.items()

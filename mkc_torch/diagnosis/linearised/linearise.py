@@ -1,4 +1,4 @@
-"""From a fitted model to a search: tangents of the parameters, of every candidate and of wandering noise, whitened."""
+"""Linearise a fitted model to a search: whitened tangents of the parameters, of every candidate and of the drift."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from mkc_torch.diagnosis.noise.imputation import Imputation
 from mkc_torch.diagnosis.noise.spectrum import (
     NoiseSpectrum,
     autoregressive,
-    colour_of,
-    colour_of_fast,
     enters_at_port,
-    port_colour,
+    port_autoregression,
+    spectrum_of,
+    spectrum_of_fast,
 )
 
 if TYPE_CHECKING:
@@ -32,32 +32,34 @@ if TYPE_CHECKING:
 __all__ = ["LinearisedSearch", "linearise"]
 
 
-_ALTERNATIONS, _SETTLED = 8, 10.0
-"""Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
-which is some twenty numbers, gains by chance."""
+_ALTERNATIONS = 8
+"""Largest number of alternations between spectrum and drift."""
+
+_SETTLED = 10.0
+"""Nats that an alternation has to gain to continue: as many as a spectrum of about twenty numbers gains by chance."""
 
 _REACHED = 0.98
-"""Share of a random walk's power that lies at the frequencies that it reaches."""
+"""Share of a random walk's power below the frequency from which the spectrum is estimated without the drift."""
 
 _FARTHEST = 10.0
-"""Times that a step may go beyond, of the root of a spectrum."""
+"""Largest factor by which an over-relaxed step may change the root of a spectrum."""
 
 _REFILLED = 2
-"""Times that the colour is read again, with what it says of rejected samples."""
+"""Rounds of estimating the spectrum and imputing rejected samples with it."""
 
 
 @dataclass(frozen=True)
 class LinearisedSearch:
-    """A search and the series it is about.
+    """A linear search and its series.
 
     Attributes:
         search: over the candidates.
-        series: (M,), the whitened pseudo-residual, and what the prior pulls at.
-        colour: of the stationary part of the noise.
-        entrance: where wandering noise enters, coloured noise may too: the port's pointwise tangents, and the
-            autoregression of noise that gives such residuals; None where there is no such port.
-        filling: what stands in for rejected samples.
-        others: noise from where the alternation between colour and wander was not begun.
+        series: (M,), the whitened pseudo-residual, followed by the prior's rows.
+        spectrum: of the stationary part of the noise.
+        entrance: if coloured noise enters at the drift's port: the port's pointwise tangents, and the autoregression of
+            the noise there; otherwise None.
+        filling: imputation of the rejected samples.
+        others: noise models from the other starts of the alternation between spectrum and drift.
     """
 
     search: LinearSearch
@@ -68,59 +70,59 @@ class LinearisedSearch:
     others: tuple[LinearisedSearch, ...] = ()
 
     def plausible(self, within: float) -> list[NoiseSpectrum]:
-        """Other colours that the noise may have: as likely ones, within some nats.
+        """Return other spectra of the noise that are within some nats of the most likely.
 
-        The alternation comes to them from elsewhere: a spectrum of twenty numbers that a wander hides in part has
-        several.
+        They are the results of the alternation from other starts: a spectrum of twenty numbers that a drift partly
+        hides has several optima.
         """
-        settled = [_settled(one) for one in self.others]
-        return [one.spectrum for one in settled if one.evidence > self.evidence - within]
+        settled = [_settled(start) for start in self.others]
+        return [found.spectrum for found in settled if found.evidence > self.evidence - within]
 
-    def colour_beside(self) -> NoiseSpectrum:
-        """The colour of what is left beside the wander."""
+    def stationary_spectrum(self) -> NoiseSpectrum:
+        """Return the spectrum of the noise without the drift."""
         K, m = self.spectrum.root.shape
         power = self.search.stationary(self.series)[: K * m].unflatten(0, (K, m))
-        return colour_of(power * self.spectrum.root.square())
+        return spectrum_of(power * self.spectrum.root.square())
 
     @property
-    def wanders(self) -> bool:
-        """Whether a wander makes the noise likelier."""
+    def has_drift(self) -> bool:
+        """Whether a drift makes the noise more likely."""
         return self.search.noise_fit(self.series).gain > 0
 
-    def colour_ahead(self) -> NoiseSpectrum:
-        """Twice as far from the present colour as :meth:`colour_beside`: that goes slowly where a wander is strong.
+    def overrelaxed_spectrum(self) -> NoiseSpectrum:
+        """Return twice the step of :meth:`stationary_spectrum` (over-relaxation), which is slow for a strong drift.
 
         Salakhutdinov & Roweis, "Adaptive overrelaxed bound optimization methods", ICML (2003).
         """
-        step = self.colour_beside()
+        step = self.stationary_spectrum()
         beyond = (step.root / self.spectrum.root).clamp(1.0 / _FARTHEST, _FARTHEST)
         return replace(step, root=step.root * beyond)
 
-    def recoloured(self, spectrum: NoiseSpectrum) -> LinearisedSearch:
-        """The same beside noise of another colour, with what stands in for rejected samples as it is."""
+    def under(self, spectrum: NoiseSpectrum) -> LinearisedSearch:
+        """Return the search under another noise spectrum, with the same imputation of rejected samples."""
         factor = (self.spectrum.root / spectrum.root).flatten()
         own, rows = self.series[: len(factor)], len(self.series) - len(factor)
-        # what the prior pulls at is on the scale of the residuals
+        # the prior's rows are on the scale of the residuals
         scale = (factor * own).std() / own.std()
         factor = torch.cat([factor, scale.expand(rows)])
         return replace(self, search=self.search.scaled(factor), series=factor * self.series, spectrum=spectrum)
 
     @property
     def evidence(self) -> float:
-        """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
+        """Log-likelihood of the residuals under their noise, up to a constant of the recording."""
         log_det = float(self.spectrum.root.log().sum()) + 0.5 * self.filling.log_det
         return self.search.noise_fit(self.series).log_likelihood - log_det
 
     def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> SearchGains:
-        """The likelihood ratios of other candidates on the series."""
+        """Return the likelihood ratios of other candidates on the series."""
         return self.search.with_candidates(self._columns(tangents, counts)).gains(self.series.unsqueeze(-1))
 
     def with_more(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> LinearisedSearch:
-        """The same with other candidates after its own."""
+        """Return the search with these candidates after its own."""
         return replace(self, search=self.search.with_more(self._columns(tangents, counts)))
 
     def without(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> LinearisedSearch:
-        """The same with these tangents taken out of everything too."""
+        """Return the search with these tangents projected out of everything too."""
         return replace(self, search=self.search.without(torch.cat(self._columns(tangents, counts), -1)))
 
     def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
@@ -132,7 +134,7 @@ class LinearisedSearch:
         return self.spectrum.scaled(self.filling(dct(values, len(self.spectrum.root))))
 
     def entering(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"] | None:
-        """Draws of coloured noise that enters at the port, of variance one once whitened."""
+        """Draw coloured noise that enters at the port, with variance 1 once whitened; None without such a port."""
         if self.entrance is None:
             return None
         pointwise, coefficients = self.entrance
@@ -141,7 +143,7 @@ class LinearisedSearch:
         flat = self._whitened(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
         rows = len(self.series) - len(flat)
         prior = torch.randn(rows, count, generator=generator, dtype=flat.dtype)
-        # the colour knows how much there is at each frequency; the draws know how frequencies hang together
+        # the spectrum sets the power at each frequency, the draws the correlation between frequencies
         return torch.cat([flat / flat.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-300), prior])
 
 
@@ -159,107 +161,120 @@ def linearise(
     joint: bool = False,
     seen: CosineProjection | None = None,
 ) -> LinearisedSearch:
-    """A search around a fit.
+    """Linearise a model at a fit.
 
     Args:
         model, parameters: the fit.
         pseudo: its pseudo-residual, without the effect that is sought.
-        counts: 0 where a residual was rejected; there the tangents say nothing either.
+        counts: 0 for a rejected residual; there the tangents are ignored too.
         tangents: at the fit.
-        colour: of the noise; default the likeliest one of ``pseudo``.
-        near: a colour that is close to it.
-        white: beside the wander, noise counts as white.
-        wander: allow for noise that wanders at the ports.
-        joint: the one candidate is all of the parameters, to be estimated together.
-        seen: what :meth:`CosineProjection.of` gives of the same, where it is known.
+        spectrum: of the noise; default the most likely spectrum of ``pseudo``.
+        near: a similar spectrum, as the start.
+        white: treat noise other than the drift as white.
+        drift: allow for a drift at the ports.
+        joint: the only candidate is the vector of all parameters, to be estimated together.
+        seen: result of :meth:`CosineProjection.of` for the same arguments, if known.
     """
     m = pseudo.shape[1]
-    pull = _Pull.of(model, parameters)
+    prior_rows = _PriorRows.of(model, parameters)
     slow = tangents.slow if drift else None
     seen = CosineProjection.of(pseudo, counts, tangents, slow) if seen is None else seen
     level = pseudo.new_ones(seen.kept, m) * _level(pseudo)
     plain = NoiseSpectrum(tuple(pseudo.new_zeros(0) for _ in range(m)), level)
     if white:
-        return _searching(plain, pull, seen, slow)
+        return _build_search(plain, prior_rows, seen, slow)
     bare = replace(seen, candidates=())
     if joint:
-        own = _coloured(plain, near, pull, bare, slow).spectrum if spectrum is None else spectrum
-        return _searching(own, pull, seen, slow, joint=True)
-    found = _coloured(plain, near, pull, bare, slow) if spectrum is None else _searching(spectrum, pull, bare, slow)
+        own = _with_own_spectrum(plain, near, prior_rows, bare, slow).spectrum if spectrum is None else spectrum
+        return _build_search(own, prior_rows, seen, slow, joint=True)
+    found = (
+        _with_own_spectrum(plain, near, prior_rows, bare, slow)
+        if spectrum is None
+        else _build_search(spectrum, prior_rows, bare, slow)
+    )
     candidates = [
-        pull.below(found.spectrum.scaled(one)) for one in each(found.filling, seen.candidates, FILLED_AT_ONCE)
+        prior_rows.below(found.spectrum.scaled(c)) for c in each(found.filling, seen.candidates, FILLED_AT_ONCE)
     ]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
         return found
     block = counts.unsqueeze(-1) * pointwise
-    # the wander is drawn for itself
-    beside = pseudo - counts * slow.waveform(found.search.courses(found.series))
-    if not enters_at_port(beside, block):
+    # the drift is drawn separately
+    without_drift = pseudo - counts * slow.waveform(found.search.courses(found.series))
+    if not enters_at_port(without_drift, block):
         return found
-    return replace(found, entrance=(block, port_colour(beside, block)))
+    return replace(found, entrance=(block, port_autoregression(without_drift, block)))
 
 
-def _searching(
-    spectrum: NoiseSpectrum, pull: _Pull, seen: CosineProjection, slow: SlowBasis | None, *, joint: bool = False
+def _build_search(
+    spectrum: NoiseSpectrum,
+    prior_rows: _PriorRows,
+    seen: CosineProjection,
+    slow: SlowBasis | None,
+    *,
+    joint: bool = False,
 ) -> LinearisedSearch:
-    """A search of what has its rejected samples filled."""
+    """Build the search with the rejected samples imputed."""
     filling = seen.gaps.filling(spectrum)
     seen = seen.filled(filling)
     flat = spectrum.scaled(seen.pseudo)
-    parameters = pull.under(spectrum.scaled(seen.nuisance), flat)
-    candidates = [pull.below(spectrum.scaled(one)) for one in seen.candidates]
+    parameters = prior_rows.under(spectrum.scaled(seen.nuisance), flat)
+    candidates = [prior_rows.below(spectrum.scaled(candidate)) for candidate in seen.candidates]
     search = LinearSearch(
         parameters[:, :0] if joint else parameters,
         [parameters] if joint else candidates,
-        pull.below(spectrum.scaled(seen.slow)),
+        prior_rows.below(spectrum.scaled(seen.slow)),
         flat.new_zeros(0, 0) if slow is None else slow.scales,
         0.0 if slow is None else slow.walk_first,
     )
-    return LinearisedSearch(search, pull.beside(flat), spectrum, None, filling)
+    return LinearisedSearch(search, prior_rows.appended(flat), spectrum, None, filling)
 
 
-def _coloured(
-    plain: NoiseSpectrum, near: NoiseSpectrum | None, pull: _Pull, seen: CosineProjection, slow: SlowBasis | None
+def _with_own_spectrum(
+    plain: NoiseSpectrum,
+    near: NoiseSpectrum | None,
+    prior_rows: _PriorRows,
+    seen: CosineProjection,
+    slow: SlowBasis | None,
 ) -> LinearisedSearch:
-    """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
+    """Return the search with the most likely spectrum given a drift at the port, by alternating between the two."""
     alone = replace(seen, slow=seen.slow[..., :0])
 
-    def beside_nothing() -> NoiseSpectrum:
-        best = _searching(plain, pull, alone, None).colour_beside()
+    def without_drift_first() -> NoiseSpectrum:
+        best = _build_search(plain, prior_rows, alone, None).stationary_spectrum()
         for _ in range(_REFILLED):
-            found = _searching(best, pull, alone, None)
+            found = _build_search(best, prior_rows, alone, None)
             if found.filling.nothing:
                 break
-            best = found.colour_beside()
+            best = found.stationary_spectrum()
         return best
 
     if slow is None:
-        return _searching(beside_nothing(), pull, seen, None)
+        return _build_search(without_drift_first(), prior_rows, seen, None)
 
-    def beside_wander() -> NoiseSpectrum:
-        return _searching(plain, pull, seen, slow).colour_beside() if near is None else near
+    def with_drift_first() -> NoiseSpectrum:
+        return _build_search(plain, prior_rows, seen, slow).stationary_spectrum() if near is None else near
 
     def tried(spectrum: Callable[[], NoiseSpectrum]) -> LinearisedSearch:
-        return _searching(spectrum(), pull, seen, slow)
+        return _build_search(spectrum(), prior_rows, seen, slow)
 
-    def beyond_wander() -> NoiseSpectrum:
+    def at_high_frequencies() -> NoiseSpectrum:
         spread = (seen.slow.square() * slow.scales[0].square()).sum(-1)
-        return colour_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
+        return spectrum_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
 
-    # from the side of no wander, from that of no colour, and from where there is no wander: each could pass for another
-    colours = (beside_nothing, beside_wander, beyond_wander)
+    # spectrum and drift can imitate each other: start without a drift, with a white spectrum, and from high frequencies
+    colours = (without_drift_first, with_drift_first, at_high_frequencies)
     starts = shared([partial(tried, spectrum) for spectrum in colours], [slow, slow.tangents, slow.scales])
     best = max(starts, key=lambda found: found.evidence)
-    return replace(_settled(best), others=tuple(one for one in starts if one is not best))
+    return replace(_settled(best), others=tuple(start for start in starts if start is not best))
 
 
 def _settled(found: LinearisedSearch) -> LinearisedSearch:
-    """With the colour that alternating between it and the wander comes to.
+    """Alternate between spectrum and drift until convergence.
 
-    What stands in for rejected samples stays: it follows any colour, and would lead it on. The family of the wander
-    stays too until the colour has settled, and is asked for again then: each is decomposed anew for every colour.
+    The imputation of rejected samples stays fixed, because it follows any spectrum and would drive it on. The drift
+    family stays fixed until the spectrum has converged, because each new spectrum needs a decomposition per family.
     """
     tried: set[int] = set()
     while (drift := found.search.noise_fit(found.series)).gain > 0 and drift.family not in tried:
@@ -271,10 +286,10 @@ def _settled(found: LinearisedSearch) -> LinearisedSearch:
 
 def _settled_in(found: LinearisedSearch) -> LinearisedSearch:
     for _ in range(_ALTERNATIONS):
-        step = found.recoloured(found.colour_ahead())
+        step = found.under(found.overrelaxed_spectrum())
         if step.evidence <= found.evidence + _SETTLED:
-            # it may have gone too far, as the one that cannot has not
-            step = max(step, found.recoloured(found.colour_beside()), key=lambda one: one.evidence)
+            # the over-relaxed step may overshoot; fall back to the plain step
+            step = max(step, found.under(found.stationary_spectrum()), key=lambda candidate: candidate.evidence)
         if step.evidence <= found.evidence + _SETTLED:
             break
         found = step
@@ -282,19 +297,19 @@ def _settled_in(found: LinearisedSearch) -> LinearisedSearch:
 
 
 def _level(pseudo: Tensor) -> Tensor:
-    """Root mean square of each channel: noisy channels count for less from the start."""
+    """Root mean square of each channel, so that noisy channels have less weight from the start."""
     return pseudo.square().mean(0).sqrt().clamp(min=1e-300)
 
 
 @dataclass(frozen=True)
-class _Pull:
+class _PriorRows:
     """A Gaussian prior as rows below the whitened residuals."""
 
     root: Tensor  # (r, p)
     distance: Tensor  # (r,)
 
     @classmethod
-    def of(cls, model: JointModel, parameters: Tensor) -> _Pull:
+    def of(cls, model: JointModel, parameters: Tensor) -> _PriorRows:
         prior = model.prior
         if prior is None:
             return cls(parameters.new_zeros(0, len(parameters)), parameters.new_zeros(0))
@@ -305,12 +320,12 @@ class _Pull:
         return cls(root, root @ (parameters - prior.mean))
 
     def under(self, nuisance: Tensor, flat: Tensor) -> Tensor:
-        """The parameters' tangents, with rows on the scale of the residuals."""
+        """Return the parameters' tangents, with the prior's rows on the scale of the residuals."""
         return torch.cat([nuisance, flat.std() * self.root])
 
     def below(self, columns: Tensor) -> Tensor:
-        """Other tangents: the prior does not know of them."""
+        """Return other tangents, with zeros in the prior's rows."""
         return torch.cat([columns, columns.new_zeros(len(self.distance), columns.shape[-1])])
 
-    def beside(self, flat: Tensor) -> Tensor:
+    def appended(self, flat: Tensor) -> Tensor:
         return torch.cat([flat, flat.std() * self.distance])

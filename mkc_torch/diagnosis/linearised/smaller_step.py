@@ -17,18 +17,18 @@ MOVED_ERRORS = 0.5
 """Standard errors by which half the step has to move a parameter for the step to matter."""
 
 NEGLIGIBLE = 1e-3
-"""Share of every parameter below which a move is not compared with its standard error."""
+"""Relative change of every parameter below which the standard errors are not computed."""
 
 
 def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDynamics | None:
-    """The system with half the step, where that moves a parameter of the fit by more than half its standard error.
+    """Return the system with half the step if that moves a parameter by more than half its standard error.
 
     Args:
         fit: of a simulation with or without effects.
         settings: of the noise that standard errors are of.
 
     Returns:
-        None where the step does not matter, where the user set it, or where it is as small as it gets.
+        None if the step does not matter, if the user set it, or if it is the smallest.
     """
     known, model = fit.model.prepared, fit.model
     if not isinstance(known, PreparedDynamics):
@@ -41,10 +41,10 @@ def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDyna
     except NoFitError:
         return None
     move = (again.parameters - fit.parameters).abs()
-    # states at the start are no result
-    told = torch.ones_like(move, dtype=torch.bool)
-    told[model.base - known.beginnings : model.base] = False
-    if not bool((move > NEGLIGIBLE * fit.parameters.abs())[told].any()):
+    # initial states are not results
+    reported = torch.ones_like(move, dtype=torch.bool)
+    reported[model.base - known.beginnings : model.base] = False
+    if not bool((move > NEGLIGIBLE * fit.parameters.abs())[reported].any()):
         return None
     error = estimate(fit, settings).standard_error
-    return finer.observed(None) if bool((move > MOVED_ERRORS * error)[told].any()) else None
+    return finer.observed(None) if bool((move > MOVED_ERRORS * error)[reported].any()) else None

@@ -1,4 +1,4 @@
-"""Tangents of a residual: what it changes by with each parameter, each candidate and each slow course."""
+"""Tangents of a residual: its derivatives by each parameter, each candidate and each slow cosine."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["ModelTangents", "SlowBasis", "tangents_of"]
 
 @dataclass(frozen=True)
 class ModelTangents:
-    """How the residual moves.
+    """The tangents of a residual.
 
     Attributes:
-        nuisance: with the parameters, (N, m, p).
-        candidates: with each candidate's γ, (N, m, q); those of many samples are made when they are asked for.
-        pointwise: through each port whose samples are apart, (N, m, channels); of the others None.
-        slow: with slow courses at the port that wanders; None where none does.
+        nuisance: of the parameters, (N, m, p).
+        candidates: of each candidate's γ, (N, m, q); for long recordings computed on access.
+        pointwise: through each pointwise port, (N, m, channels); None for the other ports.
+        slow: of slow cosines at the port with a drift; None without such a port.
     """
 
     nuisance: Float[Tensor, "N m p"]
@@ -41,27 +41,27 @@ class ModelTangents:
 
     @property
     def parts(self) -> tuple[object, ...]:
-        """All that is large of it."""
+        """All large parts."""
         slow = () if self.slow is None else (self.slow.tangents, self.slow.scales)
         return (
             self.nuisance,
             *parts_of(self.candidates),
-            *(one for one in self.pointwise.values() if one is not None),
+            *(jacobian for jacobian in self.pointwise.values() if jacobian is not None),
             *slow,
         )
 
     @property
     def bare(self) -> ModelTangents:
-        """The same without candidates."""
+        """The tangents without candidates."""
         return replace(self, candidates=())
 
 
 @dataclass(frozen=True)
 class SlowBasis:
-    """Slow courses of a port's channels, and their standard deviations in each family of wander (F, k).
+    """Slow cosines of a port's channels, and their standard deviations in each drift family (F, k).
 
-    ``tangents`` are those of each waveform of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
-    channels, (N, m, c), which the courses modulate. Another family than the first has to gain ``walk_first`` nats more.
+    ``tangents`` are those of each cosine of each channel, (N, m, k); at a ``pointwise`` port those of the channels,
+    (N, m, c), which the cosines modulate. Another family than the first has to gain ``walk_first`` nats more.
     """
 
     port: str
@@ -73,49 +73,49 @@ class SlowBasis:
 
     @property
     def count(self) -> int:
-        """Courses of each channel."""
+        """Number of cosines per channel."""
         return self.scales.shape[1] // self.channels
 
     def transformed(self, counts: Float[Tensor, "N m"], kept: int) -> Float[Tensor, "K m k"]:
-        """The K slowest cosine coefficients of the tangents, where residuals count."""
+        """Return the K slowest cosine coefficients of the tangents at the samples that count."""
         moved = counts.unsqueeze(-1) * self.tangents
         return dct_of_courses(moved, self.count, kept) if self.pointwise else dct(moved, kept)
 
     def waveform(self, amplitudes: Float[Tensor, " k"]) -> Float[Tensor, "N m"]:
-        """What courses of these amplitudes add to the residual."""
+        """Return the residual's change by cosines of these amplitudes, (N, m)."""
         if not self.pointwise:
             return self.tangents @ amplitudes
         drift = course_of(amplitudes.unflatten(0, (-1, self.channels)), len(self.tangents))
         return torch.einsum("nmc,nc->nm", self.tangents, drift)
 
     def with_shares(self, shares: Float[Tensor, " c"]) -> SlowBasis:
-        """The same with so many times the variance in each channel."""
+        """Return the basis with the variance of each channel scaled."""
         return replace(self, scales=self.scales * shares.sqrt().repeat(self.scales.shape[1] // len(shares)))
 
     def of_family(self, number: int) -> SlowBasis:
-        """The same with one family of wander only."""
+        """Return the basis with one drift family only."""
         return replace(self, scales=self.scales[number : number + 1])
 
 
 def tangents_of(
     model: JointModel, parameters: Float[Tensor, " p"], settings: NoiseSettings, terms: Sequence[Term] = ()
 ) -> ModelTangents:
-    """The tangents at these parameters, by forward mode.
+    """Compute the tangents at these parameters, by forward mode.
 
     Args:
-        model, parameters: where.
-        settings: the families of wander.
+        model, parameters: where to linearise.
+        settings: the drift families.
         terms: candidates.
 
     Raises:
-        NoFitError: the residual has no finite slope by a parameter there.
+        NoFitError: the residual has no finite derivative by a parameter there.
     """
     prepared, model = model.prepared, model.around(parameters)
     pointwise = {
         name: port_jacobian(model, parameters, name) if port.pointwise else None
         for name, port in prepared.ports.items()
     }
-    independent = parameters.new_tensor([float(one) for one in prepared.independent])
+    independent = parameters.new_tensor([float(channel) for channel in prepared.independent])
     values = len(prepared.time) * len(prepared.independent)
     nuisance = forward_jacobian(model.residual, parameters, values)
     if not bool(nuisance.isfinite().all()):
@@ -126,7 +126,7 @@ def tangents_of(
         names = zip((*prepared.parameter_names, *effects), finite, strict=True)
         lost = dict.fromkeys(name for name, known in names if not known)
         raise NoFitError(
-            f"The simulation's outputs have no finite slope by {', '.join(lost)} at the fitted values. Bound "
+            f"The simulation's outputs have no finite derivative by {', '.join(lost)} at the fitted values. Bound "
             "these parameters, or start them elsewhere."
         )
     start = model.base
@@ -143,10 +143,10 @@ def _slow_courses(
 ) -> SlowBasis | None:
     N = len(model.prepared.time)
     count = min(settings.slow_courses, N // 10)
-    wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
-    if not wandering or count == 0:
+    drifting = [name for name, port in model.prepared.ports.items() if port.allows_drift]
+    if not drifting or count == 0:
         return None
-    name = wandering[0]
+    name = drifting[0]
     c = len(model.prepared.ports[name].channels)
     k = torch.arange(1, count + 1, dtype=parameters.dtype).repeat_interleave(c)
     others = ((1.0 + (k / corner).square()).reciprocal() + (walk / k).square() for corner, walk in settings.plateaus)

@@ -1,1 +1,1 @@
-"""A simulation with effects in it: terms, the grid of candidates, joint fits."""
+"""A simulation with effects: terms, the grid of candidates, joint fits."""

@@ -1,4 +1,4 @@
-"""Which columns of a recording can drive an effect, and what they are to it."""
+"""The columns of a recording that can drive an effect, and their roles."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 __all__ = ["ANY", "Driver", "Drivers", "find_drivers"]
 
 COPY = 1e-9
-"""Two columns whose correlation is nearer to ±1 than this are one driver."""
+"""Distance of a correlation from ±1 below which two columns are one driver."""
 
 ANY = "any"
-"""The role of a column whose role is not known."""
+"""The role of a column of unknown role."""
 
 _ROLE_OF_NAME: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature", "current": "current"}
 _ROLE_OF_UNIT: Mapping[str, str] = {"°C": "temperature", "K": "temperature", "A": "current"}
@@ -38,7 +38,7 @@ class Driver:
         values: (N, k), finite, less ``reference``.
         reference: (k,), the columns' means.
         units: of the columns.
-        copies: names of columns that are the same but for offset and gain.
+        copies: names of columns that are equal except for offset and gain.
     """
 
     columns: tuple[str, ...]
@@ -51,7 +51,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Drivers:
-    """The drivers of a recording, and sentences about columns that are none."""
+    """The drivers of a recording, and warnings about columns that cannot drive an effect."""
 
     drivers: tuple[Driver, ...]
     warnings: tuple[str, ...]
@@ -64,17 +64,18 @@ def find_drivers(
     roles: frozenset[str] = frozenset(),
     measured: frozenset[str] = frozenset(),
 ) -> Drivers:
-    """The drivers among a recording's columns.
+    """Return the drivers among a recording's columns.
 
     A column's role comes from its name (``temperature``, ``temp_imu``, ``current_2`` …) or its unit. Missing values
-    are filled from their neighbours in time; a few that are far from all others count as missing.
+    are filled from their neighbours in time; a few values far from all others count as missing.
 
     Args:
         recording: the samples in use.
         taken: columns that the simulation uses itself.
-        settings: what makes a column a driver, and a value a wild one.
-        roles: further roles, of a user's own effects: a column has one if its name is that or begins with it.
-        measured: columns that are compared with the simulation; what repeats one of them drives nothing.
+        settings: which columns are drivers, and which values count as missing.
+        roles: further roles, of a user's own effects: a column has such a role if its name is the role or begins with
+            it.
+        measured: columns that are compared with the simulation; a column that repeats one of them is no driver.
 
     Example:
         >>> ramp = torch.linspace(20.0, 30.0, 50)
@@ -112,7 +113,7 @@ def _driver(
 
 
 def role_of(name: str, unit: str) -> str:
-    """The role of a column by its name's first word, else by its unit.
+    """Return the role of a column by its name's first word, else by its unit.
 
     Example:
         >>> role_of("temperature", "°C"), role_of("esc_power", "A"), role_of("current_3", ""), role_of("rpm", "")
@@ -122,7 +123,7 @@ def role_of(name: str, unit: str) -> str:
 
 
 def _own_role(name: str, roles: frozenset[str]) -> str:
-    """The role of a user's effect that a column's name says; the longest, if several."""
+    """Return the longest role of a user's effects that the column's name begins with; empty if there is none."""
     fitting = [role for role in roles - {ANY, "position"} if (name == role or name.startswith(f"{role}_"))]
     return max(fitting, key=len, default="")
 
@@ -140,10 +141,10 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
     wild = _wild(values, settings)
     if bool(wild.any()):
         first, last = (f"{float(end):.6g}" for end in torch.aminmax(values[wild]))
-        told = first if first == last else f"between {first} and {last}"
+        values_text = first if first == last else f"between {first} and {last}"
         warnings.append(
-            f"Column `{name}` has {int(wild.sum())} value{'s' if int(wild.sum()) > 1 else ''} ({told}) far from all "
-            "others; they count as missing, and are filled from their neighbours in time."
+            f"Column `{name}` has {int(wild.sum())} value{'s' if int(wild.sum()) > 1 else ''} ({values_text}) far from "
+            "all others; they count as missing, and are filled from their neighbours in time."
         )
         values = _filled(values, ~wild)
     spread = float(values.amax() - values.amin())
@@ -153,7 +154,7 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
 
 
 def _wild(values: Float[Tensor, " N"], settings: DriverSettings) -> Bool[Tensor, " N"]:
-    """A few values that are far from all others and come alone, or are all the same: glitches, and codes for none."""
+    """Mark a few values far from all others that are short glitches, or all equal, as a code for "no value" is."""
     few = max(int(settings.wild_share * len(values)), 1)
     ordered = values.sort().values
     span = ordered[-1 - few] - ordered[few]
@@ -169,7 +170,7 @@ def _wild(values: Float[Tensor, " N"], settings: DriverSettings) -> Bool[Tensor,
 def _repeated(
     values: Float[Tensor, " N"], recording: Recording, measured: frozenset[str], settings: DriverSettings
 ) -> str | None:
-    """The measured column that these values are but for offset, gain and rounding."""
+    """Return the measured column that equals these values except for offset, gain and rounding, or None."""
     unit = _centred(values)
     for name in sorted(measured):
         if name in recording and bool(recording[name].isfinite().all()):
@@ -197,7 +198,7 @@ def _filled(values: Tensor, finite: Tensor) -> Tensor:
 def _singles(
     usable: Mapping[str, Tensor], units: Mapping[str, str], roles: Mapping[str, str], warnings: list[str]
 ) -> list[Driver]:
-    """One driver for each group of columns that are copies of one another; a known role goes before an unknown one."""
+    """Return one driver for each group of columns that are copies; a member with a known role represents it."""
     if not usable:
         return []
     names = sorted(usable, key=lambda name: roles[name] == ANY)
@@ -213,8 +214,10 @@ def _singles(
         done.update(group)
         copies = tuple(names[j] for j in group if j != i)
         if copies:
-            told = ", ".join(f"`{copy}`" for copy in copies)
-            warnings.append(f"Column `{name}` and {told} are copies of one another: this data cannot tell them apart.")
+            names_text = ", ".join(f"`{copy}`" for copy in copies)
+            warnings.append(
+                f"Column `{name}` and {names_text} are copies of one another: inseparable in this recording."
+            )
         drivers.append(_driver((name,), roles[name], usable[name].unsqueeze(-1), (units[name],), copies))
     order = {name: k for k, name in enumerate(usable)}
     return sorted(drivers, key=lambda d: order[d.columns[0]])

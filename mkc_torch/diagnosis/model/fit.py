@@ -18,19 +18,19 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "without_term"]
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_with_effect", "without_term"]
 
 _CLIP = 2.0
-"""Robust standard deviations at which residuals are clipped where a fit is only begun with them."""
+"""Robust standard deviations at which residuals are clipped for the start of a fit."""
 
 _WIDE = 1.2
-"""Robust standard deviations of the residual beyond which a scale is suspected to be that of another one."""
+"""Ratio of a scale to the residual's robust standard deviation above which the scale may belong to another optimum."""
 
 _NARROWER = 2
-"""Times that a fit with such a scale is begun again where it ended."""
+"""Restarts of a fit with such a scale from its own end."""
 
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
-"""Of the size that an effect begins with, tried one after the other where the simulation has no finite answer."""
+"""Shares of an effect's initial size to try in turn if the simulation has no finite result."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class FittedModel:
     """A joint model at its most likely parameters.
 
     Attributes:
-        model, parameters: what was fitted; the model begins with the answer at these parameters.
+        model, parameters: what was fitted; the model holds the trajectory at these parameters as its start.
         sigma, d, bound: (m,) of the MKC density.
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
-        converged: whether another step would bring nothing.
+        converged: whether the iteration has converged.
     """
 
     model: JointModel
@@ -56,7 +56,7 @@ class FittedModel:
     converged: bool
 
     def pseudo(self, settings: NoiseSettings) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
-        """The pseudo-residual, and 1 where it counts."""
+        """Return the pseudo-residual and its mask, (N, m) each."""
         return pseudo_residual(self.residual, self.sigma, self.d, settings.rejected_below)
 
 
@@ -67,28 +67,28 @@ def fitted(
     *,
     rows: Float[Tensor, " N"] | None = None,
     graduate: bool = True,
-    anew: bool = False,
+    fresh: bool = False,
 ) -> FittedModel:
-    """The most likely parameters of a joint model.
-
-    Raises:
-        NoFitError: the simulation has no finite answer where the fit begins, or none where it ends.
+    """Fit a joint model by maximum likelihood.
 
     Args:
         model: a simulation with effects.
-        start: where to begin.
+        start: initial parameters.
         bound: half-width of the density's domain; None for the rule of :func:`mkc_torch.nonlinear.fit`.
-        rows: weights of the samples; 0 leaves one out.
-        graduate: False for a start near the answer.
-        anew: True to search a trajectory without the one that the model knows, where there is no answer near that one:
-            it may be of another noise. That takes long.
+        rows: weights of the samples; 0 leaves a sample out.
+        graduate: False for a start near the solution.
+        fresh: True to also search for a trajectory without the model's own as the start, if there is none near that:
+            it may belong to another noise model. This is slow.
+
+    Raises:
+        NoFitError: the simulation has no finite result at the start or at the end of the fit.
     """
-    found = _fit(*_begun(model, start, anew=anew), bound, rows, graduate=graduate)
+    found = _fit(*_finite_start(model, start, fresh=fresh), bound, rows, graduate=graduate)
     for _ in range(_NARROWER):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
             break
-        # a scale that suited the residuals where the fit began can hold on beside one that suits those of its end
+        # a scale that fits the initial residuals can remain a local optimum
         again = _fit(found.model, found.parameters, found.bound, rows, graduate=False)
         if not again.log_likelihood > found.log_likelihood:
             break
@@ -123,7 +123,7 @@ def _fit(
     there = model.begun_with(way.near(found.theta))
     residual = there.residual(found.theta).detach()
     if not bool((residual if rows is None else residual[rows > 0]).isfinite().all()):
-        raise nonlinear.NoFitError("A trajectory that was found on the way of the fit is lost again in its end.")
+        raise nonlinear.NoFitError("The simulation has no finite trajectory at the end of the fit.")
     return FittedModel(
         there,
         found.theta,
@@ -137,10 +137,10 @@ def _fit(
     )
 
 
-def fitted_beside(
+def fitted_with_effect(
     base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True
 ) -> FittedModel:
-    """A model with one more effect on the domain of a fit without it; that fit, where the effect has no answer."""
+    """Fit a model with one more effect on the domain of a fit without it; return the latter if this fails."""
     try:
         return fitted(model, start, base.bound, graduate=graduate)
     except nonlinear.NoFitError:
@@ -149,28 +149,30 @@ def fitted_beside(
 
 
 def without_term(fit: FittedModel, number: int) -> FittedModel:
-    """The simulation with all effects of a fit but one, as a start for fits: at its parameters, not fitted anew."""
+    """Return the fit without one effect, at the same parameters, as a start for further fits."""
     model, place = fit.model, fit.model.base + sum(fit.model.sizes[:number])
     left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]), model.near)
     parameters = torch.cat([fit.parameters[:place], fit.parameters[place + model.sizes[number] :]])
     return replace(fit, model=left, parameters=parameters)
 
 
-def _begun(model: JointModel, start: Float[Tensor, " p"], *, anew: bool) -> tuple[JointModel, Float[Tensor, " p"]]:
-    """A model and a start at which it has a finite answer, where there are any; effects are made smaller for that."""
-    anew = anew and model.near is not None
-    if not model.terms and not anew:
+def _finite_start(
+    model: JointModel, start: Float[Tensor, " p"], *, fresh: bool
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """Return a model and a start with a finite result, if there are any; effects are scaled down if necessary."""
+    fresh = fresh and model.near is not None
+    if not model.terms and not fresh:
         return model, start
     for share in _SHARES if model.terms else (1.0,):
         smaller = torch.cat([start[: model.base], share * start[model.base :]])
-        for one in (model, model.begun_with(None)) if anew and share == 1.0 else (model,):
-            if bool(one.residual(smaller).isfinite().all()):
-                return one, smaller
+        for variant in (model, model.begun_with(None)) if fresh and share == 1.0 else (model,):
+            if bool(variant.residual(smaller).isfinite().all()):
+                return variant, smaller
     return model, start
 
 
 def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
-    """Pseudo-residual of Huber's score at two robust scales: what a redescending score takes for outliers still counts.
+    """Return the pseudo-residual of Huber's score at two robust scales, and its mask: no sample is rejected.
 
     Huber, "Robust Statistics" (1981), 7.6.
     """

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 __all__ = ["candidate_terms", "described", "finer", "reach_of", "within_a_sample"]
 
 _STEPS = 8
-"""Values of a shape's number to either side of the present one, and what its range is divided by each round."""
+"""Grid points of a shape number to either side of its value, and the factor by which its range shrinks each round."""
 
 
 def candidate_terms(
     prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
 ) -> tuple[Term, ...]:
-    """Each effect that has its port in the simulation, with each driver of its roles and each shape of its grid."""
+    """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid."""
     terms = []
     for effect in effects:
         places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
-        # a role that is known says what the column does; an effect of unknown roles takes what is left over
+        # an effect without roles, or with an optional driver, is also tried without a driver
         alone = not effect.roles or effect.driver_optional
         fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
         shapes = effect.shapes(prepared.time)
@@ -45,7 +45,7 @@ def candidate_terms(
 
 
 def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:
-    """Whether a candidate says no more than what an input does between two samples."""
+    """Whether a candidate only changes what an input does between two samples."""
     inside = prepared.time.diff()
     step = float(inside[inside > 0].median()) if bool((inside > 0).any()) else 0.0
     return term.effect.within_a_sample(term.shape, step)
@@ -58,7 +58,7 @@ def _fits(effect: Effect, name: str, port: Port) -> bool:
 
 
 def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:
-    """A shape in units, of one in shares of what passes through the port or of what drives the effect."""
+    """Return a shape in units, from shares of the signal at the port or of the driver."""
     if not effect.relative:
         return shape
     known = dict(port.sizes)
@@ -69,10 +69,10 @@ def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = N
 
 
 def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float, float]]:
-    """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ.
+    """Return the lower and upper limits, in units, of the numbers of a shape that are fitted together with γ.
 
     Raises:
-        ValueError: the effect names a number that its shape does not have, or a range with nothing in it.
+        ValueError: the effect names a number that its shape does not have, or an empty range.
     """
     if not term.effect.fitted_shape:
         return {}
@@ -81,28 +81,28 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
         if name not in term.shape or not low < high:
             raise ValueError(
                 f"Expected `fitted_shape` of {term.effect.id} to hold numbers of its shape ({', '.join(term.shape)}) "
-                f"with a least and a greater value but got `{name}`: ({low}, {high}); mend it or "
+                f"with a lower and a greater upper limit but got `{name}`: ({low}, {high}); correct it or "
                 "leave it out."
             )
     of_length, length = term.effect.continuous, float(prepared.time[-1] - prepared.time[0])
     ends = [
         absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port, term.driver) for k in (0, 1)
     ]
-    least, most = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
-    return {name: (least[name], most[name]) for name in reach}
+    lower, upper = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
+    return {name: (lower[name], upper[name]) for name in reach}
 
 
 def _drives(driver: Driver, effect: Effect) -> bool:
-    """Whether a driver has one of an effect's roles; a curve without a name follows any one column."""
+    """Whether a driver has one of an effect's roles; a curve without a name accepts any single column."""
     return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
 
 
 def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:
-    """The same effect with one number of its shape varied: over an eighth of its range to either side, then ever less.
+    """Return the effect with one number of its shape varied, over 1/8 of its range either way, less in later rounds.
 
     Args:
         term: the effect.
-        name: of the number, one of those that the effect calls continuous.
+        name: of the number, one of the effect's continuous numbers.
         time: of the recording.
         rounds: how often the range was narrowed before.
     """
@@ -115,13 +115,13 @@ def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tupl
 
 
 def described(effect: Effect, shape: Shape) -> str:
-    """The numbers of a shape that are told, as a user reads them.
+    """Return the reported numbers of a shape as text.
 
     Example:
         >>> from mkc_torch.effects.sensor.offset_drift import OffsetDrift
         >>> described(OffsetDrift(), {"middle": 12.345, "width": 0.5})
         'middle 12.35 s, width 0.5 s'
     """
-    told = {name: value for name, value in shape.items() if effect.reports(name)}
-    units = {name: effect.shape_units.get(name, "") for name in told}
-    return ", ".join(f"{name.replace('_', ' ')} {value:.4g} {units[name]}".rstrip() for name, value in told.items())
+    numbers = {name: value for name, value in shape.items() if effect.reports(name)}
+    units = {name: effect.shape_units.get(name, "") for name in numbers}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g} {units[name]}".rstrip() for name, value in numbers.items())

@@ -1,4 +1,4 @@
-"""A simulation together with the effects found so far: one vector of parameters, one residual."""
+"""A simulation together with effects: a joint parameter vector and a joint residual."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch._support.forward_mode import forward_jacobian
+from mkc_torch._support.forward_mode import forward_jacobian, make_dual
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
-from mkc_torch.nonlinear import GaussianPrior, make_dual
+from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
 from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["JointModel", "directions", "in_order_of_the_chain", "port_jacobian", "summed", "through_port"]
 
 _CHUNK = 64
-"""Courses whose effect on the residual is computed together."""
+"""Number of changes at a port whose tangents are computed together."""
 
 
 class JointModel:
@@ -34,8 +34,8 @@ class JointModel:
 
     Args:
         prepared: the simulation of the recording.
-        terms: the effects in it.
-        near: an answer of the simulation that its answers here are near; what is computed begins with it.
+        terms: its effects.
+        near: a nearby result of the simulation, as the start of its computation.
     """
 
     def __init__(self, prepared: PreparedSimulation, terms: Sequence[Term] = (), near: Nearby | None = None) -> None:
@@ -53,10 +53,10 @@ class JointModel:
 
     @property
     def prior(self) -> GaussianPrior | None:
-        """The simulation's own, padded: nothing is known of effects beforehand."""
+        """The simulation's prior, padded with zero precision for the effects."""
         settled = self._settled
         prepared = self.prepared
-        known = prepared.prior_beside(settled) if settled and isinstance(prepared, Clocked) else prepared.prior
+        known = prepared.prior_given(settled) if settled and isinstance(prepared, Clocked) else prepared.prior
         if known is None or not self.terms:
             return known
         more = known.mean.new_zeros(self.size - self.base)
@@ -67,7 +67,7 @@ class JointModel:
 
     @property
     def _settled(self) -> frozenset[str]:
-        """Parts of the clocks that effects settle: each that those which act on all channels have together."""
+        """Parts of the clocks that effects determine: a part counts if effects on all channels determine it."""
         parts: dict[str, set[str]] = {}
         for term in self.terms:
             for part in term.effect.settles:
@@ -75,29 +75,30 @@ class JointModel:
         return frozenset(part for part, channels in parts.items() if channels >= set(self.prepared.channels))
 
     def gammas(self, parameters: Float[Tensor, " p"]) -> tuple[Tensor, ...]:
-        """Of the effects, in their order."""
+        """Return γ of each effect."""
         return torch.split(parameters[self.base :], list(self.sizes)) if self.terms else ()
 
     @property
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
-        """Least and greatest values; None if all are free."""
+        """Lower and upper limits of the parameters; None if all are free."""
         known = self.prepared.bounds
         reach = [(term.effect.lower, term.effect.upper) for term in self.terms]
-        if known is None and all(one == (-torch.inf, torch.inf) for one in reach):
+        if known is None and all(limits == (-torch.inf, torch.inf) for limits in reach):
             return None
         free = self.prepared.time.new_full((self.base,), torch.inf)
         low, high = (-free, free) if known is None else known
-        least, most = (
-            [free.new_full((size,), one[side]) for one, size in zip(reach, self.sizes, strict=True)] for side in (0, 1)
+        lower, upper = (
+            [free.new_full((size,), ends[side]) for ends, size in zip(reach, self.sizes, strict=True)]
+            for side in (0, 1)
         )
-        return torch.cat([low, *least]), torch.cat([high, *most])
+        return torch.cat([low, *lower]), torch.cat([high, *upper])
 
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
-        """What the effects add at each port."""
+        """Return the sum of the effects' changes at each port."""
         return self._changes_of(range(len(self.terms)), parameters)
 
     def _changes_of(self, numbers: Sequence[int], parameters: Tensor) -> dict[str, Change]:
-        """What some of the effects add at each port."""
+        """Return the sum of some effects' changes at each port."""
         total: dict[str, Change] = {}
         gammas, ports = self.gammas(parameters), self.prepared.ports
         for number in in_order_of_the_chain(self.terms, numbers):
@@ -115,22 +116,22 @@ class JointModel:
 
     @cached_property
     def _courses(self) -> tuple[Callable[[Tensor], Tensor] | None, ...]:
-        """What each effect adds as a function of γ alone; None where it is more than a sum of known courses."""
+        """Each effect's change as a function of γ alone; None for an effect that is not a sum of known courses."""
         return tuple(
             None if follows else courses_of(term, term.context(self.prepared, None))
             for term, follows in zip(self.terms, self._follow, strict=True)
         )
 
     def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
-        """What passes through each port, with the effects in it."""
+        """Return the signal at each port, with the effects."""
         return self.prepared.signals(parameters[: self.base], self.changes(parameters), self.near)
 
     def signals_before(self, parameters: Float[Tensor, " p"], keys: Collection[Key]) -> Mapping[str, Tensor]:
-        """What passes through each port where the next effect would act: behind the effects in series there.
+        """Return the signal at each port that a further effect would receive: after the effects in series there.
 
         Args:
             parameters: of the model.
-            keys: of candidates, which count as not yet there.
+            keys: of candidates whose own terms in the model are ignored.
         """
         signals = dict(self.signals(parameters))
         ahead = [k for k, t in enumerate(self.terms) if t.key not in keys and t.port in signals]
@@ -140,11 +141,11 @@ class JointModel:
         return signals
 
     def residual(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
-        """Recording less prediction."""
+        """Return recording less prediction."""
         return self.answer(parameters).residual
 
     def answer(self, parameters: Float[Tensor, " p"]) -> Answer:
-        """The residual, and what one nearby begins with."""
+        """Return the residual, and the nearby result that further computations start from."""
         check_deadline()
         compiled = self._compiled if is_plain(parameters) else None
         found = None if compiled is None else compiled.answer(parameters, self.near)
@@ -152,30 +153,32 @@ class JointModel:
             return found
         return self.prepared.answer(parameters[: self.base], self.changes(parameters), self.near)
 
-    def pushed(self, parameters: Float[Tensor, " p"], port: str, change: Float[Tensor, "N c"]) -> Float[Tensor, "N m"]:
-        """The residual with a change at a port that does not depend on its signal."""
+    def residual_with_change(
+        self, parameters: Float[Tensor, " p"], port: str, change: Float[Tensor, "N c"]
+    ) -> Float[Tensor, "N m"]:
+        """Return the residual with an added change at a port that does not depend on its signal."""
         check_deadline()
         changes = self.changes(parameters)
         added = {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
         return self.prepared.answer(parameters[: self.base], added, self.near).residual
 
     def around(self, parameters: Float[Tensor, " p"]) -> JointModel:
-        """The same, for derivatives at these parameters: with the answer there, linearised, to begin with."""
+        """Return the model with the linearised result at these parameters as its start, for derivatives there."""
         nearby = self.answer(parameters).nearby
         return self if nearby is None else self.begun_with(nearby)
 
     def begun_with(self, near: Nearby | None) -> JointModel:
-        """The same with another answer to begin with."""
+        """Return the model with another nearby result as its start."""
         other = copy.copy(self)
-        vars(other).update(vars(self), near=near)  # the compiled residual too
+        vars(other).update(vars(self), near=near)  # keeps the compiled residual
         return other
 
     def continuation(self) -> Continuation:
-        """The residual for one fit, on whose way each answer begins with the one before."""
+        """Return the residual for one fit, in which each evaluation starts from the previous result."""
         return Continuation(self.prepared, self._meaning, self.near, lambda: self._compiled)
 
     def _meaning(self, parameters: Tensor) -> tuple[Tensor, dict[str, Change]]:
-        """The simulation's own parameters, and what the effects add at each port."""
+        """Return the simulation's own parameters, and the effects' changes at each port."""
         return parameters[: self.base], self.changes(parameters)
 
     @cached_property
@@ -183,29 +186,29 @@ class JointModel:
         return compiled_residual(self.prepared, self._meaning, self.size)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the compiled residual, which another process compiles again."""
+        """Leave out the compiled residual; another process compiles it again."""
         return {name: value for name, value in vars(self).items() if name != "_compiled"}
 
     def with_term(self, term: Term) -> JointModel:
         return JointModel(self.prepared, (*self.terms, term), self.near)
 
     def with_last(self, term: Term) -> JointModel:
-        """The same with another term in the place of the last one."""
+        """Return the model with another term in place of the last."""
         return JointModel(self.prepared, (*self.terms[:-1], term), self.near)
 
     def with_shape(self, shape: Shape) -> JointModel:
-        """The same with another shape of the last effect."""
+        """Return the model with another shape of the last effect."""
         return self.with_last(replace(self.terms[-1], shape=shape))
 
 
 def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str) -> Float[Tensor, "N m c"]:
-    """How the residual of each sample changes with what enters at a pointwise port, by forward mode."""
+    """Return the derivative of each sample's residual by the signal at a pointwise port, by forward mode."""
     known = model.prepared.ports[port]
     N = len(model.prepared.time)
     zero = parameters.new_zeros(N, len(known.channels))
 
     def residual(change: Tensor) -> Tensor:
-        return model.pushed(make_dual(parameters, change[0, 0]), port, change)
+        return model.residual_with_change(make_dual(parameters, change[0, 0]), port, change)
 
     columns = []
     for k in range(len(known.channels)):
@@ -216,10 +219,10 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
 
 
 def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | None:
-    """A function of γ that is an effect's change, for one that adds courses of its own; None of any other."""
+    """Return the effect's change as a function of γ if it is a sum of known courses; otherwise None."""
     if term.effect.has_basis:
         return partial(combined, term.effect.basis(term.shape, context))
-    if term.effect.has_course:
+    if term.effect.has_waveform:
         return partial(gained, term.effect.waveform(term.shape, context))
     return None
 
@@ -229,23 +232,23 @@ def _constant(added: Float[Tensor, "N c"]) -> Change:
 
 
 def in_order_of_the_chain(terms: Sequence[Term], numbers: Iterable[int]) -> list[int]:
-    """Numbers of terms in the order in which effects in series act: those with memory before those without.
+    """Return numbers of terms in the order in which effects in series act: effects with memory come first.
 
-    A motor's lag comes before the square by which its propeller pulls; delays, lags and play commute.
+    A motor's lag comes before the square law of its propeller; delays, lags and backlash commute.
     """
     return sorted(numbers, key=lambda number: not terms[number].effect.remembers)
 
 
-def summed(one: Change | None, other: Change, *, series: bool = False) -> Change:
-    """Two changes at one port: side by side, or in ``series``, the second of the signal that the first one changed."""
-    if one is None:
+def summed(previous: Change | None, other: Change, *, series: bool = False) -> Change:
+    """Return two changes at one port: in parallel, or in ``series``, the second on the output of the first."""
+    if previous is None:
         return other
-    first = one
+    first = previous
 
     def both(signal: Tensor) -> Tensor:
         added = first(signal)
         more = other(signal + added if series else signal)
-        # the rate of a memory, where only one of them has it, comes last
+        # the last column is the rate of a memory, if only one change has it
         width = max(added.shape[1], more.shape[1])
         return _widened(added, width) + _widened(more, width)
 
@@ -253,18 +256,18 @@ def summed(one: Change | None, other: Change, *, series: bool = False) -> Change
 
 
 def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
-    """With zeros beside it."""
+    """Append columns of zeros."""
     if added.shape[1] == width:
         return added
     return torch.cat([added, added.new_zeros(len(added), width - added.shape[1])], -1)
 
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
-    """How an effect's change at its port grows with γ at γ = 0, by forward mode where the effect does not say."""
+    """Return the derivative of an effect's change at its port by γ at γ = 0, by forward mode if it is not given."""
     if term.effect.has_basis:
         return term.effect.basis(term.shape, context)
-    if term.effect.has_course:
-        # a gain on a course: the derivative is the course, channel by channel
+    if term.effect.has_waveform:
+        # a gain of a waveform: the derivative is the waveform, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
         return term.effect.waveform(term.shape, context)[:, None, None] * eye
 
@@ -281,13 +284,15 @@ def through_port(
     courses: Float[Tensor, "N c q"],
     pointwise: Float[Tensor, "N m c"] | None,
 ) -> Float[Tensor, "N m q"]:
-    """Residual tangents of changes at a port; by the pointwise Jacobian where there is one, else by forward mode."""
+    """Return residual tangents of changes at a port, by the pointwise Jacobian if given, else by forward mode."""
     if pointwise is not None:
         return torch.einsum("nmc,ncq->nmq", pointwise, courses)
     zero = torch.zeros_like(courses[..., 0])
 
-    def push(direction: Tensor) -> Tensor:
-        return torch.func.jvp(lambda change: model.pushed(parameters, port, change), (zero,), (direction,))[1]
+    def tangent(direction: Tensor) -> Tensor:
+        return torch.func.jvp(
+            lambda change: model.residual_with_change(parameters, port, change), (zero,), (direction,)
+        )[1]
 
-    # where nothing follows the change, torch takes an out_dims of -1 for a place in memory
-    return torch.vmap(push, in_dims=-1, chunk_size=_CHUNK)(courses).movedim(0, -1)
+    # out_dims=-1 fails in torch if nothing depends on the change
+    return torch.vmap(tangent, in_dims=-1, chunk_size=_CHUNK)(courses).movedim(0, -1)

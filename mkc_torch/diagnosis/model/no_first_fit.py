@@ -1,4 +1,4 @@
-"""Why a simulation has no first fit, in words."""
+"""The error message for a simulation without a first fit."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ __all__ = ["no_first_fit"]
 
 
 def no_first_fit(prepared: PreparedSimulation, others: OtherStarts | None = None) -> str:
-    """What is off, what was tried and what to change, in sentences.
+    """Return sentences: what is wrong, what was tried and what to change.
 
     Args:
         prepared: the simulation.
-        others: the starts that were tried beside the first ones; None for a simulation without states.
+        others: the further starts that were tried; None for a simulation without states.
     """
     where = f"{prepared.recording.name}: " if prepared.recording.name else ""
     outputs = ", ".join(f"`{name}`" for name in prepared.channels)
     if others is None:
         return (
-            f"{where}no fit of {prepared.name} to {outputs} begins with the values that its parameters are given: what "
-            "it computes is too far from the recording, or not finite nearby. Give values nearer to the system's own, "
-            "and check units and signs."
+            f"{where}no fit of {prepared.name} to {outputs} succeeds from the given parameter values: its output is "
+            "too far from the recording, or not finite nearby. Give values nearer to the system's own, and check "
+            "units and signs."
         )
     return " ".join(
         [
             f"{where}no fit of {prepared.name} to {outputs} was found.",
             *_lost(others),
-            f"Tried: the values given, those with which the measured states obey the equations, {others.tried} starts "
-            "between and around them (each parameter of the other sign, 0, and 3 to 30 times smaller or larger), and "
-            "predictions over a few samples only.",
+            f"Tried: the given values, values with which the measured states obey the equations, {others.tried} starts "
+            "between and around them (each parameter with the other sign, 0, and 3 to 30 times smaller or larger), "
+            "and predictions over a few samples only.",
             f"Check the sign and the unit of {_what(others)} in `derivative`; or give a value nearer to the system's "
             "own, or limits, Parameter(value, lower=..., upper=...), within which the simulation stays finite.",
         ]
@@ -37,13 +37,13 @@ def no_first_fit(prepared: PreparedSimulation, others: OtherStarts | None = None
 
 
 def _lost(others: OtherStarts) -> list[str]:
-    """How the run with the user's values is lost."""
+    """Describe how the simulation diverges with the user's values."""
     if not others.output:
         return []
     if others.until <= 0.0:
-        first = f"With the values given, the equations have no finite solution: `{others.output}` is lost at once."
+        first = f"With the given values, the equations have no finite solution: `{others.output}` diverges at once."
     else:
-        first = f"With the values given, `{others.output}` grows beyond all numbers within {others.until:.4g} s."
+        first = f"With the given values, `{others.output}` diverges within {others.until:.4g} s."
     if not others.parameter:
         return [f"{first} No change of a single parameter keeps it finite for longer."]
     lasts = "throughout" if others.lasts == float("inf") else f"for {others.lasts:.4g} s"

@@ -1,4 +1,4 @@
-"""Works near a simulation, on all cores that may be used."""
+"""Parallel work on a simulation, on all available cores."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ T = TypeVar("T")
 def run_parallel(
     works: Sequence[Callable[[], T]], prepared: PreparedSimulation, terms: Sequence[Term] = (), thing: str = ""
 ) -> list[T]:
-    """The results of works, in their order.
+    """Return the results of functions, in their order.
 
     Args:
-        works: none needs what another one leaves behind.
+        works: independent functions.
         prepared, terms: a simulation and effects that results may hold.
-        thing: name of what each work is about, where progress counts them.
+        thing: name of the items that progress counts.
     """
     return shared(works, common_parts(prepared, terms), thing)
 
 
 def common_parts(prepared: PreparedSimulation, terms: Sequence[Term]) -> list[object]:
-    """What every process has of a simulation and its effects, and need not be sent."""
+    """Return the parts of a simulation and its effects that every process holds and that need not be sent."""
     return [prepared, *(part for term in terms for part in (term.effect, term.driver) if part is not None)]

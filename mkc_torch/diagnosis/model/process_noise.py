@@ -1,4 +1,4 @@
-"""A simulation with its effects under the likeliest noise of the world: pushes of its states beside its sensors'."""
+"""A simulation with its effects under its most likely noise: process noise of its states, and its sensors' noise."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, strongly_observed
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, likeliest_noise, noise_of
+from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, most_likely_noise, noise_of
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -42,33 +42,33 @@ __all__ = [
 ]
 
 _ROUNDS = 2
-"""Times that the noise is sought along a trajectory and the parameters are fitted under it."""
+"""Rounds of estimating the noise along a trajectory and fitting the parameters under it."""
 
 _FIRST = 3
-"""Samples, for each state, that a run's first states are known by."""
+"""Samples per state that determine a run's initial states."""
 
 _OTHER_STARTS = 3
-"""Further starts that fits are made from, where the first ones fail."""
+"""Number of further starts for fits, if the first starts fail."""
 
 _NOTHING = 0.05
-"""Share of the outputs' variation up to which a first fit explains nothing."""
+"""Explained share of the outputs' variation up to which a first fit is poor."""
 
 _ROOM = 3.0
-"""Robust standard deviations of the residual that a domain holds at least."""
+"""Smallest half-width of a domain, in robust standard deviations of the residual."""
 
 _STRONG = 10.0
-"""Size of the pushes that a first observer is for, over that at which they move an output by its noise."""
+"""Process noise assumed by a first observer, relative to that which moves an output by its noise."""
 
 
 @dataclass(frozen=True)
 class ProcessNoiseFit:
-    """A joint model, fitted.
+    """A fitted joint model, open loop and under its most likely noise.
 
     Attributes:
-        free: as it runs freely; None where that run loses the recording, or where there is no fit.
-        fit: under the likeliest noise; the same as ``free`` where the sensors' white noise is enough.
-        noise: that noise; None of a simulation that has no states to be pushed.
-        starts: from which a first fit was tried.
+        free: the open-loop fit; None if it loses the recording, or could not be fitted.
+        fit: the fit under the most likely noise; the same as ``free`` if the sensors' white noise is enough.
+        noise: that noise; None for a simulation without states.
+        starts: number of starting points of the first fit.
     """
 
     free: FittedModel | None
@@ -77,23 +77,23 @@ class ProcessNoiseFit:
     starts: int = 1
 
     @property
-    def pushed(self) -> bool:
-        """Whether more than the sensors' white noise is in it."""
+    def has_disturbances(self) -> bool:
+        """Whether the noise contains more than the sensors' white noise."""
         return self.noise is not None and self.noise.observer is not None
 
     @property
-    def pushes(self) -> int:
-        """How many disturbances are in it."""
-        return 0 if self.noise is None else len(self.noise.disturbed.disturbances)
+    def disturbance_count(self) -> int:
+        """Number of disturbances in the noise."""
+        return 0 if self.noise is None else len(self.noise.selected.disturbances)
 
 
 def open_loop(prepared: PreparedSimulation) -> PreparedSimulation:
-    """The simulation as it runs freely."""
+    """Return the simulation in open loop."""
     return prepared.observed(None) if isinstance(prepared, PreparedDynamics) else prepared
 
 
 def first_samples(prepared: PreparedSimulation) -> Tensor | None:
-    """The samples that a run's first states are known by; None where none are asked for."""
+    """Mask the samples that determine a run's initial states; None for a simulation without states."""
     if not isinstance(prepared, PreparedDynamics):
         return None
     index = torch.arange(len(prepared.time))
@@ -101,8 +101,8 @@ def first_samples(prepared: PreparedSimulation) -> Tensor | None:
     return index - first < _FIRST * len(prepared.system.states)
 
 
-def with_noise_of_fit(fit: FittedModel) -> bool:
-    """Whether a fit is under more noise than the sensors' white one."""
+def has_process_noise(fit: FittedModel) -> bool:
+    """Whether a fit is under more noise than the sensors' white noise."""
     prepared = fit.model.prepared
     return isinstance(prepared, PreparedDynamics) and prepared.observer is not None
 
@@ -113,27 +113,27 @@ def estimate_noise(
     settings: NoiseSettings,
     known: StateSpaceNoise | None = None,
 ) -> StateSpaceNoise | None:
-    """The likeliest noise along a fit's trajectory; None where there is no trajectory, or are no states.
+    """Return the most likely noise along a fit's trajectory; None without a trajectory or without states.
 
     Args:
-        fit: along whose trajectory.
-        declared: standard deviation of the white noise of outputs that it is known of.
+        fit: its trajectory is used.
+        declared: known standard deviations of the outputs' white noise.
         settings: of the noise.
-        known: a noise nearby, whose disturbances are given their sizes; None to seek them.
+        known: a similar noise, whose disturbances only get new sizes; None to select the disturbances.
     """
     prepared, model = fit.model.prepared, fit.model
     if not isinstance(prepared, PreparedDynamics):
         return None
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
-    return likeliest_noise(
+    return most_likely_noise(
         prepared,
         theta,
         changes,
         model.near,
         declared=declared,
-        least=settings.pushed,
-        most=settings.pushes,
-        known=None if known is None else known.disturbed,
+        least=settings.disturbance_gain,
+        most=settings.max_disturbances,
+        known=None if known is None else known.selected,
     )
 
 
@@ -143,13 +143,13 @@ def fit_baseline(
     settings: NoiseSettings,
     keep: Callable[[ProcessNoiseFit], object] = lambda _: None,
 ) -> ProcessNoiseFit:
-    """The simulation alone, from as many starts as it takes to trust its first fit.
+    """Fit the simulation without effects, from as many starts as a reliable first fit needs.
 
-    Where fits from the first starts fail or explain nothing, others between and around the user's values are tried,
-    and shorter horizons. ``keep`` is called with the first fit, before its noise is known.
+    If fits from the first starts fail or explain nothing, starts between and around the user's values are tried, and
+    shorter horizons. ``keep`` is called with the first fit, before its noise is known.
 
     Raises:
-        NoFitError: no start has a finite answer; the message says in words what was tried.
+        NoFitError: no start has a finite result; the message lists what was tried.
     """
     model, starts = JointModel(prepared), [prepared.start()]
     if not isinstance(prepared, PreparedDynamics):
@@ -159,38 +159,42 @@ def fit_baseline(
             raise NoFitError(no_first_fit(prepared)) from error
     short = multiple_shooting_start(prepared, prepared.given)
     starts += [] if short is None else [short]
-    free = _likeliest_free(model, starts)
+    free = _best_open_loop(model, starts)
     if free is not None:
         keep(ProcessNoiseFit(free, free, None, len(starts)))
     if free is not None and _explains(free):
-        return fit_with_process_noise(_wider(free, settings), declared, settings, beside=starts[1:], model=model)
+        return fit_with_process_noise(
+            _wider(free, settings), declared, settings, further_starts=starts[1:], model=model
+        )
     others = other_starts(prepared, starts[0], _OTHER_STARTS)
-    works = [partial(multiple_shooting_start, prepared, one, shortest=True) for one in (prepared.given, *others.starts)]
-    further = [one for one in run_parallel(works, prepared) if one is not None]
-    more = [one for one in (free, _likeliest_free(model, [*others.starts, *further])) if one is not None]
-    free = _wider(max(more, key=lambda one: one.log_likelihood), settings) if more else None
+    works = [
+        partial(multiple_shooting_start, prepared, start, shortest=True) for start in (prepared.given, *others.starts)
+    ]
+    further = [start for start in run_parallel(works, prepared) if start is not None]
+    more = [fit for fit in (free, _best_open_loop(model, [*others.starts, *further])) if fit is not None]
+    free = _wider(max(more, key=lambda fit: fit.log_likelihood), settings) if more else None
     try:
-        found = fit_with_process_noise(free, declared, settings, beside=[*starts[1:], *further], model=model)
+        found = fit_with_process_noise(free, declared, settings, further_starts=[*starts[1:], *further], model=model)
     except NoFitError as error:
         raise NoFitError(no_first_fit(prepared, others)) from error
     return replace(found, starts=len(starts) + others.tried + len(further))
 
 
-def _likeliest_free(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) -> FittedModel | None:
-    """The likeliest fit of the free run from several starts; None where it has no finite answer from any of them."""
+def _best_open_loop(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) -> FittedModel | None:
+    """Return the most likely open-loop fit from several starts; None if it is finite from none of them."""
     tried = run_parallel([partial(_free, model, start) for start in starts], model.prepared)
-    return max((one for one in tried if one is not None), key=lambda one: one.log_likelihood, default=None)
+    return max((fit for fit in tried if fit is not None), key=lambda fit: fit.log_likelihood, default=None)
 
 
 def _explains(free: FittedModel) -> bool:
-    """Whether a free run explains anything of what was recorded."""
+    """Whether an open-loop fit explains more than nothing of the recording."""
     return pooled(goodness_of_fit(free.model.prepared, free.residual, {}, None)) > _NOTHING
 
 
 def _wider(free: FittedModel, settings: NoiseSettings) -> FittedModel:
-    """The same fit on the wider domain that all models are compared on; as it is where it is lost there."""
+    """Return the fit on the wider domain that all models share; unchanged if that fit fails."""
     bound = settings.domain * free.bound.maximum(free.bound.mean())
-    # residuals at the end can be larger than those that the domain was chosen by
+    # the final residuals can be larger than those that set the domain
     bound = bound.maximum(_ROOM * robust_scale(free.residual))
     try:
         return fitted(free.model, free.parameters, bound, graduate=False)
@@ -203,39 +207,39 @@ def fit_with_process_noise(
     declared: Mapping[str, float],
     settings: NoiseSettings,
     *,
-    beside: Sequence[Float[Tensor, " p"]] = (),
+    further_starts: Sequence[Float[Tensor, " p"]] = (),
     model: JointModel | None = None,
 ) -> ProcessNoiseFit:
-    """A free fit under the likeliest noise around it.
+    """Fit a model under its most likely noise, from its open-loop fit.
 
     Args:
-        free: the fit; None where there is none.
-        declared: standard deviation of the white noise of outputs that it is known of.
+        free: the open-loop fit; None if there is none.
+        declared: known standard deviations of the outputs' white noise.
         settings: of the noise.
-        beside: parameters that predict over short horizons, to begin with as well.
-        model: what is fitted, where there is no free fit.
+        further_starts: parameters that predict over short horizons, to start from as well.
+        model: the model, if there is no open-loop fit.
     """
-    starts = 1 + len(beside)
+    starts = 1 + len(further_starts)
     noise = None if free is None else estimate_noise(free, declared, settings)
     if free is not None and (noise is None or noise.observer is None):
         return ProcessNoiseFit(free, free, noise, starts)
     own = model if free is None else free.model
     assert own is not None
     bound = None if free is None else free.bound
-    works = [partial(_from_short, own, start, bound, declared, settings) for start in beside]
-    if beside and isinstance(own.prepared, PreparedDynamics):
+    works = [partial(_from_short, own, start, bound, declared, settings) for start in further_starts]
+    if further_starts and isinstance(own.prepared, PreparedDynamics):
         works.append(partial(_from_given, own, own.prepared.given, bound, declared, settings))
     if free is not None and not works:
         works = [partial(_under_noise, free, noise, declared, settings)]
     tried = run_parallel(works, own.prepared)
-    found = [one for one in tried if one is not None]
+    found = [pair for pair in tried if pair is not None]
     if not found:
         if free is None:
             raise NoFitError(
-                "No trajectory of the simulation was found near the recording, over short horizons either."
+                "No trajectory of the simulation was found near the recording, not even over short horizons."
             )
         return ProcessNoiseFit(free, free, noise, starts)
-    best = max(found, key=lambda one: one[0].log_likelihood)
+    best = max(found, key=lambda pair: pair[0].log_likelihood)
     if best[1].observer is None and free is not None:
         return ProcessNoiseFit(free, free, best[1], starts)
     return ProcessNoiseFit(free, *best, starts)
@@ -244,13 +248,13 @@ def fit_with_process_noise(
 def refit_noise(
     fit: FittedModel, around: StateSpaceNoise | None, declared: Mapping[str, float], settings: NoiseSettings
 ) -> FittedModel:
-    """A joint model under the pushes that are left beside its effects, or, where it is as likely, running freely."""
+    """Refit a joint model under its remaining process noise, or in open loop if that is as likely."""
     found = _under_noise(fit, estimate_noise(fit, declared, settings, around), declared, settings)
     best = fit if found is None or found[0].log_likelihood < fit.log_likelihood else found[0]
     free = refit_open_loop(best)
     if free is None:
         return best
-    # parameters that were fitted beside a push can need it where those of the free run do not
+    # parameters fitted under a disturbance can depend on it; those of the open-loop fit do not
     left = estimate_noise(free, declared, settings)
     if left is None or left.observer is None or free.log_likelihood > best.log_likelihood:
         return free
@@ -260,9 +264,9 @@ def refit_noise(
 def refit_input_hold(
     fit: FittedModel, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
 ) -> FittedModel:
-    """The same with inputs held or straight between samples, whichever is likelier now that the effects are there.
+    """Return the fit with the most likely holds of its inputs, given its effects.
 
-    Without them another course between samples may have stood in for what they do.
+    Without the effects, another hold may have replaced them.
     """
     prepared = fit.model.prepared
     if not isinstance(prepared, PreparedDynamics):
@@ -271,7 +275,7 @@ def refit_input_hold(
         for other in ("held", "linear"):
             if name in fixed or other == how:
                 continue
-            moved = prepared.holding({name: other})
+            moved = prepared.with_input_hold({name: other})
             try:
                 under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
             except NoFitError:
@@ -284,7 +288,7 @@ def refit_input_hold(
 
 
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
-    """The same joint model fitted to its free run; None where that loses the recording."""
+    """Fit the same joint model in open loop; None if that loses the recording."""
     prepared = open_loop(fit.model.prepared)
     if prepared is fit.model.prepared:
         return fit
@@ -297,7 +301,7 @@ def refit_open_loop(fit: FittedModel) -> FittedModel | None:
             return None
 
     both = run_parallel([partial(tried, False), partial(tried, True)], prepared, fit.model.terms)
-    return max((one for one in both if one is not None), key=lambda one: one.log_likelihood, default=None)
+    return max((found for found in both if found is not None), key=lambda found: found.log_likelihood, default=None)
 
 
 def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:
@@ -313,7 +317,7 @@ _Found = tuple[FittedModel, StateSpaceNoise]
 def _under_noise(
     fit: FittedModel, noise: StateSpaceNoise | None, declared: Mapping[str, float], settings: NoiseSettings
 ) -> _Found | None:
-    """Fits under the noise of the fit before, the likeliest of them, with the noise that is around it."""
+    """Alternate noise estimation and fit; return the most likely fit with the noise around it."""
     best: _Found | None = None
     for _ in range(_ROUNDS):
         if noise is None:
@@ -341,10 +345,10 @@ def _from_short(
     declared: Mapping[str, float],
     settings: NoiseSettings,
 ) -> _Found | None:
-    """The same from parameters that predict over short horizons, along an observer that corrects by much."""
+    """Fit from parameters that predict over short horizons, along a strongly correcting observer."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    observed = strongly_observed(prepared, start, _STRONG)
+    observed = with_strong_observer(prepared, start, _STRONG)
     if observed is None:
         return None
     strong = JointModel(observed, model.terms)
@@ -364,14 +368,21 @@ def _from_given(
     declared: Mapping[str, float],
     settings: NoiseSettings,
 ) -> _Found | None:
-    """Fits under the noise that is around a user's own values: what is missing may drive any fit without it away."""
+    """Fit under the noise around a user's own values, because a missing effect can drive any fit without it away."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    strong = strongly_observed(prepared, start, _STRONG)
+    strong = with_strong_observer(prepared, start, _STRONG)
     if strong is None or bound is None:
         return None
-    noise = likeliest_noise(
-        strong, start, {}, None, declared=declared, least=settings.pushed, most=settings.pushes, known=None
+    noise = most_likely_noise(
+        strong,
+        start,
+        {},
+        None,
+        declared=declared,
+        least=settings.disturbance_gain,
+        most=settings.max_disturbances,
+        known=None,
     )
     if noise is None or noise.observer is None:
         return None
@@ -385,27 +396,30 @@ def _from_given(
 def choose_input_hold(
     base: ProcessNoiseFit, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
 ) -> ProcessNoiseFit:
-    """The same with inputs that are held or go straight from sample to sample, whichever is likelier.
+    """Return the fit with the most likely hold of each input, constant or linear between samples.
 
     Args:
-        base: with what the simulation says of its inputs.
-        declared: of the outputs' white noise.
-        fixed: inputs of which it is known.
+        base: the fit with the simulation's own holds.
+        declared: known standard deviations of the outputs' white noise.
+        fixed: inputs whose hold is known.
         settings: of the noise.
     """
     prepared = open_loop(base.fit.model.prepared)
     if not isinstance(prepared, PreparedDynamics):
         return base
     for name, how in prepared.input_hold.items():
-        others = [one for one in ("held", "linear") if one != how] if name not in fixed else []
+        others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
-        tried = [one for one in run_parallel(works, prepared) if one is not None]
-        base = max([base, *tried], key=lambda one: one.fit.log_likelihood - settings.pushed * one.pushes)
+        tried = [found for found in run_parallel(works, prepared) if found is not None]
+        base = max(
+            [base, *tried],
+            key=lambda found: found.fit.log_likelihood - settings.disturbance_gain * found.disturbance_count,
+        )
     return _with_sizes(base)
 
 
 def _with_sizes(base: ProcessNoiseFit) -> ProcessNoiseFit:
-    """The same with the fitted trajectory as the guess of all states, of those that no output shows as well."""
+    """Return the fit with its trajectory as the guess of all states, including those that no output shows."""
     known, near = base.fit.model.prepared, base.fit.model.near
     assert isinstance(known, PreparedDynamics)
 
@@ -423,7 +437,7 @@ def _holding(
 ) -> ProcessNoiseFit | None:
     known = base.fit.model.prepared
     assert isinstance(known, PreparedDynamics)
-    prepared = known.holding({name: how})
+    prepared = known.with_input_hold({name: how})
     free = None
     try:
         if base.free is not None:
@@ -431,7 +445,7 @@ def _holding(
             free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
         if free is not None:
             running = replace(fit_with_process_noise(free, declared, settings), starts=base.starts)
-            if not (base.pushed and running.pushed):
+            if not (base.has_disturbances and running.has_disturbances):
                 return running
         fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound)
     except NoFitError:

@@ -1,4 +1,4 @@
-"""Numbers of effects' shapes fitted together with all else, once the effects are known."""
+"""Joint fits that include numbers of the effects' shapes."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ __all__ = ["ShapedModel", "shape_fitted"]
 
 
 class ShapedModel(JointModel):
-    """A joint model that has numbers of its effects' shapes as its last parameters, of positive ones the logarithms.
+    """A joint model whose last parameters are shape numbers of its effects; positive numbers enter as logarithms.
 
     Args:
         model: the joint model.
-        reach: of each effect, the name of each such number to its least and greatest value.
+        reach: for each effect, the limits (lower, upper) of each shape number by name.
     """
 
     def __init__(self, model: JointModel, reach: Sequence[Mapping[str, tuple[float, float]]]) -> None:
         super().__init__(model.prepared, model.terms, model.near)
         self._reach = tuple(reach)
-        least = [low for one in reach for low, _ in one.values()]
-        self._positive = torch.tensor([low > 0.0 for low in least], dtype=torch.bool)
+        lower = [low for limits in reach for low, _ in limits.values()]
+        self._positive = torch.tensor([low > 0.0 for low in lower], dtype=torch.bool)
 
     @classmethod
     def of(cls, model: JointModel) -> ShapedModel:
-        """With all numbers that can be fitted."""
+        """Include all shape numbers that can be fitted."""
         return cls(model, [reach_of(term, model.prepared) for term in model.terms])
 
     @property
     def joint(self) -> int:
-        """Number of parameters without the shapes' numbers."""
+        """Number of parameters without the shape numbers."""
         return super().size
 
     @property
@@ -61,24 +61,24 @@ class ShapedModel(JointModel):
         return torch.cat([known[0], shapes[:, 0]]), torch.cat([known[1], shapes[:, 1]])
 
     def start(self, parameters: Float[Tensor, " q"]) -> Float[Tensor, " p"]:
-        """The joint model's parameters with its effects' shapes beside them."""
+        """Return the joint model's parameters followed by the shape numbers."""
         values = [term.shape[name] for term, reach in zip(self.terms, self._reach, strict=True) for name in reach]
         return torch.cat([parameters, self._free(parameters.new_tensor(values))])
 
     def per_effect(self, values: Sequence[Any]) -> list[dict[str, Any]]:
-        """Values of the numbers, by the names that they have in each effect's shape."""
+        """Split values of the shape numbers into one mapping per effect, by name."""
         left = iter(values)
         return [{name: next(left) for name in reach} for reach in self._reach]
 
     def shaped(self, parameters: Float[Tensor, " p"]) -> tuple[Term, ...]:
-        """The effects with these shapes; as tensors what is fitted of them, to be differentiated."""
+        """Return the effects with the shapes of these parameters, as differentiable tensors."""
         free = parameters[self.joint :]
         values = torch.where(self._positive, torch.where(self._positive, free, 0.0).exp(), free)
         fitted = self.per_effect(values.unbind())
         return tuple(replace(t, shape={**t.shape, **new}) for t, new in zip(self.terms, fitted, strict=True))
 
     def spread(self, values: Sequence[float], errors: Float[Tensor, " s"]) -> Float[Tensor, " s"]:
-        """Standard errors of numbers of the shapes, from those of the parameters that stand for them."""
+        """Return standard errors of the shape numbers from those of their parameters."""
         return torch.where(self._positive, errors * errors.new_tensor(values), errors)
 
     def _free(self, values: Float[Tensor, "*a s"]) -> Float[Tensor, "*a s"]:
@@ -92,21 +92,20 @@ class ShapedModel(JointModel):
 
 
 def shape_fitted(fit: FittedModel) -> FittedModel:
-    """The fit with its effects' shapes at the likeliest values of the numbers that can be fitted.
+    """Refit with the shape numbers free.
 
     Args:
-        fit: at the likeliest parameters for the shapes that it has.
+        fit: at the most likely parameters for its present shapes.
 
     Returns:
-        A fit at those shapes; the same one where no number can be fitted, or the simulation gives none that is
-        likelier.
+        The fit at the most likely shapes; the same fit if no number can be fitted, or no result is more likely.
     """
     model = ShapedModel.of(fit.model)
     if model.size == model.joint:
         return fit
     try:
         both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
-        terms = [_told(term) for term in model.shaped(both.parameters)]
+        terms = [_with_plain_shape(term) for term in model.shaped(both.parameters)]
         moved = JointModel(model.prepared, terms, both.model.near)
         again = fitted(moved, both.parameters[: model.joint], fit.bound, graduate=False)
     except NoFitError:
@@ -114,6 +113,6 @@ def shape_fitted(fit: FittedModel) -> FittedModel:
     return again if again.log_likelihood > fit.log_likelihood else fit
 
 
-def _told(term: Term) -> Term:
-    """The same with plain numbers as its shape."""
+def _with_plain_shape(term: Term) -> Term:
+    """Return the term with plain numbers as its shape."""
     return replace(term, shape={name: float(value) for name, value in term.shape.items()})

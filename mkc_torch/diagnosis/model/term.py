@@ -1,4 +1,4 @@
-"""A term of a model: one effect at one port with its drivers and shape."""
+"""A term of a model: an effect at a port, with its driver and shape."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mkc_torch.simulation.protocol import Port, PreparedSimulation
 __all__ = ["Key", "Term", "context_at", "continuous"]
 
 Key = tuple[str, tuple[str, ...], str]
-"""Of a candidate, whatever its shape: the effect's id, its columns and its port."""
+"""Identity of a candidate without its shape: the effect's id, its columns and its port."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """An effect with its driver (None for time or the signal alone), its shape, and its port where it has a choice."""
+    """An effect with its driver (None for time or the signal alone), its shape, and its port if it has a choice."""
 
     effect: Effect
     driver: Driver | None
@@ -37,11 +37,11 @@ class Term:
 
     @property
     def key(self) -> Key:
-        """What it is, whatever its shape."""
+        """Identity without the shape."""
         return self.effect.id, self.columns, self.port
 
     def context(self, prepared: PreparedSimulation, signal: Tensor | None) -> Context:
-        """What the effect sees."""
+        """Return the context in which the effect is evaluated."""
         port = prepared.ports[self.port]
         time = prepared.time if port.clock is None else port.clock.time
         values = time.new_zeros(len(time), 0)
@@ -58,7 +58,7 @@ class Term:
 
 
 def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...], signal: Tensor) -> Context:
-    """What an effect sees at a port."""
+    """Return the context of an effect at a port."""
     return Context(
         time,
         drivers,
@@ -74,5 +74,5 @@ def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...]
 
 
 def continuous(term: Term) -> list[str]:
-    """The numbers of a candidate's shape that are closed in on."""
+    """Return the names of a candidate's shape numbers that are refined."""
     return [name for name in term.shape if name in term.effect.continuous]

@@ -1,1 +1,1 @@
-"""Noise of residuals: its colour, gaps, bursts, what is rejected."""
+"""Noise of the residuals: its spectrum, rejected samples, bursts and imputation."""

@@ -30,7 +30,7 @@ def dct(values: Float[Tensor, N * rest], count: int | None = None) -> Float[Tens
     folded = torch.cat([values[::2], values[1::2].flip(0)]).movedim(0, -1)
     spectrum = torch.fft.rfft(folded)
     if count > spectrum.shape[-1]:
-        # the spectrum of what is real mirrors
+        # the spectrum of a real series is symmetric
         spectrum = torch.cat([spectrum, spectrum[..., 1 : (N + 1) // 2].conj().flip(-1)], -1)
     angle = torch.arange(count, dtype=values.dtype, device=values.device) * (-math.pi / (2 * N))
     real = spectrum.real[..., :count] * torch.cos(angle) - spectrum.imag[..., :count] * torch.sin(angle)
@@ -60,14 +60,14 @@ def inverse_dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
 
 
 def cosines(count: int, N: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "N count"]:
-    """The first ``count`` slow courses of the cosine basis, the constant left out; each of mean square one."""
+    """Return the first ``count`` slow cosines without the constant, (N, count), each with mean square 1."""
     k = torch.arange(1, count + 1, dtype=dtype)
     n = torch.arange(N, dtype=dtype) + 0.5
     return math.sqrt(2.0) * torch.cos(math.pi / N * n.unsqueeze(-1) * k)
 
 
 def course_of(amplitudes: Float[Tensor, k * rest], N: int) -> Float[Tensor, N * rest]:
-    """``cosines(k, N) @ amplitudes``, by one transform.
+    """Return ``cosines(k, N) @ amplitudes``, by one transform.
 
     Example:
         >>> amplitudes = torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64)
@@ -79,9 +79,10 @@ def course_of(amplitudes: Float[Tensor, k * rest], N: int) -> Float[Tensor, N * 
 
 
 def dct_of_courses(values: Float[Tensor, "N m c"], courses: int, count: int) -> Float[Tensor, "count m k"]:
-    """``dct(values[:, :, None] * cosines(courses, N)[:, None, :, None], count)``, k = courses · c, from c transforms.
+    """Return the slowest cosine coefficients of channels times slow cosines, k = courses · c, from c transforms.
 
-    A product of two cosines is the mean of those of the sum and of the difference of their frequencies.
+    The same as ``dct(values[:, :, None] * cosines(courses, N)[:, None, :, None], count)``: a product of two cosines is
+    the mean of the cosines of the sum and of the difference of their frequencies.
 
     Example:
         >>> values = torch.randn(20, 1, 1, dtype=torch.float64)
@@ -92,7 +93,7 @@ def dct_of_courses(values: Float[Tensor, "N m c"], courses: int, count: int) -> 
     count = min(count, N)
     known = dct(values).flatten(1).mT.contiguous()  # (m c, N)
     known[:, 0] *= math.sqrt(2.0)
-    # beyond the N-th frequency the transform of N samples goes back, with the other sign
+    # beyond the N-th frequency the transform of N samples is mirrored, with the opposite sign
     beyond = torch.cat([known, torch.zeros_like(known[:, :1]), -known[:, 1:].flip(-1)], -1)
     both = torch.cat([known[:, 1 : courses + 1].flip(-1), beyond[:, : count + courses + 1]], -1)
     sums = beyond[:, 1 : count + courses].unfold(-1, count, 1)

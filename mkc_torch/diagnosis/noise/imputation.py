@@ -1,8 +1,8 @@
-"""Rejected samples: what coloured noise is there to be expected, by what is around it.
+"""Imputation: expected coloured noise at the rejected samples, given the samples around them.
 
-A zero in place of a rejected sample is right where noise is white. Where it wanders, zeros cut holes into it, and what
-is cut out reaches all frequencies. The expectation of the noise there is linear in the samples that count: done to the
-residual and to all tangents alike, it leaves the amplitudes of effects what they are.
+For white noise, 0 in place of a rejected sample is right. For a drift, zeros cut holes that spread to all frequencies.
+The expectation is linear in the samples that count: applied to the residual and to all tangents alike, it leaves the
+estimated sizes of effects unbiased.
 """
 
 from __future__ import annotations
@@ -23,25 +23,27 @@ if TYPE_CHECKING:
 __all__ = ["Imputation", "MissingSamples"]
 
 _PLAIN = 0.3
-"""A spectrum nearer to the level of its end than this share counts as white there."""
+"""Relative distance to the level of its high-frequency end within which a spectrum counts as white."""
 
 _END = 20
-"""One in so many frequencies, the highest ones, show the level of the spectrum's end."""
+"""The highest 1/20 of the frequencies set the level of the spectrum's end."""
 
-_MOST, _CELLS = 1000, 20_000_000
-"""Frequencies at most that are not taken for white, those that are the farthest from it; fewer where their products
-with all others would be more numbers than these."""
+_MOST = 1000
+"""Largest number of frequencies that are not treated as white; the farthest from white are kept."""
+
+_CELLS = 20_000_000
+"""Largest number of products of these frequencies with all others."""
 
 _HANDY = 0.5
-"""Rejected samples are solved for, where they are fewer than this share of the frequencies."""
+"""Number of rejected samples, as a share of the frequencies, below which the system is solved by samples."""
 
 
 class MissingSamples:
     """The rejected samples of each channel.
 
     Args:
-        counts: 0 where a sample is rejected, else 1.
-        kept: number K of the slowest cosine coefficients that are looked at.
+        counts: 0 for a rejected sample, else 1.
+        kept: number K of the slowest cosine coefficients in use.
     """
 
     def __init__(self, counts: Float[Tensor, "N m"], kept: int) -> None:
@@ -49,13 +51,13 @@ class MissingSamples:
         self._N, self._kept = N, kept
         known = dct(1.0 - counts) * math.sqrt(N / 2)
         known[0] *= math.sqrt(2.0)
-        # sums of cosines at the rejected samples; beyond the N-th frequency they go back, with the other sign
+        # sums of cosines at the rejected samples; beyond the N-th frequency they are mirrored, with the opposite sign
         self._sums = torch.cat([known, torch.zeros_like(known[:1]), -known[1:].flip(0)])
-        self._lost = [torch.nonzero(one == 0).flatten() for one in counts.unbind(1)]
+        self._lost = [torch.nonzero(mask == 0).flatten() for mask in counts.unbind(1)]
         self._bases: dict[int, Tensor] = {}
 
     def basis(self, channel: int) -> Float[Tensor, "K n"]:
-        """The basis at the rejected samples of a channel."""
+        """Return the cosine basis at the rejected samples of a channel, (K, n)."""
         if channel not in self._bases:
             k = torch.arange(self._kept, dtype=self._sums.dtype).unsqueeze(-1)
             basis = torch.cos(math.pi / self._N * k * (self._lost[channel] + 0.5)) * math.sqrt(2.0 / self._N)
@@ -64,9 +66,9 @@ class MissingSamples:
         return self._bases[channel]
 
     def overlap(self, channel: int, rows: Tensor) -> Float[Tensor, "J K"]:
-        """Inner products of the basis' functions of these numbers with all of it, over a channel's rejected samples."""
+        """Return inner products (J, K) of the basis functions ``rows`` with all, over a channel's rejected samples."""
         K = self._kept
-        # the sums at every difference of two numbers, and at every sum of two
+        # the sums at every difference and every sum of two frequency numbers
         sums = torch.cat([self._sums[1:K, channel].flip(0), self._sums[: 2 * K - 1, channel]]) / self._N
         product = sums[: 2 * K - 1].unfold(0, K, 1)[K - 1 - rows] + sums[K - 1 :].unfold(0, K, 1)[rows]
         product[:, 0] *= math.sqrt(0.5)
@@ -74,7 +76,7 @@ class MissingSamples:
         return product
 
     def filling(self, noise_spectrum: NoiseSpectrum) -> Imputation:
-        """The rejected samples' expectation under noise of this colour."""
+        """Return the imputation of the rejected samples under this noise spectrum."""
         spectrum = noise_spectrum.root.square()
         K, m = spectrum.shape
         end = spectrum[-max(K // _END, 1) :].mean(0)
@@ -92,7 +94,7 @@ class MissingSamples:
             if len(rows) > most:
                 rows = rows[far[rows].topk(most).indices].sort().values
             own = excess[rows, channel]
-            # the same by either identity; what is solved is as large as the rejected samples, or as the frequencies
+            # both identities give the same result; solve the smaller system, by samples or by frequencies
             few = lost < _HANDY * len(rows)
             part = self._by_sample(channel, rows, own) if few else self._by_frequency(channel, rows, own)
             log_det += part.log_det
@@ -145,7 +147,7 @@ class _ByFrequency:
 
 @dataclass(frozen=True)
 class _Louder:
-    """The same where all excess is negative: the noise is nowhere below the level of its spectrum's end."""
+    """The same for negative excess: the noise is nowhere below the level of its spectrum's end."""
 
     half: Tensor  # (J, 1), root of -E
     root: Tensor  # (J, J) of 1 - half O half
@@ -156,7 +158,7 @@ class _Louder:
 
 @dataclass(frozen=True)
 class _ImputedPart:
-    """What the rejected samples of a channel take: ``spread @ pulling(·)`` of the coefficients of these rows."""
+    """Correction for a channel's rejected samples: ``spread @ pulling(·)`` of the coefficients of these rows."""
 
     rows: Tensor  # (J,)
     spread: Tensor  # (K, n)
@@ -169,14 +171,14 @@ class _ImputedPart:
 
 @dataclass(frozen=True)
 class Imputation:
-    """What to add to the slowest cosine coefficients of series that are 0 at rejected samples.
+    """The imputation, applied to the slowest cosine coefficients of series that are 0 at rejected samples.
 
     With P the precision of the noise, 1 at the end of its spectrum, x at the rejected samples m is
-    ``-(P_mm)^-1 (P x)_m``; in the basis of cosines, and by the identity of Woodbury, this takes no more than the
-    frequencies at which the noise is not white.
+    ``-(P_mm)^-1 (P x)_m``; in the cosine basis, and by Woodbury's identity, it needs only the frequencies at which the
+    noise is not white.
 
     Attributes:
-        parts: one a channel; None where nothing is to be done.
+        parts: one per channel; None if the channel needs no correction.
         log_det: of ``P_mm``.
     """
 
@@ -185,7 +187,7 @@ class Imputation:
 
     @property
     def nothing(self) -> bool:
-        """Whether all is left as it is."""
+        """Whether no channel needs a correction."""
         return all(part is None for part in self.parts)
 
     def __call__(self, coefficients: Float[Tensor, "K m *rest"]) -> Float[Tensor, "K m *rest"]:

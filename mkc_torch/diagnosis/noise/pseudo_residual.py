@@ -1,4 +1,4 @@
-"""Residuals as if their noise was Gaussian, with rejected samples filled in."""
+"""Pseudo-residuals: residuals as if their noise was Gaussian, 0 where rejected."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["pseudo_residual"]
 def pseudo_residual(
     error: Float[Tensor, "N m"], sigma: Float[Tensor, " m"], d: Float[Tensor, " m"], rejected_below: float
 ) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
-    """The score of the MKC density over its mean slope, and 1 where a residual counts: 0 where it is rejected.
+    """Return the score of the MKC density over its mean slope, (N, m), and the mask: 1 where a residual counts, else 0.
 
     Args:
         error: the residual.
         sigma, d: of the density.
-        rejected_below: weight below which a residual says nothing, neither of the noise nor of an effect.
+        rejected_below: weight below which a residual is rejected.
 
     Example:
         >>> error = torch.tensor([[0.1], [-0.1], [50.0]])

@@ -1,4 +1,4 @@
-"""Running medians: windows that are as long as a share of the recording, at a cost that grows with its samples."""
+"""Running medians over long windows."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["running_median"]
 
 
 def running_median(values: Float[Tensor, "N m"], half: int) -> Float[Tensor, "N m"]:
-    """The median of each value with ``half`` neighbours to either side, mirrored at the ends.
+    """Return the median of each value and ``half`` neighbours to either side, mirrored at the ends.
 
-    The window is kept sorted: each sample is put in at its place and the one that leaves is taken out.
+    The window is kept sorted: each new sample is inserted, and the oldest is removed.
 
     Args:
-        values: finite ones.
+        values: finite values.
         half: 0 or more, and fewer than N.
 
     Example:
@@ -28,7 +28,7 @@ def running_median(values: Float[Tensor, "N m"], half: int) -> Float[Tensor, "N 
         tensor([9., 2., 3., 2.])
     """
     padded = torch.nn.functional.pad(values.mT, (half, half), mode="reflect")
-    return torch.tensor([_medians(one, half) for one in padded.tolist()], dtype=values.dtype).mT
+    return torch.tensor([_medians(channel, half) for channel in padded.tolist()], dtype=values.dtype).mT
 
 
 def _medians(padded: list[float], half: int) -> list[float]:

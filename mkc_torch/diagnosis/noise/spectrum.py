@@ -1,8 +1,8 @@
-"""The noise that structure is tested against: heavy-tailed, coloured, and wandering at the simulation's ports.
+"""Spectra of coloured noise in the cosine basis.
 
-Residuals enter as pseudo-residuals, the bounded values whose least squares are the M-estimate to first order (Huber,
-"Robust Statistics", 1981, 7.6). In the basis of cosines (DCT-II) stationary noise is nearly independent from one
-coefficient to the next, and a random walk exactly so; dividing by the root of the spectrum makes it white.
+Residuals enter as pseudo-residuals: bounded values whose least squares are the M-estimate to first order (Huber,
+"Robust Statistics", 1981, 7.6). In the cosine basis (DCT-II) the coefficients of stationary noise are nearly
+independent, and those of a random walk exactly so; dividing by the root of the spectrum whitens them.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = [
     "NoiseSpectrum",
     "autoregression",
     "autoregressive",
-    "colour_of",
-    "colour_of_fast",
     "correlation_time",
     "enters_at_port",
     "filtered",
-    "port_colour",
+    "port_autoregression",
+    "spectrum_of",
+    "spectrum_of_fast",
     "whittle",
 ]
 
@@ -36,7 +36,7 @@ MAX_ORDER = 12
 """Highest order of the autoregression."""
 
 _FILLED = 10
-"""Times that what does not count is filled in."""
+"""EM iterations for the coefficients that do not count."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class NoiseSpectrum:
     """The spectrum of each channel's stationary noise as an autoregression; order 0 is white.
 
     Attributes:
-        coefficients: φ of ``e[t] = Σ φ_j e[t-j] + innovation``, one tensor a channel.
-        root: (K, m), root of the spectrum on the K slowest frequencies of the cosine basis, on any one scale.
+        coefficients: φ of ``e[t] = Σ φ_j e[t-j] + innovation``, one tensor per channel.
+        root: (K, m), root of the spectrum on the K slowest frequencies of the cosine basis, on any common scale.
     """
 
     coefficients: tuple[Tensor, ...]
@@ -56,40 +56,42 @@ class NoiseSpectrum:
         return max(len(c) for c in self.coefficients)
 
     def whiten(self, values: Float[Tensor, "N m *rest"]) -> Float[Tensor, Km * rest]:
-        """The slowest cosine coefficients over the root of the spectrum, as many as ``root`` has, channels stacked."""
+        """Return the slowest cosine coefficients over the root of the spectrum, K of each channel, channels stacked."""
         return self.scaled(dct(values, len(self.root)))
 
     def scaled(self, coefficients: Float[Tensor, "K m *rest"]) -> Float[Tensor, Km * rest]:
-        """The same of what is in the cosine basis already."""
+        """Whiten values that are in the cosine basis already."""
         root = self.root.reshape(*self.root.shape, *[1] * (coefficients.dim() - 2)).to(coefficients.dtype)
         return (coefficients / root).flatten(0, 1)
 
 
-_SHARED, _CLEARLY = 0.5, 1.01
-"""Share of a port's axes that two samples have in common for their product to tell of noise at the port, and times that
-noise at a port has to explain the products better than the residual's own."""
+_SHARED = 0.5
+"""Overlap of a port's axes at two samples from which their product informs about noise at the port."""
+
+_CLEARLY = 1.01
+"""Ratio of squares by which noise at a port has to explain the products better than the residual's own noise."""
 
 
-def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:
-    """Autoregression of noise that enters at a port, alike and independent in its channels, and gives these residuals.
+def port_autoregression(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:
+    """Return the autoregression of noise at a port, equal and independent in its channels, from the residuals.
 
-    Where the port's axes turn against the residual, ``cov_residual(lag) = cov_port(lag) · mean(P[t] P[t + lag]ᵀ)``.
+    If the port's axes turn against the residual, ``cov_residual(lag) = cov_port(lag) · mean(P[t] P[t + lag]ᵀ)``.
     """
     N = values.shape[0]
     highest = min(MAX_ORDER, N // 10)
     covariance = _autocovariance(values, highest).sum(-1)
     overlap = torch.stack([(pointwise[: N - lag] * pointwise[lag:]).sum() / N for lag in range(highest + 1)])
     ratio = overlap / overlap[0]
-    # where the port has turned away, the residuals say too little about it
+    # at lags where the port has turned away, the residuals hold too little information
     known = int((ratio < _SHARED).long().argmax()) if bool((ratio < _SHARED).any()) else len(ratio)
     return _up_to_order(_levinson((covariance[:known] / ratio[:known]).unsqueeze(-1), N * values.shape[1])[:, 0])
 
 
 def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> bool:
-    """Whether coloured noise is rather that of a port whose axes turn against the residual than the residual's own.
+    """Whether coloured noise enters at a port whose axes turn against the residual, rather than in the residual itself.
 
-    Products of residuals some samples apart are in proportion to how much of the port's axes they share, or to nothing:
-    that which leaves the smaller squares over all lags decides; where they are alike, it is the residual's own.
+    Products of residuals at a lag are proportional to the overlap of the port's axes in the first case, constant in the
+    second. The model that explains more squares over all lags is taken; the residual's own noise if both are equal.
     """
     N = len(values)
     through, own = 0.0, 0.0
@@ -107,7 +109,7 @@ def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c
 
 
 def autoregression(values: Float[Tensor, " N"]) -> Tensor:
-    """Coefficients of the autoregression of a series, of an order by BIC.
+    """Return the autoregression coefficients of a series, with the order by BIC.
 
     Example:
         >>> draws = autoregressive(torch.tensor([0.8], dtype=torch.float64), 4000, 1, torch.Generator().manual_seed(0))
@@ -120,7 +122,7 @@ def autoregression(values: Float[Tensor, " N"]) -> Tensor:
 
 
 def correlation_time(values: Float[Tensor, " N"]) -> float:
-    """Integrated autocorrelation time of a series, in samples, by its autoregression; 1 of white noise.
+    """Return the integrated autocorrelation time of a series in samples, by its autoregression; 1 for white noise.
 
     Sokal, "Monte Carlo methods in statistical mechanics", in Functional Integration (1997), (2.16).
 
@@ -138,7 +140,7 @@ def correlation_time(values: Float[Tensor, " N"]) -> float:
 
 
 def filtered(values: Float[Tensor, " N"], coefficients: Tensor) -> Float[Tensor, " N"]:
-    """What an autoregression does not predict from the samples before; of those before the first it knows nothing."""
+    """Return the innovations of a series under an autoregression; values before the first sample count as 0."""
     left = values.clone()
     for lag, coefficient in enumerate(coefficients, 1):
         left[lag:] -= coefficient * values[:-lag]
@@ -146,46 +148,46 @@ def filtered(values: Float[Tensor, " N"], coefficients: Tensor) -> Float[Tensor,
 
 
 def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Generator) -> Float[Tensor, "N count"]:
-    """Stationary draws of an autoregression whose innovations have variance one."""
-    # a circle three times as long, of which a third is used, hides that it closes; its length is even
+    """Return stationary draws of an autoregression whose innovations have variance 1, (N, count)."""
+    # draw a periodic series three times as long and use a third of it, so that the period does not show; even length
     length = 3 * (N + N % 2)
     frequency = torch.arange(length // 2 + 1, dtype=torch.float64) * (2 * math.pi / length)
-    # drawn where white noise is white too; the two ends of its spectrum are real
+    # draw in the frequency domain; the two ends of a real series' spectrum are real
     drawn = torch.randn(count, len(frequency), generator=generator, dtype=torch.complex128)
     drawn[:, [0, -1]] *= math.sqrt(2.0)
     drawn *= math.sqrt(length) * _root(coefficients, frequency)
     return torch.fft.irfft(drawn, n=length)[:, :N].mT
 
 
-def colour_of(power: Float[Tensor, "K m"]) -> NoiseSpectrum:
-    """The spectrum of each channel from the squares of its K slowest cosine coefficients.
+def spectrum_of(power: Float[Tensor, "K m"]) -> NoiseSpectrum:
+    """Return the spectrum of each channel from the squares of its K slowest cosine coefficients.
 
-    It is the product of three: a slow part that rises towards low frequencies, of the likeliest size and corner
-    (Whittle's likelihood); an autoregression by Levinson's recursion, of an order by BIC; and local averages of what
-    these two miss, over the more coefficients the higher the frequency.
+    The spectrum is the product of three factors: a slow part that rises towards low frequencies, of the most likely
+    size and corner (Whittle's likelihood); an autoregression by Levinson's recursion, of an order by BIC; and local
+    averages of what these two miss, over a width that grows with the frequency.
 
-    The constant says nothing of a spectrum: it may be an offset. Its neighbour stands in for it.
+    The constant may be an offset and carries no information; its neighbour replaces it.
 
     Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953).
     """
     phi, spectrum = _spectra(power)
-    return NoiseSpectrum(tuple(_up_to_order(one) for one in phi.unbind(-1)), spectrum.sqrt())
+    return NoiseSpectrum(tuple(_up_to_order(channel) for channel in phi.unbind(-1)), spectrum.sqrt())
 
 
-def colour_of_fast(power: Float[Tensor, "K m"], first: Int[Tensor, " m"]) -> NoiseSpectrum:
-    """The spectrum of an autoregression that the coefficients of each channel have from its ``first`` on.
+def spectrum_of_fast(power: Float[Tensor, "K m"], first: Int[Tensor, " m"]) -> NoiseSpectrum:
+    """Return the spectrum of an autoregression from the coefficients of each channel from ``first`` on.
 
-    What the slower ones would be follows from it (the EM algorithm for missing data: they are set to their expectation
-    under the present one), as is right where something else is in them that is not to be looked at.
+    The slower coefficients may hold something else, such as a drift. They are treated as missing data: the EM algorithm
+    sets their squares to their expectation under the present spectrum.
 
     Args:
         power: squares of the K slowest cosine coefficients.
-        first: number of the first one that counts.
+        first: number of the first coefficient that counts.
 
     Example:
         >>> noise = torch.randn(3000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> noise[:100] *= 50.0
-        >>> root = colour_of_fast(noise.square().unsqueeze(-1), torch.tensor([100])).root
+        >>> root = spectrum_of_fast(noise.square().unsqueeze(-1), torch.tensor([100])).root
         >>> bool((root[:100] < 1.2).all())
         True
     """
@@ -199,25 +201,25 @@ def colour_of_fast(power: Float[Tensor, "K m"], first: Int[Tensor, " m"]) -> Noi
         level = torch.where(counts, power / spectrum, 0.0).sum(0) / counts.sum(0).clamp(min=1)
         filled = torch.where(counts, power, level * spectrum)
     return NoiseSpectrum(
-        tuple(_up_to_order(one) for one in phi.unbind(-1)), (level * spectrum).clamp(min=1e-300).sqrt()
+        tuple(_up_to_order(channel) for channel in phi.unbind(-1)), (level * spectrum).clamp(min=1e-300).sqrt()
     )
 
 
 def _up_to_order(phi: Float[Tensor, " highest"]) -> Float[Tensor, " order"]:
-    """Without the zeros beyond the last coefficient."""
+    """Drop the zeros after the last coefficient."""
     known = torch.nonzero(phi).flatten().tolist()
     return phi[: known[-1] + 1 if known else 0]
 
 
 def whittle(power: Float[Tensor, "K B"]) -> Float[Tensor, " B"]:
-    """Log-likelihood of series by the colour that :func:`colour_of` finds for each, up to a constant.
+    """Return the log-likelihood of series under the spectrum that :func:`spectrum_of` finds for each, up to a constant.
 
     Args:
-        power: squares of the K slowest cosine coefficients of each.
+        power: squares of the K slowest cosine coefficients of each series.
 
     Example:
         >>> white = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> slow = white / torch.arange(1, 401)  # as much as one number of a white series is worth
+        >>> slow = white / torch.arange(1, 401)  # nearly all power in the first few coefficients
         >>> of_white, of_slow = whittle(torch.stack([white, slow], -1).square())
         >>> bool(of_slow > of_white)
         True
@@ -227,23 +229,23 @@ def whittle(power: Float[Tensor, "K B"]) -> Float[Tensor, " B"]:
 
 
 def _spectra(power: Float[Tensor, "K B"]) -> tuple[Float[Tensor, "order B"], Float[Tensor, "K B"]]:
-    """Autoregression and spectrum of each series."""
+    """Return autoregression and spectrum of each series."""
     power = torch.cat([power[1:2], power[1:]])
     phi, shape = _shape(power)
     return phi, shape * _local_mean(power / shape)
 
 
 def _shape(power: Float[Tensor, "K B"]) -> tuple[Float[Tensor, "order B"], Float[Tensor, "K B"]]:
-    """Autoregression, and the spectrum that it and a slow part make, whichever of the two is read first."""
+    """Return the autoregression, and its spectrum times a slow part, fitted in the better of the two orders."""
     K = len(power)
-    alone = _autoregression(power)
-    first = _spectrum(alone, K)
+    fast_first = _autoregression(power)
+    fast = _spectrum(fast_first, K)
     slow = _slow_part(power)
-    beside = _autoregression(power / slow)
-    one, other = first * _slow_part(power / first), slow * _spectrum(beside, K)
-    lack = [spectrum.log().mean(0) + (power / spectrum).mean(0).log() for spectrum in (one, other)]
+    slow_first = _autoregression(power / slow)
+    spectra = fast * _slow_part(power / fast), slow * _spectrum(slow_first, K)
+    lack = [spectrum.log().mean(0) + (power / spectrum).mean(0).log() for spectrum in spectra]
     nearer = lack[0] <= lack[1]
-    return torch.where(nearer, alone, beside), torch.where(nearer, one, other)
+    return torch.where(nearer, fast_first, slow_first), torch.where(nearer, *spectra)
 
 
 def _autoregression(power: Float[Tensor, "K B"]) -> Float[Tensor, "order B"]:
@@ -262,9 +264,9 @@ def _frequencies(K: int, like: Tensor) -> Float[Tensor, " K"]:
 
 
 def _slow_part(power: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
-    """``1 + size · shape`` with the likeliest of a grid of sizes and shapes; the level is profiled out."""
+    """Return ``1 + size · shape`` with the most likely of a grid of sizes and shapes; the level is profiled out."""
     K = len(power)
-    k = torch.arange(K, dtype=power.dtype).clamp(min=1.0)  # the first one is the constant
+    k = torch.arange(K, dtype=power.dtype).clamp(min=1.0)  # the first coefficient is the constant
     shapes = [k.pow(-2), *(1.0 / (1.0 + (k / corner).square()) for corner in (3.0, 10.0, 30.0))]
     sizes = torch.logspace(-1.0, 7.0, 25, dtype=power.dtype)
     spectra = 1.0 + (torch.stack(shapes).unsqueeze(1) * sizes.unsqueeze(-1)).flatten(0, 1)
@@ -274,7 +276,7 @@ def _slow_part(power: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
 
 
 def _local_mean(values: Float[Tensor, "K m"]) -> Float[Tensor, "K m"]:
-    """Mean over a neighbourhood of each row, of an eighth of its number to either side, and ten rows at least."""
+    """Return the mean over a neighbourhood of each row: an eighth of its number to either side, at least ten rows."""
     K = len(values)
     index = torch.arange(K)
     half = torch.clamp(index // 8, min=10)
@@ -286,7 +288,7 @@ def _local_mean(values: Float[Tensor, "K m"]) -> Float[Tensor, "K m"]:
 
 
 def _root(phi: Float[Tensor, order * B], frequency: Float[Tensor, " K"]) -> Float[Tensor, K * B]:
-    """Root of the spectrum of an autoregression with innovations of variance one."""
+    """Return the root of the spectrum of an autoregression with innovations of variance 1."""
     phase = frequency.unsqueeze(-1) * torch.arange(1, len(phi) + 1, dtype=frequency.dtype)
     return torch.hypot(1.0 - torch.cos(phase) @ phi, torch.sin(phase) @ phi).reciprocal()
 
@@ -298,10 +300,10 @@ def _autocovariance(values: Tensor, highest: int) -> Float[Tensor, "lags m"]:
 
 
 def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "order B"]:
-    """Autoregressions from autocovariances by Levinson's recursion, their orders by BIC on N samples; 0 beyond them.
+    """Return autoregressions from autocovariances by Levinson's recursion, orders by BIC; 0 beyond the order.
 
-    Estimates that are those of no series, as where the turns of a port have been divided out, count up to where they
-    could be; one lag that is larger than the variance is the slowest noise there is.
+    Autocovariances that belong to no series, such as those divided by the rotation of a port, are used up to the last
+    valid lag; a covariance larger than the variance at lag 1 counts as the slowest noise.
     """
     highest = len(covariance) - 1
     some = covariance[0] > 0

@@ -82,7 +82,7 @@ class DiagnosisPlot:
         ax = axes_or_new(ax)
         mark_findings(ax, self._findings)
         draw_residual(ax, t, array(t.time), which, after=after)
-        floor = [one.noise_floor for one in self._world.follows if one.output == t.channels[which]]
+        floor = [fit.noise_floor for fit in self._world.goodness_of_fit if fit.output == t.channels[which]]
         draw_floor(ax, floor[0] if floor else None)
         ax.set_title(of_channel(MOMENTS[after] if self._findings else "label.residual", t.channels[which]))
         ax.set_xlabel(of_time(t.has_time))
@@ -191,10 +191,10 @@ class DiagnosisPlot:
         shown = sorted(self._candidates[:most], key=lambda one: -one.log_likelihood_gain)
         found = {(finding.effect, finding.drivers) for finding in self._findings}
         ax = axes_or_new(ax)
-        for row, one in enumerate(shown):
-            color = ORANGE if (one.effect, one.drivers) in found else BLUE
-            ax.barh(row, max(one.log_likelihood_gain, 0.0), color=color, height=0.66)
-        _rows(ax, [_with_drivers(one.effect, one.drivers) for one in shown])
+        for row, element in enumerate(shown):
+            color = ORANGE if (element.effect, element.drivers) in found else BLUE
+            ax.barh(row, max(element.log_likelihood_gain, 0.0), color=color, height=0.66)
+        _rows(ax, [_with_drivers(item.effect, item.drivers) for item in shown])
         ax.set_xlabel(term("table.gain"))
         ax.set_title(term("section.candidates"))
         return ax
@@ -211,7 +211,7 @@ class DiagnosisPlot:
         """
         if isinstance(most, bool) or most < 1:
             raise ValueError(f"Expected argument `upper` to be at least 1 but got {most}; 12 is what the report shows.")
-        labels = [_label(one) for one in self._separability.labels[:most]]
+        labels = [_label(label) for label in self._separability.labels[:most]]
         if not labels:
             raise ValueError("There are no candidates to compare.")
         share = array(self._separability.share)[: len(labels), : len(labels)].copy()
@@ -229,11 +229,11 @@ class DiagnosisPlot:
         Raises:
             ValueError: there is no such forcing.
         """
-        known = self._world.forcing
+        known = self._world.disturbance
         _check_number("index", index, len(known), "forcing was found")
         ax = axes_or_new(ax)
         draw_course(ax, known[index], self._traces.has_time)
-        ax.set_ylabel(named(term("picture.push"), tidy(known[index].unit)))
+        ax.set_ylabel(named(term("picture.process_noise"), tidy(known[index].unit)))
         return ax
 
     def _finding(self, number: int) -> Finding:

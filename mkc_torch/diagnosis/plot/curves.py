@@ -47,7 +47,7 @@ def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) 
 def draw_course(ax: Any, forcing: DisturbanceEstimate, has_time: bool) -> None:
     """What pushes a rate, or is added to an output, over time with its band."""
     course = array(forcing.time)
-    time, value, band = (_joined(course, array(one)) for one in (forcing.time, forcing.value, forcing.band))
+    time, value, band = (_joined(course, array(item)) for item in (forcing.time, forcing.value, forcing.band))
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     ax.fill_between(time, value - band, value + band, color=BLUE, alpha=0.2, lw=0, zorder=2)
     ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)
@@ -55,7 +55,7 @@ def draw_course(ax: Any, forcing: DisturbanceEstimate, has_time: bool) -> None:
     ax.set_xlabel(of_time(has_time))
     ax.set_ylabel(short(tidy(forcing.unit)))
     ax.locator_params(axis="y", nbins=5)
-    key = "picture.forcing" if forcing.at_rate else "picture.forcing_of_output"
+    key = "picture.disturbance" if forcing.at_rate else "picture.drift"
     ax.set_title(term(key, place=short(forcing.place)))
 
 
@@ -103,5 +103,5 @@ def named(name: str, unit: str, most: int = MOST_LETTERS) -> str:
 
 def short(text: str, most: int = MOST_LETTERS) -> str:
     """A text from a file, cut where there is no room."""
-    told = plain(text)
-    return told if len(told) <= most else told[: most - 1] + "…"
+    label = plain(text)
+    return label if len(label) <= most else label[: most - 1] + "…"

@@ -130,7 +130,7 @@ def mark_findings(ax: Any, findings: Sequence[Finding]) -> None:
 
 def onsets(finding: Finding) -> tuple[float, ...]:
     """The moments at which it sets in."""
-    return finding.moments or (() if finding.onset is None else (finding.onset,))
+    return finding.event_times or (() if finding.onset is None else (finding.onset,))
 
 
 def draw_floor(ax: Any, size: float | None) -> None:

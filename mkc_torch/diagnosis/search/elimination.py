@@ -1,4 +1,4 @@
-"""Backward elimination: a finding whose effect later findings have taken over is dropped."""
+"""Backward elimination: drop findings that later findings make needless."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["needless_term", "without"]
 
 
 def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> int | None:
-    """The effect of a joint fit that does not pay its price beside the others; None where each one does.
+    """Return the number of an effect that does not pay its penalty given the others; None if all do.
 
-    The price of an effect is half the logarithm of the number of samples for each of its numbers and each fitted number
-    of its shape (Schwarz, Annals of Statistics 6, 1978, 461), and what tells two models apart.
+    The penalty of an effect is half the logarithm of the number of samples for each of its numbers and each fitted
+    number of its shape (Schwarz, Annals of Statistics 6, 1978, 461), plus the limit of separability.
 
     Args:
         fit: with several effects.
-        declared: standard deviation of the white noise of outputs that it is known of.
-        settings: the numbers that decide.
+        declared: known standard deviations of the outputs' white noise.
+        settings: thresholds.
     """
     count = len(fit.model.terms)
     if count < 2:
@@ -36,7 +36,7 @@ def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Set
 
 
 def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> float:
-    """Nats that a fit without an effect is less likely by, less the effect's price."""
+    """Nats by which the fit without an effect is less likely, less the effect's penalty."""
     less = without(fit, number, declared, settings)
     if less is None:
         return math.inf
@@ -46,7 +46,7 @@ def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings
 
 
 def without(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> FittedModel | None:
-    """The joint fit without one of its effects, under the noise that is then left; None where it has no answer."""
+    """Return the joint fit without one of its effects, under its remaining noise; None if it fails."""
     start = without_term(fit, number)
     try:
         return with_own_noise(fitted(start.model, start.parameters, fit.bound, graduate=False), declared, settings)

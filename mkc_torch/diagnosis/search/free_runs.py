@@ -1,7 +1,8 @@
-"""Free runs of candidates: fits without process noise, where the simulation alone is far from the recording.
+"""Open-loop fits of candidates, for simulations that are far from the recording.
 
-Process noise around a fit that is wrong follows the recording so closely that straight lines along that trajectory say
-little of what is missing. A candidate that is right needs no process noise: its free run follows the recording.
+Process noise around a wrong fit follows the recording so closely that a linearisation along that trajectory shows
+little of the missing effect. The right candidate needs no process noise: its open-loop simulation follows the
+recording.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
 from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
@@ -27,25 +28,28 @@ if TYPE_CHECKING:
 __all__ = ["free_runs", "linear_gains"]
 
 PHYSICS = 8
-"""Kinds of physics of which free runs are fitted."""
+"""Number of effects that are fitted in open loop."""
 
 SHAPES = 2
-"""Shapes of each that fits begin with."""
+"""Number of initial shapes for each effect."""
 
-BEHIND_NATS, BEHIND_SHARE = 50.0, 0.5
-"""Fits farther behind the largest gain than both of these, in nats and as a share of it, are given up."""
+BEHIND_NATS = 50.0
+"""Fits farther behind the largest gain than this many nats are dropped, if also beyond the share below."""
+
+BEHIND_SHARE = 0.5
+"""Share of the largest gain by which a dropped fit is behind."""
 
 
 def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> list[tuple[int, FittedModel]]:
-    """Fits of the free runs of the candidates that gain most beside the free run of the simulation alone.
+    """Fit in open loop the candidates that gain most over the open-loop simulation.
 
     Args:
-        free: the fit of the free run without a candidate.
+        free: the open-loop fit without a candidate.
         terms: candidates.
         settings: of the diagnosis.
 
     Returns:
-        Numbers of the terms that the fits began with, one for each kind of physics, and the fits.
+        For each effect the number of its initial term, and its fit.
     """
     gains, sizes = linear_gains(free, terms, settings)
     chosen = _chosen(gains, terms)
@@ -59,7 +63,7 @@ def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> l
         if key not in best or fit.log_likelihood > best[key][1].log_likelihood:
             best[key] = number, fit
     kept = _near([fit.log_likelihood - free.log_likelihood for _, fit in best.values()])
-    leading = [one for one, near in zip(best.values(), kept, strict=True) if near]
+    leading = [pair for pair, near in zip(best.values(), kept, strict=True) if near]
     shaped = run_parallel([partial(shape_fitted, fit) for _, fit in leading], *known)
     return [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
 
@@ -67,15 +71,15 @@ def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> l
 def linear_gains(
     free: FittedModel, terms: Sequence[Term], settings: Settings
 ) -> tuple[list[float], list[Float[Tensor, " q"]]]:
-    """Gains of candidates along straight lines, in white noise, and their sizes.
+    """Return gains of candidates in the linearised model with white noise, and their sizes.
 
     Args:
-        free: the fit that the lines begin at.
+        free: the fit to linearise at.
         terms: candidates.
         settings: of the diagnosis.
 
     Returns:
-        Log-likelihood ratios in nats, 0 where the size has a sign that the physics does not allow; and the sizes.
+        Log-likelihood ratios in nats, 0 for a size whose sign the physics does not allow; and the sizes.
     """
     tangents = tangents_of(free.model, free.parameters, settings.noise, terms)
     values, counts = free.pseudo(settings.noise)
@@ -99,9 +103,9 @@ def linear_gains(
 
 
 def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
-    """Each leading kind of physics at the shapes that gain most.
+    """Return the leading effects, each at its shapes that gain most.
 
-    Lines at a fit that is far off say little of how much each gains, so none of the leading ones is left out for it.
+    Far from the solution the linear gains are unreliable, so no leading effect is dropped because of its gain.
     """
     order = sorted(range(len(terms)), key=lambda number: -gains[number])
     able = [number for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
@@ -110,7 +114,7 @@ def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
 
 
 def _near(gains: Sequence[float]) -> list[bool]:
-    """Which gains are near enough to the largest."""
+    """Whether each gain is near enough to the largest."""
     largest = max(gains, default=0.0)
     least = min(largest - BEHIND_NATS, (1.0 - BEHIND_SHARE) * largest)
     return [gain >= least for gain in gains]
@@ -119,5 +123,5 @@ def _near(gains: Sequence[float]) -> list[bool]:
 def _fit(free: FittedModel, term: Term, size: Float[Tensor, " q"]) -> FittedModel:
     model = free.model.with_term(term)
     starts = (torch.cat([free.parameters, size]), torch.cat([free.parameters, torch.zeros_like(size)]))
-    fits = [fitted_beside(free, model, start, graduate=False) for start in starts]
+    fits = [fitted_with_effect(free, model, start, graduate=False) for start in starts]
     return max(fits, key=lambda fit: fit.log_likelihood)

@@ -1,8 +1,8 @@
-"""Noise and physics chosen together: what each candidate gains when every model has the noise that suits it best.
+"""Joint selection of noise and physics: the gain of each candidate if every model has its own most likely noise.
 
-Under the noise that is likeliest without a candidate, nearly all that the candidate does can be process noise. So the
-likelihood with a candidate and that without are each the largest over the same models of the noise, for the recording
-and for draws alike. A candidate's gain counts how far the disturbance falls.
+Under the noise that is most likely without a candidate, process noise can explain nearly all that the candidate does.
+So the likelihoods with and without a candidate are maximised over the same noise models, for the recording and for
+surrogates alike. A candidate's gain then includes the fall in process noise.
 """
 
 from __future__ import annotations
@@ -36,33 +36,36 @@ if TYPE_CHECKING:
 __all__ = ["JointLikelihood", "JointStart", "joint_likelihood"]
 
 _STEPS = (0.5, 0.5, 0.25, 0.25, 0.125)
-"""Decades by which sizes and times of the leading models of the noise are varied, round after round."""
+"""Decades by which sizes and times of the leading noise models are varied, round by round."""
 
 _PAIRED = 2
-"""Rounds in which a second disturbance is tried beside that of a leading model."""
+"""Number of rounds in which a second disturbance is added to leading models."""
 
 _LEADING = 6
-"""Candidate physics whose noise is refined."""
+"""Number of effects whose noise is refined."""
 
 _SETTLED = 0.1
-"""Nats that a round has to gain for some of them, for another one to follow."""
+"""Nats that some likelihood has to gain in a round for another round."""
 
 _NULL_WITHIN = 6.0
-"""Nats behind the likeliest within which another kind of noise is drawn from too."""
+"""Nats behind the most likely noise within which surrogates of another kind of noise are drawn too."""
 
 _KINDS = 3
-"""Kinds of noise that are drawn from at most."""
+"""Largest number of kinds of noise for surrogates."""
 
 _USUAL = 0.9
-"""Quantile of a candidate's gains over draws that its gain is counted from."""
+"""Quantile of a candidate's gains over surrogates that is subtracted from its gain."""
 
-_FIRST_DRAWS, _ENOUGH = 19, 6
-"""Draws after which the p-value is clear where so many of them come up to the recording."""
+_FIRST_DRAWS = 19
+"""Surrogates of the first round."""
+
+_ENOUGH = 6
+"""Surrogates that reach the recording's gain from which no second round is drawn."""
 
 
 @dataclass(frozen=True)
 class JointStart:
-    """Where the joint fit of a candidate begins: its sizes, how far the parameters move, and its noise's observer."""
+    """Start of a candidate's joint fit: its sizes, the shift of the parameters, and the observer of its noise."""
 
     gamma: Float[Tensor, " q"]
     shift: Float[Tensor, " p"]
@@ -71,16 +74,16 @@ class JointStart:
 
 @dataclass(frozen=True)
 class JointLikelihood:
-    """What candidates gain.
+    """The gains of the candidates.
 
     Attributes:
-        gain: (C,), in nats, over the simulation without one, each under its likeliest noise.
+        gain: (C,), in nats, over the simulation without a candidate, each under its most likely noise.
         dof: (C,), numbers of each.
-        p_value: of the strongest, after the whole search, the largest over the kinds of noise drawn from.
-        beyond: nats by which it is beyond the strongest of the draws.
-        needed: (C,), nats at which each would have a p-value of the level.
-        noise: of each candidate, its likeliest noise; ``without``, that of the simulation alone.
-        scene: what the numbers are computed from.
+        p_value: of the strongest candidate after the whole search, the largest over the kinds of noise.
+        beyond: nats by which it exceeds the strongest surrogate.
+        needed: (C,), gains in nats at which the p-value would equal the level.
+        noise: the most likely noise with each candidate; ``without`` that of the simulation without a candidate.
+        scene: the linearised recording.
     """
 
     gain: Float[Tensor, " C"]
@@ -94,19 +97,19 @@ class JointLikelihood:
 
     @property
     def longer(self) -> float:
-        """Times as long a recording has to be for its strongest candidate to reach the level, if it is there."""
+        """Ratio by which a recording has to be longer for the strongest candidate to reach the level, if it is real."""
         number = int((self.gain - self.needed).argmax())
         gain, needed = float(self.gain[number]), float(self.needed[number])
         return needed / gain if gain > 0.0 else torch.inf
 
     def start(self, number: int) -> JointStart:
-        """Where the joint fit of a candidate begins."""
+        """Return the start of a candidate's joint fit."""
         return self.scene.start(number, self.noise[number])
 
 
 @dataclass(frozen=True)
 class _LinearisedRecording:
-    """The linearised recording: its flow, with all samples and with those that count, its series, the columns."""
+    """The linearised recording: its flow, with all samples and with those that count, its series and the tangents."""
 
     prepared: Observable
     flow: Flow
@@ -121,7 +124,7 @@ class _LinearisedRecording:
         return log_likelihoods(self.counted, models, series, self.columns, self.largest, thing)
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The recording whitened beside a candidate (N, m), the candidate's sizes and the parameters' shift."""
+        """Return the whitened recording given a candidate (N, m), the candidate's sizes and the parameters' shift."""
         gains = gains_of(self.counted, filter_models(self.counted, [model]))
         [(_, values)] = whitened(self.counted, gains, joined(self.series, self.columns.series))
         used, p = self.counted.counts > 0, self.columns.parameters
@@ -138,10 +141,10 @@ class _LinearisedRecording:
         left, gamma, shift = self.residual(number, model)
         used = self.counted.counts > 0
         scale = 1.0 if any(model.known) else max(float(np.sqrt(np.square(left[used]).mean())), model.least_scale)
-        names, channels = self.prepared.pushable, self.prepared.channels
+        names, channels = self.prepared.disturbable, self.prepared.channels
         like = self.prepared.measured
         disturbances = model.disturbances(names, channels, scale)
-        sensor = like.new_tensor([scale * one for one in model.sensor])
+        sensor = like.new_tensor([scale * size for size in model.sensor])
         observer = observer_of(self.flow, disturbances, sensor, names, channels)
         return JointStart(like.new_tensor(gamma), like.new_tensor(shift), observer)
 
@@ -158,51 +161,52 @@ def joint_likelihood(
     declared: Sequence[bool] = (),
     quick: bool = False,
 ) -> JointLikelihood | None:
-    """The search beside a fit of differential equations; None where its trajectory is lost.
+    """Search the candidates at a fit of differential equations; None if its trajectory is lost.
 
     Args:
-        base: the fit, along whose trajectory all is linear.
+        base: the fit whose trajectory is linearised.
         terms: candidates.
         tangents: of the fit's parameters and the candidates.
-        counts: what counts of the fit's residual.
-        draws: of each kind of noise.
-        generator: of the draws.
-        level: of false alarms.
-        declared: of each output whether its white noise is declared.
-        quick: draw nothing; there is an effect if any candidate gains more than its price.
+        counts: mask of the fit's residual.
+        draws: number of surrogates for each kind of noise.
+        generator: of the surrogates.
+        level: rate of false alarms.
+        declared: for each output whether its white noise is declared.
+        quick: draw no surrogates; there is an effect if a candidate gains more than its penalty.
     """
     scene = _scene(base, terms, tangents, counts)
     if scene is None:
         return None
     prepared = scene.prepared
     observer = prepared.observer
-    names, channels = prepared.pushable, prepared.channels
+    names, channels = prepared.disturbable, prepared.channels
     size = base.residual.square().mul(counts).sum(0).div(counts.sum(0).clamp(min=1.0)).sqrt()
     sensor = (size if observer is None else observer.sensor).tolist()
-    told = tuple(declared) or (False,) * len(channels)
-    rounding = [0.0 if one else step for one, step in zip(told, rounding_of(prepared.measured).tolist(), strict=True)]
-    sensor = [max(one, step, 1e-300) for one, step in zip(sensor, rounding, strict=True)]
-    white = NoiseModel(tuple(sensor), (), told, tuple(rounding))
+    known_noise = tuple(declared) or (False,) * len(channels)
+    steps = rounding_of(prepared.measured).tolist()
+    rounding = [0.0 if is_known else step for is_known, step in zip(known_noise, steps, strict=True)]
+    sensor = [max(size, step, 1e-300) for size, step in zip(sensor, rounding, strict=True)]
+    white = NoiseModel(tuple(sensor), (), known_noise, tuple(rounding))
     grid = NoiseGrid(scene.counted, white)
-    pushes = () if observer is None else observer.disturbances
-    known = [NoiseModel.of(pushes, sensor, names, channels, told, rounding)] if pushes else []
+    disturbances = () if observer is None else observer.disturbances
+    known = [NoiseModel.of(disturbances, sensor, names, channels, known_noise, rounding)] if disturbances else []
     keys = [term.key for term in terms]
-    found = _refined(scene, grid, [one for one in known if grid.plausible(one)], keys)
+    found = _refined(scene, grid, [model for model in known if grid.plausible(model)], keys)
     without = found.without[:, 0]
     best = int(without.argmax())
-    gains = found.beside[:, :, 0].max(0) - without[best]
+    gains = found.with_candidate[:, :, 0].max(0) - without[best]
     strongest = int((gains - found.rank).argmax())
-    left, *_ = scene.residual(strongest, found.models[int(found.beside[:, strongest, 0].argmax())])
+    left, *_ = scene.residual(strongest, found.models[int(found.with_candidate[:, strongest, 0].argmax())])
     p_value, beyond, needed = 0.0, np.inf, np.zeros(len(terms))
     if quick:
         samples, tried = int(scene.counted.counts.sum()), len(set(keys))
-        needed = np.array([price(one, samples, tried) for one in found.rank])
+        needed = np.array([price(rank, samples, tried) for rank in found.rank])
         p_value = COUNTS if bool((gains > needed).any()) else COUNTS_NOT
     for kind in () if quick else _kinds(found):
-        one = _judged(scene, found, kind, left, draws, generator, level)
-        if one[0] >= p_value:
-            p_value, needed = one[0], np.maximum(needed, one[2])
-        beyond = min(beyond, one[1])
+        of_kind = _surrogate_test(scene, found, kind, left, draws, generator, level)
+        if of_kind[0] >= p_value:
+            p_value, needed = of_kind[0], np.maximum(needed, of_kind[2])
+        beyond = min(beyond, of_kind[1])
         if p_value > level:
             break
     return JointLikelihood(
@@ -211,7 +215,7 @@ def joint_likelihood(
         p_value,
         float(beyond),
         torch.from_numpy(needed),
-        tuple(found.models[int(number)] for number in found.beside[:, :, 0].argmax(0)),
+        tuple(found.models[int(number)] for number in found.with_candidate[:, :, 0].argmax(0)),
         found.models[best],
         scene,
     )
@@ -223,7 +227,9 @@ def _scene(
     prepared, model = base.model.prepared, base.model
     assert isinstance(prepared, PreparedDynamics)
     flow = flow_of(prepared, base.parameters[: model.base], model.changes(base.parameters), model.near)
-    if flow is None or not all(np.isfinite(one).all() for one in (flow.carried, flow.seen, flow.new, flow.shift)):
+    if flow is None or not all(
+        np.isfinite(values).all() for values in (flow.transition, flow.seen, flow.new, flow.shift)
+    ):
         return None
     counted = replace(flow, counts=flow.counts * counts.double().cpu().numpy())
     moved = torch.cat([tangents.nuisance, *tangents.candidates], -1).double().cpu().numpy()
@@ -231,7 +237,7 @@ def _scene(
     columns = Columns(
         _along(flow, prepared, base.residual, moved),
         model.size,
-        tuple(one.shape[-1] for one in tangents.candidates),
+        tuple(columns.shape[-1] for columns in tangents.candidates),
         tuple(term.effect.one_sided for term in terms),
     )
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
@@ -240,19 +246,19 @@ def _scene(
 
 
 def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:
-    """Tangents of a residual as series along its trajectory."""
+    """Return tangents of a residual as series along its trajectory."""
     observer = prepared.observer
     if observer is None:
-        return SeriesAlong(moved, np.zeros((len(moved) - 1, flow.carried.shape[1], moved.shape[-1])))
+        return SeriesAlong(moved, np.zeros((len(moved) - 1, flow.transition.shape[1], moved.shape[-1])))
     back = torch.linalg.inv(observer.white)
     slope = clipped_slope(torch.einsum("nij,nj->ni", back, residual), observer.spread)
-    names, channels = prepared.pushable, prepared.channels
+    names, channels = prepared.disturbable, prepared.channels
     model = NoiseModel.of(observer.lasting, observer.sensor.tolist(), names, channels)
     return relative_to(
         flow,
         observer.gain.double().cpu().numpy(),
-        np.array([place for place, _, _ in model.pushes], dtype=int),
-        np.array([lasting for _, _, lasting in model.pushes]),
+        np.array([place for place, _, _ in model.components], dtype=int),
+        np.array([lasting for _, _, lasting in model.components]),
         back.double().cpu().numpy() @ moved,
         slope.double().cpu().numpy(),
     )
@@ -261,10 +267,10 @@ def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Floa
 def _refined(
     scene: _LinearisedRecording, grid: NoiseGrid, more: Sequence[NoiseModel], keys: Sequence[object]
 ) -> LogLikelihoods:
-    """Over the grid, and around the likeliest noise of the simulation alone and beside each leading candidate."""
+    """Evaluate the grid, then refine the most likely noise without a candidate and with each leading candidate."""
     singles = grid.singles()
     found = scene.likelihoods([*singles, *more])
-    have = {key_of(one) for one in found.models}
+    have = {key_of(model) for model in found.models}
     for number, decades in enumerate(_STEPS):
         leading = _leading(found, keys)
         before = _largest(found)
@@ -272,12 +278,12 @@ def _refined(
         for place in leading:
             model = found.models[place]
             others = grid.neighbours(model, decades)
-            if number < _PAIRED and len(model.pushes) == 1:
+            if number < _PAIRED and len(model.components) == 1:
                 others += grid.pairs(model, singles)
-            for one in others:
-                if key_of(one) not in have:
-                    have.add(key_of(one))
-                    tried.append(one)
+            for other in others:
+                if key_of(other) not in have:
+                    have.add(key_of(other))
+                    tried.append(other)
         if not tried:
             break
         found = found.and_more(scene.likelihoods(tried))
@@ -287,37 +293,37 @@ def _refined(
 
 
 def _largest(found: LogLikelihoods) -> np.ndarray:
-    return np.concatenate([found.without[:, 0].max(0, keepdims=True), found.beside[:, :, 0].max(0)])
+    return np.concatenate([found.without[:, 0].max(0, keepdims=True), found.with_candidate[:, :, 0].max(0)])
 
 
 def _leading(found: LogLikelihoods, keys: Sequence[object]) -> list[int]:
-    """Models of the noise that are the likeliest without a candidate, or with one of the leading ones."""
+    """Return the noise models that are most likely without a candidate, or with a leading candidate."""
     leading = [int(found.without[:, 0].argmax())]
-    best = found.beside[:, :, 0].max(0) - found.rank
+    best = found.with_candidate[:, :, 0].max(0) - found.rank
     seen: set[object] = set()
     for number in np.argsort(-best):
         if keys[number] in seen:
             continue
         seen.add(keys[number])
-        leading.append(int(found.beside[:, number, 0].argmax()))
+        leading.append(int(found.with_candidate[:, number, 0].argmax()))
         if len(seen) == _LEADING:
             break
     return list(dict.fromkeys(leading))
 
 
 def _kinds(found: LogLikelihoods) -> list[int]:
-    """The likeliest model of each kind of noise that the recording may have without a candidate."""
+    """Return the most likely model of each plausible kind of noise without a candidate."""
     values = found.without[:, 0]
     kinds: dict[object, int] = {}
     for number in np.argsort(-values):
         if values[number] < values.max() - _NULL_WITHIN or len(kinds) == _KINDS:
             break
-        kind = tuple(sorted((place, lasting > 0.0) for place, _, lasting in found.models[number].pushes))
+        kind = tuple(sorted((place, lasting > 0.0) for place, _, lasting in found.models[number].components))
         kinds.setdefault(kind, int(number))
     return list(kinds.values())
 
 
-def _judged(
+def _surrogate_test(
     scene: _LinearisedRecording,
     found: LogLikelihoods,
     kind: int,
@@ -326,18 +332,18 @@ def _judged(
     generator: torch.Generator,
     level: float,
 ) -> tuple[float, float, Float[np.ndarray, " C"]]:
-    """The p-value, nats beyond all draws, and the gains that would have a p-value of the level.
+    """Return the p-value, nats beyond all surrogates, and the gains whose p-value would equal the level.
 
-    Draws are of a model of the noise, with the sizes that the innovations have beside the strongest candidate, so that
-    what is missing is not among them, each with a sign of its own.
+    Surrogates follow a noise model, with the sizes of the innovations given the strongest candidate, so that they do
+    not contain the missing effect; each innovation has a random sign.
     """
     gained = np.zeros((len(found.rank), 0))
-    own = found.beside[:, :, 0].max(0) - found.without[:, 0].max()
+    own = found.with_candidate[:, :, 0].max(0) - found.without[:, 0].max()
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
             break
         some = scene.likelihoods(found.models, _drawn(scene, found.models[kind], left, count, generator))
-        drawn = some.beside[:, :, 1:].max(0) - some.without[:, 1:].max(0)
+        drawn = some.with_candidate[:, :, 1:].max(0) - some.without[:, 1:].max(0)
         gained = np.concatenate([gained, drawn], 1)
         usual = np.quantile(gained, _USUAL, axis=1, keepdims=True)
         strongest = (gained - usual).max(0)
@@ -360,7 +366,7 @@ def _drawn(
     gains = gains_of(flow, filter_models(flow, [model]))
     scale = 1.0 if any(model.known) else np.sqrt(np.square(left[used]).mean())
     sign = 2.0 * torch.randint(2, (*left.shape, count), generator=generator).numpy() - 1.0
-    # a sample that does not count has an innovation of 0
+    # a masked sample has an innovation of 0
     back = np.linalg.inv(gains.white[:, 0] + np.eye(left.shape[1]) * ~used[:, :, None])
     innovations = back @ (sign * (left / scale)[..., None]) * used[..., None]
     models = gains.models

@@ -1,4 +1,4 @@
-"""The candidates that a joint refit makes the most of, from starts that a bad first fit cannot hide."""
+"""Joint refits of the most promising candidates, from several starts in case the first fit hides the effect."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import ModelTangents, tangents_of
-from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_with_effect
 from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.linearized import LinearizedSearch
@@ -33,22 +33,22 @@ T = TypeVar("T")
 __all__ = ["refitted", "strongest"]
 
 Start = tuple[Tensor, tuple[Tensor, Tensor]]
-"""Parameters to linearise around, and the pseudo-residual there with what counts of it."""
+"""Parameters to linearise at, and the pseudo-residual there with its mask."""
 
 Listed = tuple[Term, Tensor]
-"""A candidate worth a joint refit, with the parameters to start from, its γ the last ones."""
+"""A candidate for a joint refit, with the initial parameters, γ last."""
 
 
 def strongest(
     base: FittedModel, terms: tuple[Term, ...], prefer: ModelPrior, settings: Settings, *, parts: bool
 ) -> tuple[list[FittedModel], ModelTangents]:
-    """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
+    """Refit the most promising candidates jointly with the baseline; return the fits, best first, and the tangents.
 
-    Beside them the tangents at the fit that they are beside.
+    The leading fits come first, each at its best shape, then the others. The tangents are those at the baseline fit.
 
-    Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
-    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
-    where its fit began.
+    Candidates are ranked by the likelihood's own score and by a clipped score, which still sees a stretch of samples
+    that the fit rejects. In case one model of the whole recording diverges, they are also ranked at fits to parts of
+    the recording, and at the initial values of its fit.
     """
     around = base.parameters
     noise, search = settings.noise, settings.search
@@ -62,13 +62,13 @@ def strongest(
     fits: dict[Key, FittedModel] = {}
     fitted_parts = _part_fits(base, search.parts) if parts else []
     listed: dict[Key, Listed] = {}
-    for one in chain(*(chosen for chosen, _ in lists)):
-        listed.setdefault(one[0].key, one)
+    for entry in chain(*(chosen for chosen, _ in lists)):
+        listed.setdefault(entry[0].key, entry)
     starts = _refit_all(fits, base, list(listed.values()), prefer, fitted_parts)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
         started = [
-            one.start for one in starts if one is not None and bool((one.scale < search.part_better * least).any())
+            part.start for part in starts if part is not None and bool((part.scale < search.part_better * least).any())
         ]
         more = [
             _short_list(base, terms, start, tangents_of(base.model, start[0], noise, terms), search.refitted_elsewhere)
@@ -76,8 +76,8 @@ def strongest(
         ]
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
-    likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
-    order = [terms[number] for number in in_order((-likeliest).tolist(), terms)]
+    best_log_p = torch.stack([log_p for _, log_p in lists]).amin(0)
+    order = [terms[number] for number in in_order((-best_log_p).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
     shaped = run_parallel(
         [partial(refined, fit, base) for fit in leading], base.model.prepared, terms, "leading candidate"
@@ -91,7 +91,7 @@ def strongest(
 def _short_list(
     base: FittedModel, terms: tuple[Term, ...], start: Start, tangents: ModelTangents, most: int
 ) -> tuple[list[Listed], Float[Tensor, " C"]]:
-    """The strongest candidates, noise taken for white, and the log of each one's p."""
+    """Return the strongest candidates under white noise, and log p of each candidate."""
     parameters, (pseudo, counts) = start
     plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, drift=False)
     log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
@@ -108,7 +108,7 @@ def _short_list(
         if len(chosen) >= most:
             break
     if not chosen:
-        # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
+        # no candidate has an allowed sign; keep a candidate at size 0, which the search then rejects
         size = base.model.with_term(terms[0]).sizes[-1]
         chosen[terms[0].key] = terms[0], torch.cat([parameters, parameters.new_zeros(size)])
     return list(chosen.values()), log_p
@@ -123,7 +123,7 @@ class _Part:
 
 
 def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]]:
-    """Works that fit parts of the recording; None where one cannot be fitted alone."""
+    """Return functions that fit parts of the recording; they return None if the part cannot be fitted."""
     N = len(base.model.prepared.time)
 
     def fit_to(rows: Bool[Tensor, " N"]) -> _Part | None:
@@ -140,7 +140,7 @@ def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]
 
 
 def _first_start(base: FittedModel, away: float) -> list[Start]:
-    """Around where the fit began, if a parameter of the equations went far from there: what they lack can drive it."""
+    """Return the initial values as a start if a parameter moved far from them, as a missing effect can cause."""
     prepared = base.model.prepared
     if not isinstance(prepared, Beginning):
         return []
@@ -158,12 +158,12 @@ def _refit_all(
     base: FittedModel,
     listed: Sequence[Listed],
     prefer: ModelPrior,
-    beside: Sequence[Callable[[], T]] = (),
+    further: Sequence[Callable[[], T]] = (),
 ) -> list[T]:
-    """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
-    works = [partial(fitted_beside, base, base.model.with_term(term), start) for term, start in listed]
+    """Store the best joint refit of each effect in ``fits``; return the results of further parallel functions."""
+    works = [partial(fitted_with_effect, base, base.model.with_term(term), start) for term, start in listed]
     done: list[Any] = run_parallel(
-        [*works, *beside], base.model.prepared, [term for term, _ in listed], "fit of a candidate"
+        [*works, *further], base.model.prepared, [term for term, _ in listed], "fit of a candidate"
     )
     for (term, _), fit in zip(listed, done, strict=False):
         if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
@@ -174,7 +174,7 @@ def _refit_all(
 def _leading(
     fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior, settings: SearchSettings
 ) -> list[FittedModel]:
-    """The first ones, and another that is close behind."""
+    """Return the leading fits, and a further fit if it is close behind."""
     leading = settings.leading
     first = best_first(fits, base, prefer)[: leading + 1]
     close = max(settings.third_share * prefer.score(first[0], base), settings.third_nats)
@@ -184,9 +184,9 @@ def _leading(
 def _at_best_shapes(
     fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: ModelPrior, most: int
 ) -> list[FittedModel]:
-    """Each fit, or a better one with another shape of the same effect, of so many of ``terms`` the likeliest first.
+    """Return each fit, or a better fit of the same effect with another of the ``most`` most likely shapes in ``terms``.
 
-    Onsets are many, and closed in on later.
+    Onsets are many, and refined later.
     """
     tried = []
     for place, fit in enumerate(fits):
@@ -205,17 +205,18 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
     model = fit.model.with_last(term)
     kept = fit.parameters[: model.size]
     more = kept.new_zeros(model.size - len(kept))
-    return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
+    return fitted_with_effect(base, model, torch.cat([kept, more]), graduate=False)
 
 
 def refitted(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
-    """The joint fit of a candidate in the place of another one's, from the size that the search has for it."""
+    """Return the joint fit of a candidate in place of another, from its size in the search."""
     base, gamma = look.scene.base, look.estimate(number)
     gamma = gamma.clamp(max=0.0) if term.effect.one_sided else gamma
-    beside = best.model.with_last(term) if len(best.model.terms) > len(base.model.terms) else best.model.with_term(term)
-    found = fitted_beside(base, beside, torch.cat([best.parameters[: base.model.size], -gamma]))
+    more_terms = len(best.model.terms) > len(base.model.terms)
+    extended = best.model.with_last(term) if more_terms else best.model.with_term(term)
+    found = fitted_with_effect(base, extended, torch.cat([best.parameters[: base.model.size], -gamma]))
     if found.log_likelihood >= base.log_likelihood:
         return found
-    # it went astray from there: from nothing it only climbs
+    # the fit diverged from there; from size 0 the likelihood only increases
     model = base.model.with_term(term)
-    return fitted_beside(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)
+    return fitted_with_effect(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)

@@ -1,9 +1,9 @@
-"""Log-likelihoods of series with and without each candidate under many models of the noise, in one computation.
+"""Log-likelihoods of series with and without each candidate under many noise models, in one computation.
 
-For a model of the noise a Kalman filter whitens all series together: the recording, draws of noise, and the tangents of
-the simulation's parameters and of the candidates. What is left is one regression a candidate. The log-likelihood is the
-restricted one, its scale profiled out, so that the flexibility of process noise has its price in log det S and that of
-the parameters in the log det of their tangents (Harville, Journal of the American Statistical Association 72, 1977).
+For each noise model a Kalman filter whitens all series together: the recording, the surrogates, and the tangents of the
+simulation's parameters and of the candidates. One regression per candidate remains. The log-likelihood is
+restricted, with its scale profiled out, so that log det S is the penalty of process noise, and the log det of the
+tangents that of the parameters (Harville, Journal of the American Statistical Association 72, 1977).
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 __all__ = ["Columns", "LogLikelihoods", "log_likelihoods"]
 
 _SINGULAR = 1e-9
-"""Share of a candidate's squares, or of their largest eigenvalue, below which a direction of it counts as absent."""
+"""Share of a candidate's squares, or of their largest eigenvalue, below which a direction counts as absent."""
 
 PRICE = 6.0
-"""Nats that a disturbance has to gain to be in the noise, as those of the baseline."""
+"""Nats that a disturbance has to gain to enter the noise model, as for the baseline."""
 
 _CELLS = 1 << 17
-"""Numbers of whitened tangents that are worked on at once: 1 MB, which stays in a processor's cache."""
+"""Numbers of whitened tangents per block: 1 MB, which fits into a processor's cache."""
 
 _COVARIANCES = 8_000_000
 """Numbers of the filters' covariances that are held at once: 64 MB, a few times over."""
 
 _DEPENDENT = 1e-10
-"""Share of the largest singular value of the parameters' tangents below which a direction of them counts as absent."""
+"""Share of the largest singular value of the parameters' tangents below which a direction counts as absent."""
 
 
 @dataclass(frozen=True)
@@ -65,37 +65,37 @@ class Columns:
     one_sided: tuple[bool, ...]
 
     def places(self, number: int) -> slice:
-        """Where a candidate's tangents stand among all of them."""
+        """Return the columns of a candidate's tangents."""
         first = self.parameters + sum(self.sizes[:number])
         return slice(first, first + self.sizes[number])
 
 
 @dataclass(frozen=True)
 class LogLikelihoods:
-    """Log-likelihoods of Y series under B models of the noise, and the first series' estimates.
+    """Log-likelihoods of Y series under B noise models, and the first series' estimates.
 
     Attributes:
-        models: the models of the noise.
+        models: the noise models.
         without: (B, Y), without a candidate, in nats.
-        beside: (B, C, Y), with each candidate.
+        with_candidate: (B, C, Y), with each candidate.
         sizes: (B, q), of all candidates one after the other, for the first series.
-        rank: (C,), directions of each candidate that the parameters leave.
-        scale: (B, C), of the first series' noise with each candidate, over that of the model.
+        rank: (C,), number of directions of each candidate that the parameters leave.
+        scale: (B, C), of the first series' noise with each candidate, relative to the model's.
     """
 
     models: tuple[NoiseModel, ...]
     without: Float[np.ndarray, "B Y"]
-    beside: Float[np.ndarray, "B C Y"]
+    with_candidate: Float[np.ndarray, "B C Y"]
     sizes: Float[np.ndarray, "B q"]
     rank: Float[np.ndarray, " C"]
     scale: Float[np.ndarray, "B C"]
 
     def and_more(self, other: LogLikelihoods) -> LogLikelihoods:
-        """With those under other models."""
+        """Append the log-likelihoods under other models."""
         return LogLikelihoods(
             (*self.models, *other.models),
             np.concatenate([self.without, other.without]),
-            np.concatenate([self.beside, other.beside]),
+            np.concatenate([self.with_candidate, other.with_candidate]),
             np.concatenate([self.sizes, other.sizes]),
             np.maximum(self.rank, other.rank),
             np.concatenate([self.scale, other.scale]),
@@ -110,19 +110,19 @@ def log_likelihoods(
     largest: Float[np.ndarray, " p+m"] | None = None,
     thing: str = "",
 ) -> LogLikelihoods:
-    """The log-likelihoods; -inf where a disturbance, at the likeliest scale, is larger than is plausible.
+    """Compute the log-likelihoods; -inf if a disturbance, at its most likely scale, is implausibly large.
 
     Args:
-        flow: of the trajectory; its ``counts`` say which samples count.
-        models: of the noise, alike in which outputs' white noise is declared.
-        series: Y series to explain, the recording's the first one.
-        columns: what may explain them.
+        flow: of the trajectory; its ``counts`` mask the samples.
+        models: of the noise; all declare the white noise of the same outputs.
+        series: Y series to explain, the recording's first.
+        columns: tangents that may explain them.
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
-        thing: name of what a model of the noise is to the user, where progress counts them.
+        thing: name of a noise model in the progress.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
     used = flow.counts > 0
-    without, beside = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
+    without, with_candidate = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
     groups = _by_size(columns.sizes)
     own, candidates = _split(columns, groups)
@@ -139,7 +139,7 @@ def log_likelihoods(
         if products is None:
             continue
         n = len(rows) - basis.shape[1]
-        level = -gains.log_spread[place] - log_det - PRICE * len(models[number].pushes)
+        level = -gains.log_spread[place] - log_det - PRICE * len(models[number].components)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)
         least = models[number].least_scale
@@ -150,18 +150,18 @@ def log_likelihoods(
             remains = np.maximum(power - explained, 1e-12 * power)
             size = _scale(remains, n, free, least)
             gained = level + _log_likelihood(remains, n if free else 0, size)
-            beside[number, members] = np.where(size <= reach, gained, -np.inf)
+            with_candidate[number, members] = np.where(size <= reach, gained, -np.inf)
             sizes[number, index] = solved / norm
             rank[members] = np.maximum(rank[members], found)
             scale[number, members] = size[:, 0]
-    return LogLikelihoods(tuple(models), without, beside, sizes, rank, scale)
+    return LogLikelihoods(tuple(models), without, with_candidate, sizes, rank, scale)
 
 
 def _under_each(
     flow: Flow, models: Sequence[NoiseModel], series: SeriesAlong
 ) -> Iterator[tuple[int, FilterGains, int, Float[np.ndarray, "N m K"]]]:
-    """The whitened series under each model: its number, gains of some models, its number among these, the series."""
-    states = flow.carried.shape[1] + max(len(one.pushes) for one in models)
+    """Yield for each model: its number, gains of a block of models, its number there, the whitened series."""
+    states = flow.transition.shape[1] + max(len(model.components) for model in models)
     block = max(1, _COVARIANCES // (len(flow.new) * states**2))
     for first in range(0, len(models), block):
         gains = gains_of(flow, filter_models(flow, models[first : first + block]))
@@ -170,17 +170,17 @@ def _under_each(
 
 
 def _by_size(sizes: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Candidates of as many numbers: which they are, and the places of their tangents."""
+    """Group candidates by their number of columns: members, and the columns of their tangents."""
     first = np.concatenate([[0], np.cumsum(sizes)])
     groups = []
     for size in sorted(set(sizes)):
-        members = np.array([c for c, one in enumerate(sizes) if one == size], dtype=int)
+        members = np.array([c for c, width in enumerate(sizes) if width == size], dtype=int)
         groups.append((members, first[members][:, None] + np.arange(size)))
     return groups
 
 
 def _basis(own: Float[np.ndarray, "M p"]) -> tuple[Float[np.ndarray, "M k"], float]:
-    """An orthonormal basis of the parameters' tangents, and half the log det of their products."""
+    """Return an orthonormal basis of the parameters' tangents, and half the log det of their products."""
     if not own.shape[1]:
         return own, 0.0
     basis, values, _ = np.linalg.svd(own, full_matrices=False)
@@ -191,26 +191,26 @@ def _basis(own: Float[np.ndarray, "M p"]) -> tuple[Float[np.ndarray, "M k"], flo
 def _log_likelihood(
     power: Float[np.ndarray, "*c Y"], n: int, scale: Float[np.ndarray, "*c Y"]
 ) -> Float[np.ndarray, "*c Y"]:
-    """Of n numbers by white noise of that scale, up to a constant; n is 0 where the scale is known."""
+    """Return the log-likelihood of n numbers in white noise of that scale, up to a constant; n = 0 if known."""
     square = np.maximum(np.square(scale), 1e-300)
     result: np.ndarray = -0.5 * (n * np.log(square) + power / square - n)
     return result
 
 
 def _scale(power: Float[np.ndarray, "*c Y"], n: int, free: bool, least: float) -> Float[np.ndarray, "*c Y"]:
-    """Of the noise, over that of its model: the likeliest, but no less than that which the recording's steps leave."""
+    """Return the scale of the noise relative to its model: the most likely, but at least the recording's resolution."""
     return np.maximum(np.sqrt(power / max(n, 1)), least) if free else np.ones_like(power)
 
 
 def _reach(model: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> float:
-    """Scale up to which the disturbances of a model are of a plausible size."""
+    """Return the scale up to which the disturbances of a model are plausible."""
     if largest is None:
         return np.inf
-    return min((float(largest[place]) / size for place, size, _ in model.pushes if size > 0.0), default=np.inf)
+    return min((float(largest[place]) / size for place, size, _ in model.components if size > 0.0), default=np.inf)
 
 
 def _split(columns: Columns, groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[SeriesAlong, SeriesAlong]:
-    """The parameters' tangents, and those of the candidates: group after group, of a group number after number."""
+    """Split the tangents into the parameters' and the candidates', the latter by group and then by number."""
     new, shift, p = columns.series.new, columns.series.shift, columns.parameters
     order = np.concatenate([p + index.T.ravel() for _, index in groups] or [np.zeros(0, dtype=int)])
     own = SeriesAlong(new[..., :p], shift[..., :p])
@@ -226,12 +226,12 @@ def _products(
     left: Float[np.ndarray, "M Y"],
     groups: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]] | None:
-    """Products of the candidates' whitened tangents, summed over blocks of samples that stay in the cache.
+    """Return products of the candidates' whitened tangents, summed over blocks that fit into the cache.
 
     Returns:
         For each group of c candidates of q numbers: the products (c, q, q) of what the parameters leave of the
-        tangents, over their norms; their products (c, q, Y) with the series, likewise; the norms (c, q). None where
-        some are not finite.
+        tangents, over their norms; their products (c, q, Y) with the series, likewise; the norms (c, q). None if some
+        are not finite.
     """
     m, K = candidates.new.shape[1:]
     used = flow.counts > 0
@@ -271,12 +271,12 @@ def _explained(
     members: np.ndarray,
     one_sided: Sequence[bool],
 ) -> tuple[Float[np.ndarray, "c Y"], Float[np.ndarray, "c q"], Float[np.ndarray, " c"]]:
-    """Squares that candidates of one size explain, minus the first series' estimates, and the candidates' ranks."""
+    """Return explained squares for candidates of one size, minus the first series' estimates, and the ranks."""
     values, vectors = np.linalg.eigh(gram)
     kept = values > np.maximum(_SINGULAR, _SINGULAR * values[:, -1:])
     inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(1, 2)
     solved = inverse @ own
-    # the residual falls by what an effect adds: a negative slope is a positive size
+    # the residual decreases by what an effect adds: a negative slope is a positive size
     barred = np.array([one_sided[c] for c in members])[:, None] & (solved >= 0).all(1)
     explained = np.where(barred, 0.0, (own * solved).sum(1))
     return explained, np.where(barred[:, :1], 0.0, -solved[:, :, 0]), kept.sum(1)

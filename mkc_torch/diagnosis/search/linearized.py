@@ -1,4 +1,4 @@
-"""What a search looks at: a fit, what candidates move there, and what of the residuals counts."""
+"""The linearised search problem: a fit, the tangents of the candidates, and the mask of the residuals."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ __all__ = ["LinearizedSearch", "SearchProblem"]
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """The candidates beside a fit, where they are linear, and the residuals that they would have to explain.
+    """The linearised candidates at a fit, and the residuals that they would have to explain.
 
     Attributes:
-        base: the fit that the candidates stand beside.
-        around: the fit that tangents are taken at: the same one, or one with a candidate in it.
+        base: the fit that candidates are added to.
+        around: the fit at which tangents are taken: ``base``, or a fit with a candidate.
         terms: the candidates.
         tangents: of the parameters of ``base`` and of the candidates.
-        values, counts: (N, m), the pseudo-residual without a candidate, and what counts of it.
+        values, counts: (N, m), the pseudo-residual without a candidate, and its mask.
         settings: of the search.
     """
 
@@ -50,16 +50,16 @@ class SearchProblem:
 
     @property
     def parts(self) -> tuple[object, ...]:
-        """All that is large of it."""
+        """All large parts."""
         return (self.values, self.counts, *self.tangents.parts, *self._seen.parts)
 
     @cached_property
     def _seen(self) -> CosineProjection:
-        """The same for noise of any colour."""
+        """The projection to the cosine basis, for noise of any spectrum."""
         return CosineProjection.of(self.values, self.counts, self.tangents, self.tangents.slow)
 
     def under(self, spectrum: NoiseSpectrum | None = None) -> LinearizedSearch:
-        """The search of it under noise of a colour, default the likeliest one."""
+        """Return the search under noise of a spectrum, by default the most likely."""
         parameters = self.around.parameters[: self.base.model.size]
         found = linearise(
             self.base.model, parameters, self.values, self.counts, self.tangents, spectrum=spectrum, seen=self._seen
@@ -67,26 +67,26 @@ class SearchProblem:
         return LinearizedSearch(self, found)
 
     def without(self, stretch: tuple[int, int]) -> SearchProblem:
-        """The same with nothing that counts from one sample to before another."""
+        """Return the problem with a stretch of samples masked."""
         rest = self.counts.clone()
         rest[slice(*stretch)] = 0.0
         return replace(self, values=rest * self.values, counts=rest)
 
-    def bends(self, term: Term) -> bool:
-        """Whether an effect bends a trajectory, so that its tangents hold for small sizes alone."""
+    def is_nonlinear(self, term: Term) -> bool:
+        """Whether an effect acts through a trajectory, so that its tangents hold for small sizes only."""
         return self.tangents.pointwise[term.port] is None
 
     def tangents_of(self, terms: Sequence[Term]) -> Sequence[Float[Tensor, "N m q"]]:
-        """Those of other candidates."""
+        """Return the tangents of other candidates."""
         return Candidates(self.around.model, self.around.parameters, terms, self.tangents.pointwise)
 
 
 @dataclass(frozen=True)
 class LinearizedSearch:
-    """A scene and its search under noise of one colour.
+    """A search problem and its search under one noise spectrum.
 
     Attributes:
-        scene: what is looked at.
+        scene: the problem.
         linearised: the search.
     """
 
@@ -95,7 +95,7 @@ class LinearizedSearch:
 
     @property
     def settings(self) -> Settings:
-        """Those of the scene."""
+        """Settings of the problem."""
         return self.scene.settings
 
     @cached_property
@@ -105,12 +105,12 @@ class LinearizedSearch:
 
     @cached_property
     def noise(self) -> NoiseFit:
-        """The wander of the noise without a candidate."""
+        """The drift of the noise without a candidate."""
         return self.linearised.search.noise_fit(self.linearised.series)
 
     @cached_property
     def possible(self) -> Bool[Tensor, " C"]:
-        """Whether the amplitudes that fit have a sign that the physics allows."""
+        """Whether the fitted sizes have a sign that the physics allows, (C,)."""
         possible = torch.ones(len(self.scene.terms), dtype=torch.bool)
         for number, term in enumerate(self.scene.terms):
             if term.effect.one_sided:
@@ -118,25 +118,25 @@ class LinearizedSearch:
         return possible
 
     def estimate(self, number: int) -> Float[Tensor, " q"]:
-        """Minus γ of a candidate, by generalised least squares."""
+        """Return minus γ of a candidate, by generalised least squares."""
         return self.linearised.search.estimate(number, self.linearised.series)[0]
 
     def gains_of(self, terms: Sequence[Term]) -> SearchGains:
-        """The likelihood ratios of other candidates."""
+        """Return the likelihood ratios of other candidates."""
         return self.linearised.gains_of(self.scene.tangents_of(terms), self.scene.counts)
 
     def with_more(self, terms: Sequence[Term]) -> LinearizedSearch:
-        """The same with other candidates after its own."""
-        beside, scene = self.scene.tangents_of(terms), self.scene
-        tangents = replace(scene.tangents, candidates=one_after_the_other(scene.tangents.candidates, beside))
+        """Return the search with these candidates after its own."""
+        added, scene = self.scene.tangents_of(terms), self.scene
+        tangents = replace(scene.tangents, candidates=one_after_the_other(scene.tangents.candidates, added))
         more = replace(scene, terms=(*scene.terms, *terms), tangents=tangents)
-        return LinearizedSearch(more, self.linearised.with_more(beside, scene.counts))
+        return LinearizedSearch(more, self.linearised.with_more(added, scene.counts))
 
-    def beside(self, term: Term, fit: FittedModel) -> LinearizedSearch:
-        """The same with the tangents of a term taken out of everything, at a fit with it."""
+    def given(self, term: Term, fit: FittedModel) -> LinearizedSearch:
+        """Return the search with the tangents of a term, at a fit with it, projected out of everything."""
         own = Candidates(fit.model, fit.parameters, [term], self.scene.tangents.pointwise)
         return LinearizedSearch(self.scene, self.linearised.without(own, self.scene.counts))
 
     def own_p(self, term: Term) -> float:
-        """The p-value of a candidate, as if it were the only one."""
+        """Return the p-value of a candidate as if it were the only candidate."""
         return float(self.gains.log_p[self.scene.terms.index(term), 0].exp())

@@ -1,4 +1,4 @@
-"""Evidence of an effect that lies in one short stretch of the recording, as a burst of outliers does."""
+"""Localised evidence: an effect whose evidence lies in one short stretch, like a burst of outliers."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from mkc_torch.diagnosis.settings import Settings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["telling_stretch"]
+__all__ = ["localised_stretch"]
 
 
-def telling_stretch(
+def localised_stretch(
     pseudo: Float[Tensor, "N m"],
     counts: Float[Tensor, "N m"],
     trace: Float[Tensor, "N m"],
     nuisance: Float[Tensor, "N m p"],
     settings: Settings,
 ) -> tuple[int, int] | None:
-    """First sample and the one after the last of the stretch that most of the evidence is from; None if it is spread.
+    """Return first and end sample of the stretch that holds most of the evidence; None if the evidence is spread.
 
-    Of a recording without bursts of outliers elsewhere it is None too: there, nothing else could have made the stretch.
+    None also for a recording without bursts of outliers elsewhere, because then no burst is a likely cause.
 
     Args:
-        pseudo: pseudo-residual without the effect, with 0 where it does not count.
-        counts: 0 where a residual is rejected.
-        trace: the effect in it, at its likeliest size.
+        pseudo: pseudo-residual without the effect, 0 where masked.
+        counts: 0 for a rejected residual, else 1.
+        trace: the effect in it, at its most likely size.
         nuisance: tangents of the simulation's own parameters.
-        settings: how long a stretch is, what share of the evidence lies in it, and what a burst of outliers is.
+        settings: length of a stretch, share of the evidence in it, and definition of a burst.
 
     Example:
         >>> import torch
@@ -41,10 +41,10 @@ def telling_stretch(
         >>> trace[400:420] = 1.0
         >>> counts = torch.ones_like(trace)
         >>> counts[700:730] = 0.0
-        >>> telling_stretch(trace, counts, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
+        >>> localised_stretch(trace, counts, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
         (380, 420)
         >>> everything = torch.ones_like(trace)
-        >>> telling_stretch(trace, everything, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
+        >>> localised_stretch(trace, everything, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
     """
     N = len(pseudo)
     left = counts * (pseudo - explained(pseudo, counts, nuisance))

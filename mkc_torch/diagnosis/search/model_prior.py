@@ -1,4 +1,4 @@
-"""Which of two accounts goes first where both fit: physics with a known driver, unless another is clearly better."""
+"""Prior preference between candidates that fit equally well: physics with a known driver comes first."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.drivers import ANY, Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term, continuous
-from mkc_torch.diagnosis.noise.innovations import either_way
+from mkc_torch.diagnosis.noise.innovations import agreed_innovation_gain
 from mkc_torch.diagnosis.settings import NamingSettings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 __all__ = ["ModelPrior", "alike", "schwarz"]
 
 AKAIKE = 1.0
-"""Nats for every number (Akaike's criterion)."""
+"""Nats per number (Akaike's criterion)."""
 
 
 class ModelPrior:
-    """Handicaps of candidates, in nats.
+    """Penalties of candidates, in nats.
 
     Args:
-        terms: all candidates; their drivers of known role are what others are compared with.
+        terms: all candidates; their drivers of known role are the reference for other columns.
         prepared: the simulation of the recording.
-        settings: the handicaps.
+        settings: the penalties.
     """
 
     def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation, settings: NamingSettings) -> None:
@@ -44,7 +44,7 @@ class ModelPrior:
         self._settings = settings
 
     def penalty(self, term: Term, gain: float) -> float:
-        """What a candidate's gain is lessened by before it is compared with others."""
+        """Return the penalty of a candidate, to be subtracted from its gain before a comparison."""
         share, give = 0.0, self._settings
         fixed = self._of_form(term)
         if term.effect.is_curve:
@@ -52,58 +52,62 @@ class ModelPrior:
         if term.driver is not None and term.driver.role == ANY:
             follows = self._alike(term.driver.values[:, 0]) > give.alike_columns
             share += give.follower if follows else give.roleless
-        elif term.driver is None and term.effect.has_course and not term.effect.follows_signal:
+        elif term.driver is None and term.effect.has_waveform and not term.effect.follows_signal:
             course = term.effect.waveform(term.shape, term.context(self._prepared, None))
             share += give.event if self._alike(course) > give.alike_event else 0.0
         return fixed + share * max(gain, 0.0)
 
     def score(self, fit: FittedModel, base: FittedModel) -> float:
-        """Gain in nats less Schwarz's penalty, and less the handicap."""
+        """Return the gain in nats less Schwarz's penalty and the candidate's penalty."""
         gain = fit.log_likelihood - base.log_likelihood
         score = gain - schwarz(fit) * fit.model.sizes[-1]
         return score - self.penalty(fit.model.terms[-1], gain)
 
     def score_with_shape(self, fit: FittedModel, base: FittedModel) -> float:
-        """The same less Schwarz's penalty for the numbers of the shape that were fitted too."""
+        """Return the score less Schwarz's penalty of the fitted shape numbers."""
         return self.score(fit, base) - schwarz(fit) * _fitted_numbers(fit.model.terms[-1])
 
-    def by_innovations(self, one: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
-        """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
+    def by_innovations(self, first: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
+        """Return the nats by which ``other`` is preferred for coloured noise, which a joint fit takes for white.
 
-        Each pays a price for every number it has, and for a form that has others as special cases. 0 where one has
-        another handicap, which is meant for likelihoods.
+        Each fit is penalised for every number, and for a form that includes others as special cases. 0 if either
+        candidate has another penalty, because those are defined for likelihoods.
         """
-        terms = [fit.model.terms[-1] for fit in (one, other)]
+        terms = [fit.model.terms[-1] for fit in (first, other)]
         forms = [self._of_form(term) for term in terms]
         if any(self.penalty(term, 1.0) > form for term, form in zip(terms, forms, strict=True)):
             return 0.0
-        sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (one, other)]
-        return either_way(one.residual, other.residual) - price * (sizes[1] - sizes[0]) - (forms[1] - forms[0])
+        sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (first, other)]
+        return (
+            agreed_innovation_gain(first.residual, other.residual)
+            - price * (sizes[1] - sizes[0])
+            - (forms[1] - forms[0])
+        )
 
     def _of_form(self, term: Term) -> float:
-        """What it gives for a form that has named ones as special cases."""
+        """Return the penalty of a form that includes named forms as special cases."""
         return self._settings.is_generalisation if term.effect.is_generalisation else 0.0
 
     def _alike(self, course: Float[Tensor, " N"]) -> float:
-        """Largest correlation with one of the known drivers, either sign."""
+        """Return the largest absolute correlation with a known driver."""
         return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
 
 
 def _fitted_numbers(term: Term) -> int:
-    """Of its shape."""
+    """Number of fitted shape numbers."""
     return len({*continuous(term), *term.effect.fitted_shape})
 
 
 def schwarz(fit: FittedModel) -> float:
-    """Nats for every number by Schwarz's criterion."""
+    """Nats per number by Schwarz's criterion."""
     return 0.5 * math.log(len(fit.residual))
 
 
-def alike(one: Driver, other: Driver) -> float:
-    """Correlation of two drivers of one column each, either sign; 0 for others."""
-    if one.values.shape[1] != 1 or other.values.shape[1] != 1:
+def alike(first: Driver, other: Driver) -> float:
+    """Return the absolute correlation of two drivers of first column each; 0 for other drivers."""
+    if first.values.shape[1] != 1 or other.values.shape[1] != 1:
         return 0.0
-    return abs(float(_unit(one.values[:, 0]) @ _unit(other.values[:, 0])))
+    return abs(float(_unit(first.values[:, 0]) @ _unit(other.values[:, 0])))
 
 
 def _unit(course: Tensor) -> Tensor:

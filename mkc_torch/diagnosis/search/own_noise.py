@@ -1,4 +1,4 @@
-"""Joint fits under the noise that each of them leaves, and what their noise costs."""
+"""Joint fits, each under its own remaining noise, and the penalty of that noise."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ __all__ = ["noise_of_fit", "priced", "with_own_noise"]
 
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
-    """The joint fit of a candidate with the noise that is left beside it at its likeliest sizes, and its shape too."""
+    """Return the joint fit of a candidate, with its shape, under the most likely sizes of the remaining noise."""
     noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
     prepared = fit.model.prepared
     if noise is None or not isinstance(prepared, PreparedDynamics):
         return shape_fitted(fit)
     model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
     try:
-        again = fitted(model, fit.parameters, fit.bound, graduate=False, anew=True)
+        again = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
     except NoFitError:
         return shape_fitted(fit)
     return shape_fitted(again if priced(again, settings) > priced(fit, settings) else fit)
 
 
 def priced(fit: FittedModel, settings: Settings) -> float:
-    """Log-likelihood less the price of the disturbances in a fit's noise."""
+    """Return the log-likelihood less the penalty of the disturbances in a fit's noise."""
     prepared = fit.model.prepared
     observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
-    return fit.log_likelihood - settings.noise.pushed * (0 if observer is None else len(observer.disturbances))
+    return fit.log_likelihood - settings.noise.disturbance_gain * (
+        0 if observer is None else len(observer.disturbances)
+    )
 
 
 def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """The noise that a fit is under."""
+    """Return the noise model of a fit."""
     prepared = fit.model.prepared
     return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None

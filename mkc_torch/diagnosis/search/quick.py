@@ -1,4 +1,4 @@
-"""Whether a candidate counts in a quick look, which draws no noise: its gain against the price of its numbers."""
+"""Decisions of a quick look, which draws no surrogates: a candidate's gain against the penalty of its numbers."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ if TYPE_CHECKING:
 
 __all__ = ["COUNTS", "COUNTS_NOT", "any_pays", "pays", "price"]
 
-COUNTS, COUNTS_NOT = 0.0, 1.0
-"""What stands in the place of a p-value inside a quick look; it is never shown."""
+COUNTS = 0.0
+"""Internal replacement of a p-value in a quick look, for a candidate that counts."""
+
+COUNTS_NOT = 1.0
+"""The same for a candidate that does not count."""
 
 
 def price(numbers: float, samples: int, candidates: int) -> float:
-    """Nats that a candidate of a search has to gain to be as likely as no candidate.
+    """Return the nats that a candidate has to gain to be as likely as no candidate.
 
-    Half the logarithm of the number of samples for each of its numbers, and the logarithm of the number of candidates:
+    Half the logarithm of the number of samples for each of its numbers, plus the logarithm of the number of candidates:
     the extended criterion of Chen & Chen, Biometrika 95 (2008), 759, for one effect.
 
     Example:
@@ -33,7 +36,7 @@ def price(numbers: float, samples: int, candidates: int) -> float:
 
 
 def pays(gain: float, numbers: float, samples: int, candidates: int) -> bool:
-    """Whether a gain is more than its price.
+    """Whether a gain exceeds its penalty.
 
     Args:
         gain: log-likelihood gain, in nats.
@@ -48,14 +51,14 @@ def pays(gain: float, numbers: float, samples: int, candidates: int) -> bool:
 
 
 def any_pays(look: LinearizedSearch, possible: Bool[Tensor, " tried"]) -> float:
-    """:data:`COUNTS` if one of the first candidates of a look gains more than its price, else the other.
+    """Return :data:`COUNTS` if one of the first candidates gains more than its penalty, else :data:`COUNTS_NOT`.
 
     Args:
-        look: at candidates beside a fit.
-        possible: which of the first ones may count.
+        look: the search.
+        possible: which of the first candidates may count.
     """
     scene, tried = look.scene, len(possible)
     samples, physics = int(scene.counts.sum()), len({term.key for term in scene.terms[:tried]})
     gain = torch.where(possible, 0.5 * look.gains.ratio[:tried, 0], 0.0).tolist()
     known = zip(gain, look.gains.dof[:tried].tolist(), strict=True)
-    return COUNTS if any(pays(one, numbers, samples, physics) for one, numbers in known) else COUNTS_NOT
+    return COUNTS if any(pays(nats, numbers, samples, physics) for nats, numbers in known) else COUNTS_NOT

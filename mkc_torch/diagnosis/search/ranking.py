@@ -1,4 +1,4 @@
-"""Candidates in their order: each physics at its best shape, by what it gains beyond its numbers."""
+"""Rank candidates: each effect at its best shape, by its penalised gain."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Ranked", "ranked"]
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate at its best shape: number in the list of candidates, gain in nats, and nats behind the first."""
+    """A candidate at its best shape: its number in the list of candidates, gain in nats, and nats behind the first."""
 
     number: int
     gain: float
@@ -24,12 +24,11 @@ class Ranked:
 
 
 def ranked(look: LinearizedSearch, prefer: ModelPrior) -> tuple[Ranked, ...]:
-    """By gain in nats less one for each parameter and each number of the shape (Akaike's criterion), each physics at
-    its best possible shape."""
+    """Rank effects at their best possible shapes by gain, less 1 nat per parameter and shape number, less penalties."""
     terms, found = look.scene.terms, look.gains
     gain = 0.5 * found.ratio[:, 0]
     numbers = gain.new_tensor([float(len(continuous(term))) for term in terms])
-    penalty = [prefer.penalty(term, float(one)) for term, one in zip(terms, gain, strict=True)]
+    penalty = [prefer.penalty(term, float(nats)) for term, nats in zip(terms, gain, strict=True)]
     score = gain - found.dof - numbers - gain.new_tensor(penalty)
     score = torch.where((found.dof > 0) & look.possible, score, -torch.inf)
     best: dict[Key, int] = {}

@@ -1,4 +1,4 @@
-"""Rivals of what a search has named: whether they keep its gain once fitted, and what they leave that is new."""
+"""Rivals of the named effect: whether they keep its gain once fitted, and how their innovations compare."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ def by_joint_fits(
     prefer: ModelPrior,
     known: Sequence[FittedModel],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
+    """Return the fit, or a simpler fit that is no worse; and the ranking, with rivals that lose their gain moved back.
 
-    A port that is not pointwise bends the trajectory: a rival of the search can follow the one that the effect has
-    made, and yet not make one like it. So those that the search has as near as the effect are fitted, unless a
-    ``known`` fit keeps the gain.
+    At a port that is not pointwise the search is linear along a trajectory that the effect has shaped: a rival can
+    follow that trajectory, but not produce it. So rivals as near as the effect are fitted, unless a ``known`` fit keeps
+    the gain.
     """
     base, terms, own = look.scene.base, look.scene.terms, best.model.terms[-1].key
     naming = look.settings.naming
-    reach = naming.separable + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
+    reach = naming.separable + max([rival.gap for rival in ranking if terms[rival.number].key == own], default=0.0)
     near = [
-        one
-        for one in ranking
-        if one.gap < reach and terms[one.number].key != own and look.scene.bends(terms[one.number])
+        rival
+        for rival in ranking
+        if rival.gap < reach and terms[rival.number].key != own and look.scene.is_nonlinear(terms[rival.number])
     ]
     won = prefer.score(best, base)
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= naming.kept * won}
-    new = [one for one in near if terms[one.number].key not in fitted]
-    works = [partial(_tried, best, terms[one.number], look, one.number) for one in new]
-    for fit in run_parallel(works, base.model.prepared, [terms[one.number] for one in new]):
+    new = [rival for rival in near if terms[rival.number].key not in fitted]
+    works = [partial(_tried, best, terms[rival.number], look, rival.number) for rival in new]
+    for fit in run_parallel(works, base.model.prepared, [terms[rival.number] for rival in new]):
         fitted[fit.model.terms[-1].key] = fit
-    fits = [fitted[terms[one.number].key] for one in near]
+    fits = [fitted[terms[rival.number].key] for rival in near]
     scores = [prefer.score(fit, base) for fit in fits]
-    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < naming.kept * won}
-    told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
-    told = [replace(one, gap=one.gap - told[0].gap) for one in told]
+    behind = {rival.number: won - score for rival, score in zip(near, scores, strict=True) if score < naming.kept * won}
+    moved = sorted((replace(rival, gap=max(rival.gap, behind.get(rival.number, 0.0))) for rival in ranking), key=_gap)
+    moved = [replace(rival, gap=rival.gap - moved[0].gap) for rival in moved]
     simpler = [
         (score, fit)
         for score, fit in zip(scores, fits, strict=True)
@@ -58,9 +58,9 @@ def by_joint_fits(
         and prefer.by_innovations(best, fit, schwarz(best)) >= 0.0
     ]
     if simpler:
-        return max(simpler, key=lambda one: one[0])[1], tuple(told)
-    bent = [fit for fit in known if look.scene.bends(fit.model.terms[-1])]
-    return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent], naming.separable)
+        return max(simpler, key=lambda scored: scored[0])[1], tuple(moved)
+    nonlinear = [fit for fit in known if look.scene.is_nonlinear(fit.model.terms[-1])]
+    return _by_innovations(best, tuple(moved), terms, prefer, [*fits, *nonlinear], naming.separable)
 
 
 def _by_innovations(
@@ -71,10 +71,10 @@ def _by_innovations(
     fits: Sequence[FittedModel],
     separable: float,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """The fit, or one of another physics that clearly leaves less in coloured noise; and the ranking by that.
+    """Return the fit, or a fit of another effect that is clearly better for coloured noise; and the ranking by that.
 
-    Joint fits take noise for white, and one that follows its slow course wins by it. What is new in each sample tells
-    two physics apart that are alike in the long run.
+    Joint fits assume white noise, so a fit that follows slow noise wins by it. Innovations distinguish two effects that
+    are alike at low frequencies.
     """
     if not fits:
         return best, ranking
@@ -88,16 +88,16 @@ def _by_innovations(
     for fit in fits:
         key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best)
         behind[key] = min(gap, behind.get(key, gap))
-    told = [
-        replace(one, gap=0.0 if key == own else max(one.gap, behind.get(key, 0.0)))
-        for one, key in ((one, terms[one.number].key) for one in ranking)
+    moved = [
+        replace(rival, gap=0.0 if key == own else max(rival.gap, behind.get(key, 0.0)))
+        for rival, key in ((rival, terms[rival.number].key) for rival in ranking)
     ]
-    return best, tuple(sorted(told, key=_gap))
+    return best, tuple(sorted(moved, key=_gap))
 
 
 def _tried(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
     return refined(refitted(best, term, look, number), look.scene.base)
 
 
-def _gap(one: Ranked) -> float:
-    return one.gap
+def _gap(rival: Ranked) -> float:
+    return rival.gap

@@ -1,4 +1,4 @@
-"""Locate and name: the strongest candidate beside a fit, how sure it is after the whole search, and its rivals."""
+"""Locate and name: the strongest candidate at a fit, its p-value after the whole search, and its rivals."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mkc_torch.diagnosis.linearised.drift import NoiseFit
 from mkc_torch.diagnosis.linearised.drift_residuals import drift_residuals
 from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
 from mkc_torch.diagnosis.linearised.tangents import ModelTangents, tangents_of
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
 from mkc_torch.diagnosis.model.parallel import common_parts
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
 from mkc_torch.diagnosis.search.joint_refits import refitted, strongest
 from mkc_torch.diagnosis.search.linearized import LinearizedSearch, SearchProblem
-from mkc_torch.diagnosis.search.localised import telling_stretch
+from mkc_torch.diagnosis.search.localised import localised_stretch
 from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.p_value import judged
+from mkc_torch.diagnosis.search.p_value import surrogate_p_value
 from mkc_torch.diagnosis.search.quick import any_pays
 from mkc_torch.diagnosis.search.ranking import Ranked, ranked
 from mkc_torch.diagnosis.search.rivals import by_joint_fits
@@ -42,24 +42,23 @@ __all__ = ["SearchResult", "run_search"]
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The outcome of a search.
+    """The result of a search.
 
     Attributes:
         term: the strongest candidate, at its best shape.
         fit: the joint refit with it.
         p_value: after the whole search, and no less than the candidate's own.
-        beyond: nats by which it is rarer, by itself, than the strongest of the draws.
-        ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
-        noise: the wander of the noise without the candidate.
-        look: the search that told candidates apart.
-        beside_nothing: the search that the p-value is from; that of ``look`` is another one where an effect was named.
-        stretch: samples without which there is nothing, first and the one after the last, if they are few.
-        compared: fits of the leading candidates, each under the noise of the world that it leaves; none where all are
-            under the same.
-        longer: times as long a recording that would show it has to be, if it is there; infinite where nobody knows.
-        with_noise: whether noise and physics were chosen together.
-        alone: the simulation without the candidate, where noise that was found beside the candidate makes both as
-            likely, and likelier than any noise that the simulation had; None elsewhere.
+        beyond: nats by which its own p-value is below that of the strongest surrogate.
+        ranking: for each effect its best shape, gain in nats, and nats behind the first; best first.
+        noise: the drift of the noise without the candidate.
+        look: the search that distinguished the candidates.
+        tested_search: the search that the p-value is from; another than ``look`` if an effect was named.
+        stretch: first and end sample of a short stretch that holds the evidence, if the effect fails without it.
+        compared: fits of the leading candidates, each under its own remaining noise; empty if all share one noise.
+        longer: ratio by which a recording has to be longer to show the effect, if it is real; infinite if unknown.
+        with_noise: whether noise and physics were selected together.
+        without_candidate: the simulation without the candidate, if the noise found with the candidate makes both
+            equally likely, and more likely than the simulation's previous noise; otherwise None.
     """
 
     term: Term
@@ -69,12 +68,12 @@ class SearchResult:
     ranking: tuple[Ranked, ...]
     noise: NoiseFit
     look: LinearizedSearch
-    beside_nothing: LinearisedSearch
+    tested_search: LinearisedSearch
     stretch: tuple[int, int] | None = None
     compared: Sequence[FittedModel] = ()
     longer: float = math.inf
     with_noise: bool = False
-    alone: FittedModel | None = None
+    without_candidate: FittedModel | None = None
 
     @property
     def scene(self) -> SearchProblem:
@@ -94,25 +93,25 @@ def run_search(
     quick: bool = False,
     keep: Callable[[SearchResult], object] = lambda _: None,
 ) -> SearchResult:
-    """Search the candidates beside a fit.
+    """Search the candidates at a fit.
 
     Args:
-        base: the simulation with what was found so far.
+        base: the simulation with the previous findings.
         terms: candidates.
-        level: below which p-value the candidate is named with care.
-        surrogates: draws of noise that the strongest candidate is judged against, of each kind of noise.
-        generator: of the draws.
-        settings: the numbers that decide.
-        parts: also start from fits to parts of the recording, for where one model over all of it runs away.
-        quick: draw no noise; the strongest candidate counts if it gains more than its price.
-        keep: called with what is known before the strongest candidate is named with care.
+        level: p-value up to which the candidate is named by slower comparisons.
+        surrogates: number of surrogates, for each kind of noise.
+        generator: of the surrogates.
+        settings: thresholds.
+        parts: also start from fits to parts of the recording, in case one model of all of it diverges.
+        quick: draw no surrogates; the strongest candidate counts if it gains more than its penalty.
+        keep: called with the result so far, before the slower comparisons.
     """
     terms = tuple(terms)
     prefer = ModelPrior(terms, base.model.prepared, settings.naming)
     tried = len(terms)
     fits, tangents = strongest(base, terms, prefer, settings, parts=parts)
     best, scene = _scene(base, fits, terms, tangents, settings)
-    # without the effect, as what is left beside it weighs the samples
+    # the residual without the effect, with the mask and weights of the fit with it
     left = drift_residuals(best, base.model, scene.around.parameters[: base.model.size], scene.tangents, settings.noise)
     added = _added(best, scene)
     scene = replace(
@@ -123,13 +122,13 @@ def run_search(
     )
     naming = partial(_named, best, scene, left.noise.spectrum, prefer, level)
     known = [base, best, *terms, *scene.parts, *common_parts(base.model.prepared, scene.terms)]
-    # a copy names it already, while this process asks whether there is anything to be named
+    # another process names the effect while this process computes the p-value
     with speculative([naming], known) as answer:
         look = seen = scene.under()
         p_value, beyond = (
             (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
         )
-        noise, beside_nothing = look.noise, look.linearised
+        noise, tested_search = look.noise, look.linearised
         if p_value <= level and beyond < settings.search.doubted:
             for spectrum in look.linearised.plausible(settings.noise.plausible):
                 p_other, beyond_other = _judged(scene.under(spectrum), tried, surrogates, generator)
@@ -138,7 +137,7 @@ def run_search(
         if p_value <= level:
             own = int(torch.where(look.possible, look.gains.log_p[:, 0], 0.0).argmin())
             trace = scene.counts * (scene.tangents.candidates[own] @ look.estimate(own))
-            stretch = telling_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
+            stretch = localised_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
         if stretch is not None:
             rest = scene.without(stretch).under()
             p_other, beyond_other = (
@@ -147,13 +146,13 @@ def run_search(
                 else _judged(rest, tried, surrogates, generator)
             )
             p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
-            beside_nothing = rest.linearised
+            tested_search = rest.linearised
         ranking = ranked(look, prefer)
-        keep(SearchResult(best.model.terms[-1], best, p_value, beyond, ranking, noise, seen, beside_nothing))
+        keep(SearchResult(best.model.terms[-1], best, p_value, beyond, ranking, noise, seen, tested_search))
         if p_value <= level:
             [named] = answer()
             best, ranking, seen = named.fit, named.ranking, named.look
-            # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
+            # if the named candidate's own p-value is large, another candidate passed the surrogates
             p_value = max(p_value, seen.own_p(best.model.terms[-1]))
     if p_value <= level:
         best, ranking = by_joint_fits(best, ranking, seen, prefer, fits)
@@ -168,7 +167,7 @@ def run_search(
         ranking,
         noise,
         seen,
-        beside_nothing,
+        tested_search,
         stretch if p_value > level else None,
     )
 
@@ -176,7 +175,7 @@ def run_search(
 def _scene(
     base: FittedModel, fits: Sequence[FittedModel], terms: tuple[Term, ...], tangents: ModelTangents, settings: Settings
 ) -> tuple[FittedModel, SearchProblem]:
-    """The first fit that can be looked at, and the candidates where they are linear, its own shape included."""
+    """Return the best fit with finite tangents, and the linearised candidates, its own shape included."""
     if _shows(base, fits[0], settings):
         best = around = fits[0]
         around, own = base, best.model.terms[-1]
@@ -196,7 +195,7 @@ def _scene(
 
 
 def _added(best: FittedModel, scene: SearchProblem) -> Float[Tensor, "N m"]:
-    """What the effect of a fit adds to the residual."""
+    """Return what the effect of a fit adds to the residual."""
     if scene.around is scene.base:
         return best.residual - scene.base.residual
     number, gamma = scene.terms.index(best.model.terms[-1]), best.parameters[scene.base.model.size :]
@@ -204,11 +203,11 @@ def _added(best: FittedModel, scene: SearchProblem) -> Float[Tensor, "N m"]:
 
 
 def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
-    """Whether a fit without an effect shows what there is of it: it rejects no more, and its scale is no larger.
+    """Whether a fit without an effect shows the effect fully: it rejects no more samples, and its scale is no larger.
 
-    Then tangents there are the ones to judge it by. At a fit with it, an effect that is nearly not to be seen may have
-    any size, as a step has while the sensor rests, and what is linear about that size says nothing about none. Where an
-    effect bends a trajectory, tangents at the fit with it are the ones.
+    Then the effect is tested by tangents there. At a fit with the effect, a barely visible effect may have any size,
+    such as a step while the sensor does not move, and the linearisation at that size does not hold at size 0. For an
+    effect that acts through a trajectory, tangents at the fit with it are used.
     """
     if fit.model.prepared.ports[fit.model.terms[-1].port].clock is not None:
         return False
@@ -218,13 +217,15 @@ def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
 
 
 def _judged(look: LinearizedSearch, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:
-    """As :func:`judged` says, of the strongest of the first candidates."""
+    """Apply :func:`surrogate_p_value` to the first ``tried`` candidates."""
     noise = look.settings.noise
-    return judged(look.linearised, look.noise, look.gains, look.possible[:tried], surrogates, generator, noise)
+    return surrogate_p_value(
+        look.linearised, look.noise, look.gains, look.possible[:tried], surrogates, generator, noise
+    )
 
 
 class _NamedEffect(NamedTuple):
-    """What an effect is, if there is one: the fit with it, and the look that told it from others."""
+    """A named effect: the fit with it, and the search that distinguished it from others."""
 
     fit: FittedModel
     ranking: tuple[Ranked, ...]
@@ -234,22 +235,22 @@ class _NamedEffect(NamedTuple):
 def _named(
     best: FittedModel, scene: SearchProblem, spectrum: NoiseSpectrum, prefer: ModelPrior, level: float
 ) -> _NamedEffect:
-    """Whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it."""
+    """Name the effect under its remaining noise; whether there is an effect is tested under noise that includes it."""
     look, base, naming = scene.under(spectrum), scene.base, scene.settings.naming
-    near = [scene.terms[one.number] for one in ranked(look, prefer) if one.gap < 2.0 * naming.separable]
+    near = [scene.terms[place.number] for place in ranked(look, prefer) if place.gap < 2.0 * naming.separable]
     look = look.with_more(refine_candidates(near, look))
     terms, ranking = look.scene.terms, ranked(look, prefer)
     first, own = terms[ranking[0].number], best.model.terms[-1]
-    bends = any(scene.bends(term) for term in (first, own))
+    nonlinear = any(scene.is_nonlinear(term) for term in (first, own))
     if first.key != own.key or look.own_p(own) > level:
         other = refitted(best, first, look, ranking[0].number)
-        # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
-        # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
-        behind = [one.gap for one in ranking if terms[one.number].key == own.key]
+        # a joint fit that loses much of the linear gain went beyond the linear range; but with a possible drift, joint
+        # fits favour candidates that follow the drift, so the search decides if it separates the two candidates
+        behind = [place.gap for place in ranking if terms[place.number].key == own.key]
         clear = scene.tangents.slow is not None and not (behind and behind[0] < naming.separable)
         least = 0.0 if clear else naming.kept * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
-        if gain > least or (bends and prefer.by_innovations(best, other) > 0.0):
+        if gain > least or (nonlinear and prefer.by_innovations(best, other) > 0.0):
             best = other
     return _NamedEffect(best, ranking, look)
 
@@ -257,7 +258,7 @@ def _named(
 def _with_tangents(
     fits: Sequence[FittedModel], terms: tuple[Term, ...], settings: Settings
 ) -> tuple[FittedModel, tuple[Term, ...], ModelTangents]:
-    """The first fit that has finite tangents, with them and their candidates, its own shape included."""
+    """Return the first fit that has finite tangents, the candidates with its own shape, and their tangents."""
     for fit in fits:
         own = fit.model.terms[-1]
         tried = terms if own in terms else (*terms, own)
@@ -270,8 +271,8 @@ def _with_tangents(
 
 
 def _settled(fit: FittedModel, base: FittedModel) -> FittedModel:
-    """The fit; begun anew where it ran out of steps: they can wait for a scale that is still far too large."""
+    """Refit if the iteration did not converge, because a scale that is far too large can delay it."""
     if fit.converged:
         return fit
-    again = fitted_beside(base, fit.model, fit.parameters, graduate=False)
+    again = fitted_with_effect(base, fit.model, fit.parameters, graduate=False)
     return again if again.log_likelihood > fit.log_likelihood else fit

@@ -1,4 +1,4 @@
-"""A first look beside a finding: most often there is nothing more, and a search with its refits takes long."""
+"""Screening after a finding: usually there is no further finding, and a search with refits is slow."""
 
 from __future__ import annotations
 
@@ -6,39 +6,41 @@ from collections.abc import Sequence
 
 import torch
 
-from mkc_torch.diagnosis.search.p_value import judged
+from mkc_torch.diagnosis.search.p_value import surrogate_p_value
 from mkc_torch.diagnosis.search.quick import any_pays
 from mkc_torch.diagnosis.search.run import SearchResult
 
-__all__ = ["p_value_beside"]
+__all__ = ["screening_p_value"]
 
 
-def p_value_beside(
+def screening_p_value(
     located: SearchResult, possible: Sequence[bool], surrogates: int, generator: torch.Generator, *, quick: bool = False
 ) -> float:
-    """The p-value of the strongest other candidate beside an effect, where the search for that effect linearised.
+    """Return the p-value of the strongest further candidate, in the linearisation of the search for an effect.
 
-    The candidates, the noise and the samples that count are those of that search; the effect's own tangents are taken
-    out of everything, as those of the simulation's parameters are. Nothing is fitted anew.
+    Candidates, noise and mask are those of that search. The effect's tangents are projected out of everything, like
+    those of the simulation's parameters. Nothing is refitted.
 
     Args:
         located: the effect.
-        possible: whether each of its ``terms`` would be another finding.
-        surrogates: draws of noise.
-        generator: of the draws.
-        quick: draw none; ask whether one gains more than its price.
+        possible: whether each of its ``terms`` would be a further finding.
+        surrogates: number of surrogates.
+        generator: of the surrogates.
+        quick: draw none; test whether a candidate gains more than its penalty.
 
     Returns:
-        0 where an effect may bend a trajectory: there refits find what straight lines do not.
+        0 if an effect acts through a trajectory: there refits can find what the linearisation does not.
     """
     scene, own = located.scene, located.fit.model.terms[-1]
-    if any(scene.bends(term) for term in (*scene.terms, own)):
+    if any(scene.is_nonlinear(term) for term in (*scene.terms, own)):
         return 0.0
-    beside = located.look.beside(own, located.fit)
-    mask = torch.tensor(list(possible)) & beside.possible
+    remaining = located.look.given(own, located.fit)
+    mask = torch.tensor(list(possible)) & remaining.possible
     if not bool(mask.any()):
         return 1.0
     if quick:
-        return any_pays(beside, mask)
+        return any_pays(remaining, mask)
     noise = scene.settings.noise
-    return judged(beside.linearised, beside.noise, beside.gains, mask, surrogates, generator, noise)[0]
+    return surrogate_p_value(
+        remaining.linearised, remaining.noise, remaining.gains, mask, surrogates, generator, noise
+    )[0]

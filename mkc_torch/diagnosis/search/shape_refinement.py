@@ -1,10 +1,10 @@
-"""The continuous numbers of an effect's shape, closed in on beyond the grid that is searched."""
+"""Refinement of the continuous numbers of an effect's shape between the points of the grid."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
 from mkc_torch.diagnosis.model.grid import finer
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term, continuous
@@ -14,16 +14,16 @@ from mkc_torch.functional import mkc_energy
 __all__ = ["middle", "refine_candidates", "refined", "with_spectrum"]
 
 _ROUNDS = 3
-"""Times that the range about a shape's number is narrowed."""
+"""Rounds of narrowing the range of a shape number."""
 
 
 def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
-    """The fit with the likeliest values of its shape's continuous numbers, closed in on one by one.
+    """Return the fit with its continuous shape numbers refined one by one.
 
     Args:
         best: the fit.
-        base: what it is beside.
-        again: once more from there, with the amplitudes that fit the new shape.
+        base: the fit without its last effect.
+        again: repeat from there, with the sizes fitted to the new shape.
     """
     term = best.model.terms[-1]
     names = continuous(term)
@@ -34,21 +34,21 @@ def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fit
             shapes = finer(term, name, base.model.prepared.time, count)
             value = [_energy(best, best.model.with_last(shape)) for shape in shapes]
             term = shapes[min(range(len(shapes)), key=value.__getitem__)]
-    moved = fitted_beside(base, best.model.with_last(term), best.parameters, graduate=False)
+    moved = fitted_with_effect(base, best.model.with_last(term), best.parameters, graduate=False)
     if not moved.log_likelihood > best.log_likelihood:
         return best
     return refined(moved, base) if again else moved
 
 
 def refine_candidates(terms: Sequence[Term], look: LinearizedSearch) -> tuple[Term, ...]:
-    """Candidates with the continuous numbers of their shapes closed in on under the noise of the search.
+    """Return candidates with their continuous shape numbers refined under the noise of the search.
 
-    Only where a port is pointwise: elsewhere each shape takes a trajectory of its own.
+    Only at pointwise ports: elsewhere each shape needs a new trajectory.
     """
     refine_candidates = []
     for term in terms:
         names = continuous(term)
-        if not names or look.scene.bends(term):
+        if not names or look.scene.is_nonlinear(term):
             continue
         found = term
         for count in range(_ROUNDS):
@@ -61,14 +61,14 @@ def refine_candidates(terms: Sequence[Term], look: LinearizedSearch) -> tuple[Te
 
 
 def with_spectrum(best: FittedModel, look: LinearizedSearch) -> FittedModel:
-    """The fit with the shape that the noise of the search makes of its own: a joint fit takes the noise for white.
+    """Return the fit with the shape that is most likely under the noise of the search; a joint fit assumes white noise.
 
-    That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
-    within a burst of rejected samples are.
+    Another shape is taken if it is clearly better; otherwise the middle of the equivalent shapes, such as all onsets
+    within a burst of rejected samples.
     """
     own, base, naming = best.model.terms[-1], look.scene.base, look.settings.naming
     names = continuous(own)
-    if not names or look.scene.bends(own):
+    if not names or look.scene.is_nonlinear(own):
         return best
 
     def gains(terms: Sequence[Term]) -> list[float]:
@@ -86,12 +86,12 @@ def with_spectrum(best: FittedModel, look: LinearizedSearch) -> FittedModel:
             moved = shapes[middle(gains(shapes), place, naming.shape_alike)]
     if moved.shape == own.shape:
         return best
-    fit = fitted_beside(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
+    fit = fitted_with_effect(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
     return fit if fit.converged else best
 
 
 def middle(values: Sequence[float], place: int, alike: float) -> int:
-    """The middle one of the neighbours of a place that are not told apart from it, alike within some nats.
+    """Return the middle of the neighbours of a place whose values differ from it by less than ``alike``.
 
     Example:
         >>> middle([1.0, 7.0, 7.2, 7.1, 7.0, 7.2, 2.0, 7.2], 1, 0.5)
@@ -106,5 +106,5 @@ def middle(values: Sequence[float], place: int, alike: float) -> int:
 
 
 def _energy(fit: FittedModel, model: JointModel) -> float:
-    """Of another shape, at the same parameters."""
+    """Return the energy of another shape, at the same parameters."""
     return float(mkc_energy(model.residual(fit.parameters), fit.sigma, fit.d).sum())

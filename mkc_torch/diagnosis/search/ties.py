@@ -1,4 +1,4 @@
-"""Candidates in the order of their scores; which of two goes first that no data tells apart is not left to rounding."""
+"""Order candidates by score; ties do not depend on rounding."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mkc_torch.diagnosis.search.model_prior import ModelPrior
 __all__ = ["best_first", "in_order"]
 
 _TIE = 1e-6
-"""Nats within which scores are the same: rounding moves them by 1e-12, a sample by 1e-3 and more."""
+"""Nats within which scores are equal: rounding changes them by 1e-12, a sample by 1e-3 and more."""
 
 
 def in_order(scores: Sequence[float], terms: Sequence[Term]) -> list[int]:
-    """Places, the largest score first; of those that are the same, the one with the fewest numbers in its shape.
+    """Return places by descending score; among equal scores the candidate with the fewest shape numbers comes first.
 
-    A body that is under water all the time and a constant force do the same: the plain one is told.
+    A body that is always under water and a constant force have the same effect: the simpler name is reported.
 
     Args:
         scores: of each candidate, in nats.
@@ -33,6 +33,6 @@ def in_order(scores: Sequence[float], terms: Sequence[Term]) -> list[int]:
 
 
 def best_first(fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior) -> list[FittedModel]:
-    """Joint fits in the order of their scores."""
+    """Return joint fits by descending score."""
     scores = [prefer.score(fit, base) for fit in fits]
     return [fits[place] for place in in_order(scores, [fit.model.terms[-1] for fit in fits])]

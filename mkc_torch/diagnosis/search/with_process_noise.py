@@ -1,4 +1,4 @@
-"""Locate and name beside pushes: by candidates' gains at their own size of the pushes, then by fits of each."""
+"""Search with process noise: candidates' gains, each with its own process noise, then fits of the leaders."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.process_noise import (
     estimate_noise,
+    has_process_noise,
     refit_input_hold,
     refit_noise,
     refit_open_loop,
-    with_noise_of_fit,
 )
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
@@ -40,22 +40,22 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 __all__ = ["search_with_process_noise"]
 
 _CURVES = 2
-"""Free curves that are fitted beside the leading candidates."""
+"""Number of free curves that are fitted in addition to the leading candidates."""
 
 _PART = 0.3
 """Share of the largest gain below which a candidate is not fitted."""
 
 _CLOSER = 0.95
-"""Times the residual of a free run that a rival's has to be, for the rival to go first."""
+"""Ratio of open-loop residuals below which a rival goes first."""
 
 _DOUBT = 10.0
-"""Nats beyond its price that a candidate has to gain to count without draws."""
+"""Nats beyond its penalty that a candidate has to gain to count without surrogates."""
 
 _FIT = "fit of a leading candidate"
-"""What progress counts."""
+"""Name of the items that progress counts."""
 
 Kind = tuple[Key, str]
-"""Of a candidate, and for a curve what it is over."""
+"""Identity of a candidate, and for a curve its variable."""
 
 
 def search_with_process_noise(
@@ -72,20 +72,20 @@ def search_with_process_noise(
     quick: bool = False,
     keep: Callable[[SearchResult], object] = lambda _: None,
 ) -> SearchResult:
-    """The strongest candidate beside a fit under pushes.
+    """Search the candidates at a fit with process noise.
 
     Args:
         base: the fit.
         terms: candidates.
-        level: below which p-value candidates are fitted and compared.
-        surrogates: draws of noise.
-        generator: of the draws.
-        declared: standard deviation of the white noise of outputs that it is known of.
-        fixed: what inputs do between samples that it is known of.
-        free: the same as it runs freely; None where that loses the recording.
-        settings: the numbers that decide.
-        quick: draw no noise, and refit each leading candidate from one start.
-        keep: called with what is known before the leading candidates are refitted.
+        level: p-value up to which candidates are fitted and compared.
+        surrogates: number of surrogates.
+        generator: of the surrogates.
+        declared: known standard deviations of the outputs' white noise.
+        fixed: known input holds.
+        free: the open-loop fit; None if it loses the recording.
+        settings: thresholds.
+        quick: draw no surrogates, and refit each leading candidate from one start.
+        keep: called with the result so far, before the leading candidates are refitted.
 
     Raises:
         NoFitError: the fit's trajectory is lost.
@@ -106,7 +106,7 @@ def search_with_process_noise(
         quick=quick,
     )
     if found is None:
-        raise NoFitError("The simulation's trajectory is lost at the fitted values.")
+        raise NoFitError("The simulation has no finite trajectory at the fitted values.")
     prefer = ModelPrior(terms, base.model.prepared, settings.naming)
     look = SearchProblem(base, base, terms, tangents, values, counts, settings).under()
     ranking = _ranked(found, terms, prefer)
@@ -139,7 +139,7 @@ def search_with_process_noise(
         for number, fit in zip(chosen, first, strict=True):
             gamma, running = found.start(number).gamma, known.pop(terms[number].key, None)
             works.append(
-                partial(_likelier, base, free, terms[number], fit, gamma, declared, settings, running, quick=quick)
+                partial(_best_start, base, free, terms[number], fit, gamma, declared, settings, running, quick=quick)
             )
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
         works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
@@ -149,9 +149,11 @@ def search_with_process_noise(
         best, ranking = _by_free_run(best, ranking, fits, terms, settings)
         best = refit_noise(best, noise_of_fit(best, declared), declared, settings.noise)
         best = best if quick else refit_input_hold(best, declared, fixed, settings.noise)
-    bare = _without(base, best, declared, settings) if fits and with_noise_of_fit(best) else None
-    likelier = bare is not None and priced(bare, settings) > priced(base, settings) + settings.noise.pushed
-    needless = bare is not None and _needless(best, bare, settings, drawn=not likelier)
+    bare = _without(base, best, declared, settings) if fits and has_process_noise(best) else None
+    better_noise = (
+        bare is not None and priced(bare, settings) > priced(base, settings) + settings.noise.disturbance_gain
+    )
+    needless = bare is not None and _needless(best, bare, settings, drawn=not better_noise)
     return replace(
         located,
         term=best.model.terms[-1],
@@ -159,14 +161,14 @@ def search_with_process_noise(
         p_value=1.0 if needless else p_value,
         ranking=ranking,
         compared=fits,
-        alone=bare if needless and likelier else None,
+        without_candidate=bare if needless and better_noise else None,
     )
 
 
 def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: ModelPrior) -> tuple[Ranked, ...]:
-    """By gain less Akaike's price of the numbers and the handicap, each physics at its best shape."""
+    """Rank the effects at their best shapes by gain less Akaike's penalty of their numbers and their own penalties."""
     numbers = found.gain.new_tensor([float(len(continuous(term))) for term in terms])
-    penalty = [prefer.penalty(term, float(one)) for term, one in zip(terms, found.gain, strict=True)]
+    penalty = [prefer.penalty(term, float(nats)) for term, nats in zip(terms, found.gain, strict=True)]
     score = found.gain - found.dof - numbers - found.gain.new_tensor(penalty)
     score = torch.where(found.dof > 0, score, -torch.inf)
     best: dict[Key, int] = {}
@@ -176,12 +178,12 @@ def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: ModelPrior)
 
 
 def _chosen(found: JointLikelihood, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
-    """The leading candidates, each at its best shape, and the curve that gains most over each thing at their places."""
+    """Return the leading candidates at their best shapes, and at their ports the best free curve over each variable."""
     chosen: dict[Kind, int] = {}
-    least = _PART * max(one.gain for one in ranking[:most])
-    for one in ranking[:most]:
-        if one.gain >= least:
-            chosen[_kind(terms[one.number])] = one.number
+    least = _PART * max(candidate.gain for candidate in ranking[:most])
+    for candidate in ranking[:most]:
+        if candidate.gain >= least:
+            chosen[_kind(terms[candidate.number])] = candidate.number
     places = {terms[number].port for number in chosen.values()}
     curves = [n for n, term in enumerate(terms) if term.effect.is_curve and term.port in places]
     for number in sorted(curves, key=lambda n: -float(found.gain[n]))[:_CURVES]:
@@ -195,24 +197,24 @@ def _kind(term: Term) -> Kind:
 
 
 def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) -> FittedModel:
-    """The joint fit of a candidate, under the pushes that it leaves by the search."""
+    """Return the joint fit of a candidate, under its remaining process noise by the search."""
     prepared = base.model.prepared
     assert isinstance(prepared, PreparedDynamics)
     begin = found.start(number)
     smaller = prepared.observed(begin.observer)
     start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
     model = JointModel(smaller, (*base.model.terms, term), base.model.near)
-    none = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])
-    # far along the tangents there may be no trajectory
-    for one in (start, none):
-        there = fitted_beside(base, model, one, graduate=False)
+    size_zero = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])
+    # far along the tangents there may be no finite trajectory
+    for parameters in (start, size_zero):
+        there = fitted_with_effect(base, model, parameters, graduate=False)
         if there.model.prepared is smaller:
             return there
-    return fitted_beside(base, base.model.with_term(term), start, graduate=False)
+    return fitted_with_effect(base, base.model.with_term(term), start, graduate=False)
 
 
 def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
-    """Within the bounds, and where they are free no farther than what is nearly linear."""
+    """Clip parameters to their bounds; keep a parameter that would more than double, beyond the linear range."""
     bounds = base.model.bounds
     if bounds is not None:
         parameters = parameters.clamp(*bounds)
@@ -224,13 +226,13 @@ def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
 def _within_reach(
     chosen: Sequence[int], fits: Sequence[FittedModel], scores: Sequence[float], settings: Settings
 ) -> tuple[list[int], list[FittedModel]]:
-    """Candidates, with their first fits, that are not so far behind the best that they could not come near it."""
+    """Return the candidates, with their first fits, that are close enough to the best to come near it."""
     least = max(scores) - settings.search.behind - settings.search.behind_share * max(max(scores), 0.0)
     kept = [place for place, score in enumerate(scores) if score >= least]
     return [chosen[place] for place in kept], [fits[place] for place in kept]
 
 
-def _likelier(
+def _best_start(
     base: FittedModel,
     free: FittedModel | None,
     term: Term,
@@ -242,23 +244,23 @@ def _likelier(
     *,
     quick: bool = False,
 ) -> FittedModel:
-    """The joint fit of a candidate under the noise that it leaves, begun with its first fit or from the free run.
+    """Return the better joint fit of a candidate under its remaining noise: from its first fit or from open loop.
 
-    Process noise that the first fit began with has taken over what the effect does, and not all of it is given back.
-    A quick look begins from the free run only where the first fit is no likelier than the simulation alone.
-    ``running`` is the candidate's free run where it is fitted already.
+    Process noise of the first fit has absorbed part of the effect, and keeps some of it. A quick look starts from open
+    loop only if the first fit is no more likely than the simulation alone. ``running`` is the candidate's open-loop
+    fit, if known.
     """
     under = with_own_noise(fit, declared, settings)
-    if free is None or not with_noise_of_fit(under):
+    if free is None or not has_process_noise(under):
         return under
     if quick and priced(under, settings) > priced(base, settings):
         return under
     if running is None:
         model = free.model.with_term(term)
         starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
-        works = [partial(fitted_beside, free, model, one, graduate=False) for one in starts]
+        works = [partial(fitted_with_effect, free, model, start, graduate=False) for start in starts]
         tried = run_parallel(works, model.prepared, [term])
-        running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
+        running = shape_fitted(max(tried, key=lambda open_loop_fit: open_loop_fit.log_likelihood))
     running = _under_own_noise(running, base, declared, settings)
     return running if priced(running, settings) > priced(under, settings) else under
 
@@ -266,14 +268,14 @@ def _likelier(
 def _under_own_noise(
     running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel:
-    """A free run under the noise that is around it; as it is, where that loses the recording."""
+    """Return an open-loop fit under the noise around it; unchanged if that loses the recording."""
     noise = estimate_noise(running, declared, settings.noise)
     if noise is not None and noise.observer is not None:
         prepared = running.model.prepared
         assert isinstance(prepared, PreparedDynamics)
         observed = JointModel(prepared.observed(noise.observer), running.model.terms, running.model.near)
         try:
-            running = fitted(observed, running.parameters, base.bound, graduate=False, anew=True)
+            running = fitted(observed, running.parameters, base.bound, graduate=False, fresh=True)
         except NoFitError:
             return running
     return with_own_noise(running, declared, settings)
@@ -286,12 +288,12 @@ def _plain(
     declared: Mapping[str, float],
     settings: Settings,
 ) -> bool:
-    """Whether a candidate's fit is so much likelier than the simulation under any noise that no draws are needed.
+    """Whether a candidate's fit is so much more likely than the simulation alone that no surrogates are needed.
 
-    A likelihood ratio exceeds k with a probability of at most 1/k without the effect (Markov's inequality; Wasserman,
-    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), where the simulation alone has its likeliest noise too: that which
-    its own fit leads to, or that which is found beside the effect. What the fit of the effect's numbers and the choice
-    among the candidates gain is taken off.
+    Without the effect, a likelihood ratio exceeds k with a probability of at most 1/k (Markov's inequality; Wasserman,
+    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), if the simulation alone has its most likely noise too: that of its
+    own fit, or that found with the effect. The expected gain of fitting the effect's numbers and of choosing among the
+    candidates is subtracted.
     """
     if not runs:
         return False
@@ -311,24 +313,25 @@ def _plain(
 def _without(
     base: FittedModel, fit: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel | None:
-    """The simulation without a candidate, begun with the noise that is found beside it; None where it has no fit."""
+    """Fit the simulation without a candidate, from the noise found with the candidate; None if it fails."""
     model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
     try:
-        without = fitted(model, base.parameters, base.bound, graduate=False, anew=True)
+        without = fitted(model, base.parameters, base.bound, graduate=False, fresh=True)
     except NoFitError:
         return None
     return with_own_noise(without, declared, settings)
 
 
 def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn: bool) -> bool:
-    """Whether the noise that was found beside an effect does as much without it.
+    """Whether the noise found with an effect is as likely without the effect.
 
-    A candidate that only led to a likelier noise is no finding: its size is nothing, or anything. Its numbers are
-    priced as by Schwarz; as by Akaike where the draws were of that noise, for then the p-value counts the search.
+    A candidate that only led to a better noise model is no finding: its size is 0 or arbitrary. Its numbers are
+    penalised by Schwarz's criterion, or by Akaike's if the surrogates were of that noise, because then the p-value
+    includes the search.
     """
     numbers = best.model.size - bare.model.size + len(best.model.terms[-1].effect.fitted_shape)
-    price_of_one = 1.0 if drawn else 0.5 * math.log(len(best.residual))
-    return priced(best, settings) - priced(bare, settings) < numbers * price_of_one
+    penalty_per_number = 1.0 if drawn else 0.5 * math.log(len(best.residual))
+    return priced(best, settings) - priced(bare, settings) < numbers * penalty_per_number
 
 
 def _by_free_run(
@@ -338,11 +341,11 @@ def _by_free_run(
     terms: tuple[Term, ...],
     settings: Settings,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """Of candidates that the likelihood does not tell apart the one whose free run follows the recording best.
+    """Among candidates with inseparable likelihoods, put that with the smallest open-loop residual first.
 
-    One with more numbers than the likeliest always follows better, and does not go first for that.
+    A candidate with more numbers than the most likely always follows better, and is not put first for that.
     """
-    gaps = {terms[one.number].key: one.gap for one in ranking}
+    gaps = {terms[rival.number].key: rival.gap for rival in ranking}
     alike = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
     near = [fit for fit in alike if fit is best or _numbers(fit) <= _numbers(best)]
     keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
@@ -357,11 +360,11 @@ def _by_free_run(
     if not sizes[first] < own + len(best.d) * math.log(_CLOSER):
         return best, ranking
     key = near[first].model.terms[-1].key
-    return near[first], tuple(sorted(ranking, key=lambda one: (terms[one.number].key != key, one.gap)))
+    return near[first], tuple(sorted(ranking, key=lambda rival: (terms[rival.number].key != key, rival.gap)))
 
 
 def _numbers(fit: FittedModel) -> int:
-    """Of the last effect and its shape."""
+    """Number of parameters of the last effect and its shape."""
     return fit.model.sizes[-1] + len(fit.model.terms[-1].effect.fitted_shape)
 
 
@@ -374,7 +377,7 @@ def _by_own_noise(
     prefer: ModelPrior,
     settings: Settings,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
+    """Return the most likely fit, and the ranking by distance to it; candidates that were not fitted come last."""
     scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
     best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
     behind: dict[Key, tuple[float, int]] = {}
@@ -382,9 +385,9 @@ def _by_own_noise(
         key, gap = terms[number].key, scores[best] - score
         behind[key] = min((gap, number), behind.get(key, (gap, number)))
     last = max(gap for gap, _ in behind.values())
-    told = []
-    for one in ranking:
-        key = terms[one.number].key
-        gap, number = behind.get(key, (max(last, one.gap), one.number))
-        told.append(replace(one, number=number, gap=gap))
-    return fits[best], tuple(sorted(told, key=lambda one: one.gap))
+    moved = []
+    for rival in ranking:
+        key = terms[rival.number].key
+        gap, number = behind.get(key, (max(last, rival.gap), rival.number))
+        moved.append(replace(rival, number=number, gap=gap))
+    return fits[best], tuple(sorted(moved, key=lambda rival: rival.gap))

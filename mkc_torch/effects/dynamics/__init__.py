@@ -36,7 +36,7 @@ __all__ = ["DYNAMICS"]
 
 DYNAMICS: tuple[Effect, ...] = (
     ConstantForce(),
-    LinearDrag(beside=True),
+    LinearDrag(to_surroundings=True),
     LinearDrag(),
     QuadraticDrag(),
     CoulombFriction(),
@@ -57,7 +57,7 @@ DYNAMICS: tuple[Effect, ...] = (
     MagnusLift(),
     HardStop(),
     Overflow(),
-    ThermalLoss(beside=True),
+    ThermalLoss(to_surroundings=True),
     ThermalLoss(),
     InputDelay(),
     InputLag(),
@@ -71,4 +71,4 @@ DYNAMICS: tuple[Effect, ...] = (
     UnknownRate("position"),
     UnknownNearEnds(),
 )
-"""The effects that a diagnosis of differential equations tries."""
+"""The candidate effects for differential equations."""

@@ -1,4 +1,4 @@
-"""Fluid that has to be accelerated too."""
+"""Inertia of the fluid that a body moves along."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 class AddedMass(RateEffect):
-    """A body in a fluid moves some of it along: all forces together accelerate more than the body's own mass.
+    """Fluid that a body moves along adds to its inertia.
 
-    It is told from the simulation's own parameters by what these cannot scale, such as gravity or a known force; where
-    they scale everything, as a mass or an inertia of the simulation's own does, nothing is left of it.
+    Terms that the simulation's parameters cannot scale, such as gravity or a known force, distinguish it from these
+    parameters; if they scale all terms, as a mass or an inertia does, it is not identifiable.
 
-    Simulation: adds ``−γ f`` to the rate of a speed, f what the simulation's own equations give for it; γ is the
-        fluid's share of all the mass, ``m_a / (m + m_a)``.
-    Drivers: none but the states and inputs.
+    Simulation: adds ``−γ f`` to the rate of a speed, where f is the rate by the simulation's equations; γ is the
+        fluid's share of the total mass, ``m_a / (m + m_a)``.
+    Drivers: the states and inputs only.
     Units: γ is a share.
     Plausible: γ from 0 to 1; half the displaced fluid's mass for a sphere, all of it for a cylinder across the flow.
     Source: Lamb, "Hydrodynamics" (1932), art. 92; Brennen, "A Review of Added Mass and Fluid Inertial Forces" (1982).
@@ -35,8 +35,8 @@ class AddedMass(RateEffect):
     gain = "share"
     plot_axis = "rate"
     equation = "δv̇ = −γ f,  γ = m_a / (m + m_a)"
-    explanation = "Everything that accelerates the body does so too much: fluid that moves along adds to its mass."
-    advice = "Add the mass of the fluid that moves along, this share of all the mass."
+    explanation = "All accelerations are simulated too large: fluid that moves along adds to the body's mass."
+    advice = "Add the mass of the fluid that moves along, this share of the total mass."
     source = "Lamb, Hydrodynamics (1932), art. 92; Brennen, A Review of Added Mass and Fluid Inertial Forces (1982)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

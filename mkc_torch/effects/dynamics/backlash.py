@@ -1,4 +1,4 @@
-"""Play between a drive and its load."""
+"""Backlash between a drive and its load."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ GAPS = (0.03, 0.06, 0.1, 0.2, 0.3)
 
 
 class Backlash(ShareEffect):
-    """A drive has to cross a gap before it moves its load: worn gears, couplings, linkages and valves with play.
+    """A drive crosses a gap before it moves its load: worn gears, couplings, linkages and valves with play.
 
-    It has memory: after each reversal the load stands still until the gap, 2 c wide, is crossed. A dead zone has none,
-    and takes off the same on the way there and back. At the beginning of a run the drive is in the middle of its gap.
+    It has memory: after each reversal the load stands still until the gap, 2 c wide, is crossed. A dead zone has no
+    memory and acts alike in both directions. At the start of a run the drive is in the middle of the gap.
 
-    Simulation: adds ``γ (y − u)`` to an input, y the load's side: ``y = max(u − c, min(u + c, y before))``; a γ of one
-        is a full gap.
-    Drivers: none but the input, all of its course since the run's beginning.
-    Units: γ is a share; the shape ``half_gap`` in the unit of what it is of.
+    Simulation: adds ``γ (y − u)`` to an input u, where y is the load's side, ``y = max(u − c, min(u + c, y before))``;
+        γ = 1 is a full gap.
+    Drivers: the input only, with its history since the start of the run.
+    Units: γ is a share; the shape ``half_gap`` in the unit of the input.
     Plausible: γ from 0 to 1.
     Source: the play operator; Visintin, "Differential Models of Hysteresis" (1994), III.2; Nordin & Gutman, Automatica
         38 (2002), for gears.

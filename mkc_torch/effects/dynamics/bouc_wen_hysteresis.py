@@ -1,4 +1,4 @@
-"""A restoring force that remembers the way it came."""
+"""A restoring force with hysteresis."""
 
 from __future__ import annotations
 
@@ -19,21 +19,24 @@ if TYPE_CHECKING:
 __all__ = ["BoucWenHysteresis", "hysteretic_path"]
 
 YIELDS = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Deflections at which the force yields, as shares of the largest."""
+"""Deflections at which the force yields, as shares of the largest deflection."""
 
 _ROUNDS = 3
+"""Fixed-point iterations on the signs along a known path."""
+
 _SHORT = 1e-12
+"""Path length over the yield deflection below which its exponential is replaced by its limit."""
 
 
 class BoucWenHysteresis(RateEffect):
-    """A force that is elastic after each reversal, yields, and so goes round a loop: rubber, wire rope, joints, soil.
+    """A force that is elastic after each reversal and then yields, in a loop: rubber, wire rope, joints, soil.
 
-    Simulation: adds ``−γ z`` to the rate of the speed v of a position, with an internal state z of its own, 0 at the
-        beginning of each run: Bouc and Wen's ``ż = A v − β |v| z − β′ v |z|`` with A = 1, which γ holds, and
-        β = β′ = 1 / (2 z₀), so that it is elastic while it unloads and never exceeds z₀.
-    Drivers: none but the position and its speed, all of their course since the run's beginning.
+    Simulation: adds ``−γ z`` to the rate of the speed v of a position, with an internal state z that is 0 at the start
+        of each run: the Bouc-Wen equation ``ż = A v − β |v| z − β′ v |z|`` with A = 1, which is absorbed in γ, and
+        β = β′ = 1 / (2 z₀), so that unloading is elastic and |z| never exceeds z₀.
+    Drivers: the position and its speed only, with their history since the start of the run.
     Units: γ in the speed's unit per s and unit of position; the shape ``yield_deflection``, z₀, in that of position.
-    Plausible: γ ≥ 0: a loop takes energy out.
+    Plausible: γ ≥ 0: a loop dissipates energy.
     Source: Bouc (1967); Wen, Journal of the Engineering Mechanics Division 102 (1976), n = 1; Ismail, Ikhouane &
         Rodellar, "The Hysteresis Bouc-Wen Model, a Survey", Archives of Computational Methods in Engineering 16 (2009).
     """
@@ -46,7 +49,7 @@ class BoucWenHysteresis(RateEffect):
     gain = "stiffness"
     plot_axis = "position"
     equation = "δv̇ = −γ z,  ż = v − (|v| z + v |z|) / (2 z₀)"
-    explanation = "The restoring force depends on the way it came by: it yields, and goes round a loop."
+    explanation = "The restoring force depends on the path of the position: it yields, and follows a hysteresis loop."
     advice = "Add a hysteretic spring that yields at this deflection."
     source = "Wen (1976); Ismail, Ikhouane & Rodellar, The Hysteresis Bouc-Wen Model, a Survey (2009)"
 
@@ -57,7 +60,7 @@ class BoucWenHysteresis(RateEffect):
         return (Quantity(self.gain, 1, quotient(context.signal_unit, context.unit_of("position")) or "1/s²"),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        """The force, and beside it the rate of z, where z is solved for; z along the known path, where it is not."""
+        """The force and, while a trajectory is solved, the rate of z, (N, 2); else along the known path, (N, 1)."""
         z, yields = context.memory, shape["yield_deflection"]
         if z is None:
             z = hysteretic_path(context.part("position"), yields, context.runs)
@@ -71,31 +74,31 @@ class BoucWenHysteresis(RateEffect):
 
 
 def hysteretic_path(position: Float[Tensor, " N"], yields: float, run: Int[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """The internal state z along a path that is known, from 0 at the first sample of each run.
+    """The internal state z along a known path of the position, from 0 at the first sample of each run.
 
-    Between samples z follows from the way that was gone alone, and linearly while it has one sign: the signs are those
-    of the solution before, from that of a path that relaxes whichever way it goes.
+    Between samples z depends on the distance travelled only, and linearly while z keeps its sign. The signs are those
+    of the previous iterate; the first iterate relaxes at half the rate in both directions.
 
     Args:
-        position: at the samples.
+        position: positions at the samples.
         yields: the deflection z₀ at which z yields, in the position's unit; positive.
-        run: of each sample's run.
+        run: number of each sample's run.
 
     Example:
-        Loaded to twice its yield, and back by a half: 1 − e⁻² less the half, as it unloads elastically:
+        Loading to 2 z₀, then unloading by 0.5 z₀: 1 − e⁻² − 0.5, because unloading is elastic:
 
         >>> path = torch.cat([torch.linspace(0, 2, 2001), torch.linspace(2, 1.5, 501)]).double()
         >>> float(hysteretic_path(path, 1.0, torch.zeros(2502, dtype=torch.long))[-1])
         0.364...
     """
-    way = torch.cat([torch.zeros_like(position[:1]), position.diff()])
-    way = torch.where(first_of_runs(run), 0.0, way)
-    relaxing = torch.full_like(way, 0.5)
+    travel = torch.cat([torch.zeros_like(position[:1]), position.diff()])
+    travel = torch.where(first_of_runs(run), 0.0, travel)
+    relaxing = torch.full_like(travel, 0.5)
     for _ in range(_ROUNDS):
-        # while z goes back to 0 it is elastic
-        slope = relaxing * way.abs() / yields
+        # it is elastic while |z| decreases
+        slope = relaxing * travel.abs() / yields
         factor = torch.where(first_of_runs(run), 0.0, torch.exp(-slope))
-        gone = torch.where(slope > _SHORT, -torch.expm1(-slope) / slope.clamp(min=_SHORT), 1.0)
-        z = passed_on(factor, way * gone)
-        relaxing = (way * z > 0.0).to(way.dtype)
+        gain = torch.where(slope > _SHORT, -torch.expm1(-slope) / slope.clamp(min=_SHORT), 1.0)
+        z = passed_on(factor, travel * gain)
+        relaxing = (travel * z > 0.0).to(travel.dtype)
     return z

@@ -1,4 +1,4 @@
-"""A fluid carries what dips into it."""
+"""Buoyancy of a body that dips into a fluid."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ if TYPE_CHECKING:
 
 
 DIPS = ((2.0, 0.5), *((surface, draught) for surface in (0.5, 0.25, 0.0, -0.25, -0.5) for draught in (0.15, 0.6)))
-"""Surface and draught as shares of the largest height; a body is below the first one all the time."""
+"""Surface and draught as shares of the largest height; below the first surface a body is always submerged."""
 
 
 class Buoyancy(RateEffect):
-    """A fluid carries a body by the weight of what it displaces: more, the deeper the body dips in, until it is under.
+    """A fluid lifts a body by the weight of the displaced fluid: the more, the deeper it dips in, until submerged.
 
-    A body that is under all the time is pushed up by a constant force, and no data tells the two apart. The effect is
-    tried where the height takes either sign: on a long fall it would be a curve of the height alone.
+    On a body that is always submerged it is a constant force; no data distinguish the two. The effect is tried where
+    the height takes both signs: on a long fall it would be a mere curve of the height.
 
-    Simulation: adds ``γ clip((c − x) / h, 0, 1)`` to the rate of the speed whose height is x, which has to grow
-        upwards: at x = c the body touches the surface, and h below that it is under.
-    Drivers: none but the height: a position whose name begins with ``height``, ``altitude``, ``elevation``, ``heave``
-        or ``z``.
-    Units: γ in the speed's unit per s; the shapes ``surface``, c, and ``draught``, h, in that of the height.
+    Simulation: adds ``γ clip((c − x) / h, 0, 1)`` to the rate of the speed whose height is x, positive upwards: at
+        x = c the body touches the surface, and at c − h it is submerged.
+    Drivers: the height only: a position whose name begins with ``height``, ``altitude``, ``elevation``, ``heave`` or
+        ``z``.
+    Units: γ in the speed's unit per s; the shapes ``surface``, c, and ``draught``, h, in the unit of the height.
     Plausible: γ ≥ 0, upwards; g times the ratio of the fluid's density to the body's.
     Source: Archimedes' principle; Newman, "Marine Hydrodynamics" (1977), 6.16, for bodies at the surface.
     """
 
     id = "buoyancy"
     relative: Mapping[str, tuple[str, str]] = {"surface": ("position", "largest"), "draught": ("position", "largest")}
-    needs = ("height", "deflection")  # heights that are measured from about where the surface is
+    needs = ("height", "deflection")  # heights measured from near the surface
     gain = "lift"
     plot_axis = "position"
     equation = "δv̇ = γ clip((c − x) / h, 0, 1)"
-    explanation = "Something carries the body upwards, below a height: it dips into a fluid."
-    advice = "Add the weight of the fluid that is displaced."
+    explanation = "Below a height an upward force acts on the body: it dips into a fluid."
+    advice = "Add the weight of the displaced fluid."
     source = "Archimedes' principle; Newman, Marine Hydrodynamics (1977)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002

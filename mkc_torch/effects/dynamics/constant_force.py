@@ -1,4 +1,4 @@
-"""A force that is always there."""
+"""A constant force."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ConstantForce(RateEffect):
-    """A constant push that the simulation lacks: a bias, a slope of the ground, weight that is not balanced.
+    """A constant force that the simulation lacks: a bias, a slope of the ground, an unbalanced weight.
 
     Simulation: adds γ to the rate of a state.
     Drivers: none.
@@ -31,9 +31,9 @@ class ConstantForce(RateEffect):
     gain = "push"
     plot_axis = ""
     equation = "δẋ = γ"
-    explanation = "Something pushes all the time."
+    explanation = "A constant force acts."
     advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."
-    words_by_kind: Mapping[str, str] = {
+    display_name_by_kind: Mapping[str, str] = {
         "temperature": "constant heat flow",
         "level": "constant inflow",
         "pressure": "constant inflow",
@@ -42,21 +42,21 @@ class ConstantForce(RateEffect):
     }
     by_kind: Mapping[str, tuple[str, str]] = {
         "temperature": (
-            "Heat is added, or taken off, all the time.",
-            "Look for a source or a loss of heat that is always there, or for an error of a temperature that the "
-            "simulation takes as known.",
+            "A constant heat flow is added or removed.",
+            "Look for a constant source or loss of heat, or for an error of a temperature that the simulation takes as "
+            "known.",
         ),
         "level": (
-            "Something flows in, or out, all the time.",
+            "There is a constant inflow or outflow.",
             "Look for a leak, an inflow that is not recorded, or a sensor's zero.",
         ),
         "voltage": (
-            "A constant current charges, or discharges, all the time.",
+            "A constant current charges or discharges.",
             "Look for a bias current, a leak or a sensor's zero.",
         ),
-        "current": ("A constant voltage drives all the time.", "Look for an offset voltage or a sensor's zero."),
+        "current": ("A constant voltage acts.", "Look for an offset voltage or a sensor's zero."),
         "pressure": (
-            "Something flows in, or out, all the time.",
+            "There is a constant inflow or outflow.",
             "Look for a leak, an inflow that is not recorded, or a sensor's zero.",
         ),
     }

@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 
 WIDTHS = (0.3, 0.1, 0.03, 0.01)
-"""Of the smoothed sign, as shares of the typical speed."""
+"""Widths of the smoothed sign, as shares of the typical speed."""
 
 
 class CoulombFriction(RateEffect):
-    """Dry friction: a force of one size against the motion, whatever the speed.
+    """Dry friction: a force of constant size against the motion at any speed.
 
     Simulation: adds ``−γ tanh(v / w)`` to the rate of a speed v; the width w, in the speed's unit, smooths the jump at
     standstill, and is reported.
-    Drivers: none but the state.
-    Units: γ in the speed's unit per s; the shape ``width`` in the unit of what it is of.
+    Drivers: the state only.
+    Units: γ in the speed's unit per s; the shape ``width`` in the unit of the speed.
     Plausible: γ ≥ 0.
     Source: Amontons and Coulomb; smoothing as in Andersson, Söderberg & Björklund, Tribology International 40 (2007).
     """
@@ -36,7 +36,7 @@ class CoulombFriction(RateEffect):
     needs = ("reversing",)  # at speeds of one sign it is a constant force
     gain = "friction"
     equation = "δv̇ = −γ tanh(v / w)"
-    explanation = "Dry friction holds against the motion with a force that does not depend on its speed."
+    explanation = "Dry friction opposes the motion with a force that does not depend on the speed."
     advice = "Add dry friction of this size."
     form_parameters = ("width",)
     source = "Coulomb's law of friction; Andersson et al., Tribology International 40 (2007), for the smoothing"

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 class Coupling(RateEffect):
-    """Two states exchange: heat between bodies, fluid between tanks, force between masses.
+    """Exchange between two states: heat between bodies, fluid between tanks, force between masses.
 
-    Simulation: adds ``γ₁ (y − x)`` to the rate of a state x, and ``γ₂ (x − y)`` to that of y, a state in the same unit;
-    between equals γ₁ = γ₂.
-    Drivers: none but the states.
+    Simulation: adds ``γ₁ (y − x)`` to the rate of a state x, and ``γ₂ (x − y)`` to the rate of a state y in the same
+    unit; γ₁ = γ₂ between equal states.
+    Drivers: the states only.
     Units: γ in 1/s.
-    Plausible: γ ≥ 0: exchange evens out.
+    Plausible: γ ≥ 0: exchange reduces the difference.
     Source: Fourier's and Fick's laws; Hooke's law between masses.
     """
 
@@ -34,8 +34,8 @@ class Coupling(RateEffect):
     plot_axis = "other"
     power = 1.0
     equation = "δẋ = γ₁ (y − x),  δẏ = γ₂ (x − y)"
-    explanation = "The state exchanges with another one: the larger their difference, the faster they even out."
-    advice = "Couple the two with this coefficient."
+    explanation = "The state exchanges with another state, in proportion to their difference."
+    advice = "Couple the two states with this coefficient."
     source = "Fourier's law of conduction, Fick's law of diffusion"
 
     @property
@@ -55,7 +55,7 @@ class Coupling(RateEffect):
 
 
 class EqualCoupling(Coupling):
-    """The same between equals: what one gives off, the other takes up."""
+    """Exchange between equal states: what the first loses, the second gains."""
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, "1/s"),)

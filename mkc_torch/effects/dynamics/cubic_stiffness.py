@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class CubicStiffness(RateEffect):
-    """A spring that is not linear: harder or softer the farther it is stretched.
+    """A nonlinear spring: harder or softer at large deflections.
 
     Simulation: adds ``−γ x³`` to the rate of the speed whose position is x.
-    Drivers: none but the position.
-    Units: γ in the speed's unit per s and position's unit cubed.
-    Plausible: either sign; negative for a spring that softens.
+    Drivers: the position only.
+    Units: γ in the speed's unit per s and cube of the position's unit.
+    Plausible: either sign; negative for a softening spring.
     Source: Duffing, "Erzwungene Schwingungen bei veränderlicher Eigenfrequenz" (1918).
     """
 
@@ -32,7 +32,7 @@ class CubicStiffness(RateEffect):
     power = 3.0
     plot_axis = "position"
     equation = "δv̇ = −γ x³"
-    explanation = "The restoring force bends: the spring is harder, or softer, at large deflections."
+    explanation = "The restoring force is not linear: the spring is harder, or softer, at large deflections."
     advice = "Add a cubic spring with this coefficient."
     source = "Duffing's oscillator"
 

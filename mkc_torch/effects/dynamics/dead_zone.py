@@ -1,4 +1,4 @@
-"""An actuator that does not answer to small commands."""
+"""An actuator that does not respond to small commands."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 WIDTHS = (0.03, 0.06, 0.1, 0.2, 0.3)
-"""As shares of the largest input."""
+"""Widths to search, as shares of the largest input."""
 
 
 class DeadZone(ShareEffect):
-    """Small commands do nothing, and large ones lose as much: valves with overlap, sticking amplifiers.
+    """Small commands have no effect, and large commands lose the same amount: valves with overlap, sticking amplifiers.
 
-    It has no memory: on its way back the actuator answers as on its way there. One that does not is
+    It has no memory: the response is the same in both directions. With memory it is
     :class:`mkc_torch.effects.dynamics.backlash.Backlash`.
 
-    Simulation: adds ``−γ clip(u, ±c)`` to an input, by :func:`mkc_torch.effects.share.soft_clip`; a γ of one and no
+    Simulation: adds ``−γ clip(u, ±c)`` to an input u, by :func:`mkc_torch.effects.share.soft_clip`; γ = 1 without
         softness is a full dead zone.
-    Drivers: none but the input.
-    Units: γ is a share; the shape ``width`` in the unit of what it is of, ``softness`` a share of the width.
+    Drivers: the input only.
+    Units: γ is a share; the shape ``width`` in the unit of the input, ``softness`` a share of the width.
     Plausible: γ from 0 to 1.
     Source: Khalil, "Nonlinear Systems" (2002), 1.2.7.
     """
@@ -37,7 +37,7 @@ class DeadZone(ShareEffect):
     plot_axis = "own"
     equation = "δu = −γ clip(u, ±c)"
     explanation = "Small commands have no effect: the actuator has a dead zone."
-    advice = "Take this much off every command."
+    advice = "Subtract this amount from the size of every command."
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002

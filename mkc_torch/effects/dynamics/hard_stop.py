@@ -1,4 +1,4 @@
-"""The end of the way."""
+"""A stop that limits the position."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 PLACES = (0.5, 0.65, 0.8, 0.9)
-"""Of the stop, as shares of the largest deflection."""
+"""Positions of the stop to search, as shares of the largest deflection."""
 
 
 class HardStop(RateEffect):
-    """A bumper or the end of the way: beyond a place a stiff spring pushes back.
+    """A bumper or an end stop: beyond a position a stiff spring acts against the motion.
 
     Simulation: adds ``−γ₁ h (h/c)ⁿ⁻¹`` with ``h = max(x − c, 0)``, and γ₂ on the other side, to the rate of the speed
-        whose position is x. The exponent n is 1 for a spring and 3/2 for a ball on a plate; it is searched at 1, and
-        fitted.
-    Drivers: none but the position.
-    Units: γ in the speed's unit per s and unit of position; the shape ``place`` in the unit of what it is of;
+        whose position is x. The exponent n is 1 for a spring and 3/2 for a ball on a plate; it is 1 in the search and
+        fitted afterwards.
+    Drivers: the position only.
+    Units: γ in the speed's unit per s and unit of position; the shape ``place`` in the unit of the position;
         ``exponent`` is a number.
     Plausible: γ ≥ 0.
     Source: penalty contact; Gilardi & Sharf, Mechanism and Machine Theory 37 (2002).
@@ -41,8 +41,8 @@ class HardStop(RateEffect):
     plot_axis = "position"
     power = 1.0
     equation = "δv̇ = −γ₁ h (h/c)ⁿ⁻¹ + γ₂ h' (h'/c)ⁿ⁻¹,  h = max(x − c, 0), h' = max(−c − x, 0)"
-    explanation = "The motion runs into a stop: beyond a place something pushes back."
-    advice = "Add a stop at this place."
+    explanation = "The motion runs into a stop: beyond a position a force acts against it."
+    advice = "Add a stop at this position."
     source = "penalty contact; Gilardi & Sharf (2002)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
@@ -53,8 +53,8 @@ class HardStop(RateEffect):
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
         x, place, exponent = context.part("position"), shape["place"], shape["exponent"]
-        push = torch.stack([-beyond(x, place, exponent), beyond(-x, place, exponent)], -1)
-        return (push @ gamma).unsqueeze(-1)
+        forces = torch.stack([-beyond(x, place, exponent), beyond(-x, place, exponent)], -1)
+        return (forces @ gamma).unsqueeze(-1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         x, place, exponent = names["position"], shape["place"], shape["exponent"]

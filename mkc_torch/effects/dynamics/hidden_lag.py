@@ -1,4 +1,4 @@
-"""A part that follows a state late, and that the equations do not have."""
+"""A storage that is missing in the equations and follows a state with a lag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.005, 0.015, 0.05, 0.15)
-"""Time constants that are searched, as shares of the longest run."""
+"""Time constants to search, as shares of the longest run."""
 
 
 _EXAMPLES = {
@@ -26,18 +26,18 @@ _EXAMPLES = {
     "speed": ": a load on a slipping coupling, a liquid carried along",
     "rotation": ": a load on a slipping coupling, a liquid carried along",
 }
-"""What the second store may be."""
+"""Examples of the second store, by the kind of quantity."""
 
 
 class HiddenLag(RateEffect):
     """A second store behind a resistance: heat in a wall, water in a side tank, a mass that a damper drags along.
 
-    Simulation: adds ``γ (z − x) / τ`` to the rate of a state x, with an internal state z of its own that begins like x:
-        ``τ ż = x − z``. What the state gives off, the store takes up.
-    Drivers: none but the state, all of its course since the run's beginning.
-    Units: γ, the store's capacity as a share of the state's own, is a number; the time constant τ in s.
-    Plausible: γ from 0 to thirty, for exchange evens out; a store that follows at once only adds to the capacity, which
-        is often a parameter of the simulation, and then nothing would hold γ.
+    Simulation: adds ``γ (z − x) / τ`` to the rate of a state x, with an internal state z that starts at x:
+        ``τ ż = x − z``. What the state loses, the store gains.
+    Drivers: the state only, with its history since the start of the run.
+    Units: γ, the store's capacity as a share of the state's, is a number; the time constant τ in s.
+    Plausible: γ from 0 to 30. A store with a very short lag only adds to the capacity; where that is a parameter of the
+        simulation, γ is not identifiable without this bound.
     Source: two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011); Maxwell's model of a damper.
     """
 
@@ -50,9 +50,9 @@ class HiddenLag(RateEffect):
     gain = "share"
     plot_axis = ""
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
-    explanation = "The state exchanges with something that is not in the equations and follows it late."
+    explanation = "The state exchanges with a store that is not in the equations and follows it with a lag."
     advice = "Add a second store with this time constant, such as a wall behind a resistance."
-    words_by_kind: Mapping[str, str] = {
+    display_name_by_kind: Mapping[str, str] = {
         "temperature": "second store of heat",
         "level": "side tank",
         "pressure": "second volume",
@@ -64,14 +64,14 @@ class HiddenLag(RateEffect):
         "level": "a side tank",
         "pressure": "a second volume behind a throttle",
         "voltage": "a second capacitor behind a resistor",
-        "current": "a second coil beside a resistor",
+        "current": "a second coil parallel to a resistor",
         "speed": "a mass dragged along by a damper",
         "rotation": "a flywheel dragged along by a damper",
     }
     source = "two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011)"
 
     def store(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
-        """The store with its size and its time, as a person says them."""
+        """A phrase with the store, its size and its time constant."""
         known = self.stores.get(kind_at(context), "a second store")
         evens_out = "catching up" if kind_at(context) in MOTION else "exchanging"
         time = duration(float(shape["time_constant"]))
@@ -91,13 +91,13 @@ class HiddenLag(RateEffect):
         return (Quantity(self.gain, 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        """The exchange, and beside it the rate of z, where z is solved for; along the known path, where it is not."""
+        """The exchange and, while a trajectory is solved, the rate of z, (N, 2); else along the known path, (N, 1)."""
         x, z, lag = context.part("own"), context.memory, shape["time_constant"]
         if z is None:
             return (gamma[0] * (lagged(x, context.time, lag, context.runs) - x) / lag).unsqueeze(-1)
-        gone = (x - z) / lag
-        return torch.stack([-gamma[0] * gone, gone], -1)
+        flow = (x - z) / lag
+        return torch.stack([-gamma[0] * flow, flow], -1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        gone = f"({names['own']} - {names['memory']}) / {shape['time_constant']!r}"
-        return f"-{gamma[0]!r} * {gone}", gone
+        flow = f"({names['own']} - {names['memory']}) / {shape['time_constant']!r}"
+        return f"-{gamma[0]!r} * {flow}", flow

@@ -1,4 +1,4 @@
-"""A resonance that the equations do not have."""
+"""A resonance that is missing in the equations."""
 
 from __future__ import annotations
 
@@ -21,18 +21,25 @@ if TYPE_CHECKING:
 __all__ = ["HiddenMode", "spring_force"]
 
 PERIODS = 10
-"""That are searched: from a few samples up to :data:`LONGEST`, each the same times as long as the one before."""
+"""Number of periods to search, in a geometric series up to :data:`LONGEST`."""
 
-SAMPLES, SHORTEST, LONGEST = 5.0, 0.002, 0.25
-"""Samples in the shortest period that is searched; least and greatest one as shares of the longest run."""
+SAMPLES = 5.0
+"""Samples in the shortest period to search."""
+
+SHORTEST = 0.002
+"""Shortest period to search, as a share of the longest run."""
+
+LONGEST = 0.25
+"""Longest period to search, as a share of the longest run."""
 
 DAMPING = 0.1
-"""Share of critical damping that is searched: a resonance as wide as the periods are apart."""
+"""Damping ratio in the search: the resonance is as wide as the distance of the periods."""
 
-_LEAST = 1e-12
+_MIN_DIVISOR = 1e-12
+"""Lower limit of divisors."""
 
 _SOMETHING = ("a second store", "of the first", "that swings with it")
-"""Of a quantity that is of no known kind."""
+"""The second store for a quantity of unknown kind."""
 
 _EXAMPLES = {
     "position": "; a flexible joint, a load on a rope, a liquid that sloshes",
@@ -42,14 +49,14 @@ _EXAMPLES = {
     "level": "; a pipe between two vessels",
     "pressure": "; a long line",
 }
-"""What swings along may be."""
+"""Examples of the second mass or store, by the kind of quantity."""
 
 _SLOW = 10.0
-"""Period in s from which on it is told in place of a frequency."""
+"""Period in s from which it is reported instead of the frequency."""
 
 
 def _frequency(period: float) -> str:
-    """A frequency in Hz, or the period where it is long.
+    """A frequency in Hz as text, or a long period.
 
     Example:
         >>> _frequency(0.1408), _frequency(420.0)
@@ -59,16 +66,16 @@ def _frequency(period: float) -> str:
 
 
 class HiddenMode(RateEffect):
-    """A second mass on a spring, which swings along: a flexible joint or shaft, a load on a rope, sloshing.
+    """A second mass on a spring: a flexible joint or shaft, a load on a rope, sloshing.
 
-    Simulation: adds ``γ (ω² s + 2 ζ ω ṡ)`` to the rate of a speed v, with two internal states of its own: the spring's
-        deflection s, 0 at the beginning of each run, and the second mass's speed w, at first v:
-        ``ṡ = w − v``, ``ẇ = −ω² s − 2 ζ ω (w − v)``. Of a level it is a second surface behind a column with inertia.
-    Drivers: none but the state, all of its course since the run's beginning.
-    Units: γ, the second mass as a share of the first, is a number; the period 2π/ω in s; the damping ζ, as a share of
-        critical damping, is a number.
-    Plausible: γ from 0 to ten; a second mass on a stiff spring only adds to the first, often a parameter of the
-        simulation, and then nothing would hold γ.
+    Simulation: adds ``γ (ω² s + 2 ζ ω ṡ)`` to the rate of a speed v, with two internal states: the spring's deflection
+        s, 0 at the start of each run, and the second mass's speed w, which starts at v:
+        ``ṡ = w − v``, ``ẇ = −ω² s − 2 ζ ω (w − v)``. For a level it is a second surface behind a column with inertia.
+    Drivers: the state only, with its history since the start of the run.
+    Units: γ, the second mass as a share of the first, is a number; the period 2π/ω in s; the damping ratio ζ is a
+        number.
+    Plausible: γ from 0 to 10. A second mass on a stiff spring only adds to the first; where that is a parameter of the
+        simulation, γ is not identifiable without this bound.
     Source: Den Hartog, "Mechanical Vibrations" (1956), 3.2; Spong, Journal of Dynamic Systems, Measurement, and Control
         109 (1987), for flexible joints; Dodge, "The New Dynamic Behavior of Liquids in Moving Containers" (2000).
     """
@@ -84,8 +91,8 @@ class HiddenMode(RateEffect):
     gain = "share"
     plot_axis = ""
     equation = "δv̇ = γ (ω² s + 2 ζ ω ṡ),  ṡ = w − v,  ẇ = −ω² s − 2 ζ ω ṡ,  ω = 2π / period"
-    explanation = "Something swings along that is not in the equations, with a period of its own."
-    advice = "Add a second mass on a spring of this period, as of a flexible joint or of a liquid that sloshes."
+    explanation = "There is a resonance that is not in the equations."
+    advice = "Add a second mass on a spring with this period, such as a flexible joint or a sloshing liquid."
     seconds: Mapping[str, tuple[str, str, str]] = {
         "rotation": ("a second inertia", "of the turning one", "on a flexible shaft"),
         "angle": ("a second inertia", "of the turning one", "on a flexible shaft"),
@@ -94,19 +101,19 @@ class HiddenMode(RateEffect):
         "voltage": ("a second capacitor", "of the first", "behind a coil"),
         "current": ("a second coil", "of the first", "behind a capacitor"),
     }
-    """What swings along, what its share is of, and what it hangs on, by the kind of quantity."""
+    """The second mass or store, what its share refers to, and its connection, by the kind of quantity."""
     source = (
         "Den Hartog, Mechanical Vibrations (1956), 3.2; Spong (1987), for flexible joints; Dodge (2000), for sloshing"
     )
 
     def second(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
-        """What swings along with its size, its frequency and its damping, as a person says them."""
+        """A phrase with the second mass or store, its size, its frequency and its damping ratio."""
         kind = kind_at(context)
         plain = ("a second mass", "of the moving one", "on a spring") if kind in MOTION else _SOMETHING
         what, of_what, behind = self.seconds.get(kind, plain)
-        times, damping = _frequency(float(shape["period"])), float(f"{float(shape['damping']):.1g}")
+        frequency, damping = _frequency(float(shape["period"])), float(f"{float(shape['damping']):.1g}")
         share = share_of(float(gamma[0]))
-        return f"{what}, {share} {of_what}, {behind}: {times}, damping ratio {sized(damping)}"
+        return f"{what}, {share} {of_what}, {behind}: {frequency}, damping ratio {sized(damping)}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return f"Not in the equations is {self.second(gamma, shape, context)}."
@@ -118,15 +125,15 @@ class HiddenMode(RateEffect):
         length = float(time.max() - time.min())
         steps = time.diff()
         step = float(steps[steps > 0].median()) if bool((steps > 0).any()) else length
-        least = min(max(SAMPLES * step, SHORTEST * length), 0.5 * LONGEST * length)
-        ratio = (LONGEST * length / max(least, _LEAST)) ** (1.0 / (PERIODS - 1))
-        return tuple({"period": least * ratio**k, "damping": DAMPING} for k in range(PERIODS))
+        shortest = min(max(SAMPLES * step, SHORTEST * length), 0.5 * LONGEST * length)
+        ratio = (LONGEST * length / max(shortest, _MIN_DIVISOR)) ** (1.0 / (PERIODS - 1))
+        return tuple({"period": shortest * ratio**k, "damping": DAMPING} for k in range(PERIODS))
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        """The force, and beside it the internal states' rates, where they are solved for; else along the known path."""
+        """The force and, while a trajectory is solved, the rates of s and w, (N, 3); else along the path, (N, 1)."""
         v, memories, damping = context.part("own"), context.memories, shape["damping"]
         omega = 2.0 * math.pi / shape["period"]
         if memories is None:
@@ -149,20 +156,20 @@ def spring_force(
     damping: float | Tensor,
     run: Int[Tensor, " N"],
 ) -> Float[Tensor, " N"]:
-    """What a mass on a spring pulls with at a support whose speed is known, for each unit of its mass.
+    """The force of a mass on a spring on a support whose speed is known, per unit of the mass, (N,).
 
-    ``ω² s + 2 ζ ω ṡ`` with ``s̈ + 2 ζ ω ṡ + ω² s = −v̇``, at rest at the first sample of each run; exact for intervals of
-    any length where v goes straight from sample to sample.
+    ``ω² s + 2 ζ ω ṡ`` with ``s̈ + 2 ζ ω ṡ + ω² s = −v̇``, in steady state at the first sample of each run; exact for v
+    linear between samples, at any sampling intervals.
 
     Args:
-        speed: v, at the samples.
-        time: of the samples in s.
+        speed: v at the samples.
+        time: times of the samples in s.
         omega: 2π times the natural frequency, in rad/s.
-        damping: ζ, as a share of critical damping; between 0 and 1.
-        run: of each sample's run.
+        damping: damping ratio ζ, between 0 and 1.
+        run: number of each sample's run.
 
     Example:
-        A support that sets off at once, and a mass without damping behind it, for half a period:
+        A step of the support's speed with an undamped mass behind it, for half a period:
 
         >>> time = torch.linspace(0.0, torch.pi, 1001, dtype=torch.float64)
         >>> speed = (time > 0.0).double()
@@ -170,14 +177,14 @@ def spring_force(
         >>> [round(float(force[k]), 2) for k in (250, 500, 750)]  # -sin(t)
         [-0.71, -1.0, -0.71]
     """
-    omega, damping = (torch.as_tensor(one, dtype=speed.dtype) for one in (omega, damping))
+    omega, damping = (torch.as_tensor(value, dtype=speed.dtype) for value in (omega, damping))
     first = first_of_runs(run)
     step = torch.where(first, 0.0, torch.cat([time.new_zeros(1), time.diff()])).clamp(min=0.0)
     gained = torch.where(first, 0.0, torch.cat([speed.new_zeros(1), speed.diff()]))
     # with the pole p, q = ṡ − p̄ s obeys the first-order equation q̇ = p q − v̇
     swing = omega * (1.0 - damping.square()).sqrt()
     pole = torch.complex(-damping * omega, swing)
-    turned = pole * step.clamp(min=_LEAST)
+    turned = pole * step.clamp(min=_MIN_DIVISOR)
     keep = torch.where(first, 0.0, torch.exp(turned))
     q = passed_on(keep, -gained * (torch.exp(turned) - 1.0) / turned)
     s = q.imag / swing

@@ -1,4 +1,4 @@
-"""An actuator that answers late."""
+"""A delay of an input."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
-"""Delays that are searched, as shares of the longest run."""
+"""Delays to search, as shares of the longest run."""
 
 
 class InputDelay(ShareEffect):
-    """The system answers to what its input was a while ago.
+    """The system responds to its input with a delay.
 
-    Simulation: adds ``γ (u(t − τ) − u(t))`` to an input; a γ of one is a pure delay.
-    Drivers: none but the input.
+    Simulation: adds ``γ (u(t − τ) − u(t))`` to an input u; γ = 1 is a pure delay.
+    Drivers: the input only.
     Units: γ is a share; the delay in s.
     Plausible: γ from 0 to 1.
     Source: transport delays; Åström & Murray, "Feedback Systems" (2008), 3.4.
@@ -33,7 +33,7 @@ class InputDelay(ShareEffect):
     continuous: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     equation = "δu = γ (u(t − τ) − u(t))"
-    explanation = "The system answers to its input late."
+    explanation = "The system responds to its input with a delay."
     advice = "Delay the input by this time."
     recurrence = "a delay shifts fast changes of its input and leaves their size"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"

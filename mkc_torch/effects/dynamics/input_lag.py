@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.001, 0.003, 0.01, 0.03, 0.1)
-"""Time constants that are searched, as shares of the longest run."""
+"""Time constants to search, as shares of the longest run."""
 
 
 class InputLag(ShareEffect):
     """The actuator follows its command through a first-order lag: motor drivers, valves, radiators, propellers.
 
-    A delay shifts the command in time and leaves its shape; a lag smooths it. At the first sample of a run the actuator
-    is where its command is.
+    A delay shifts the command in time and keeps its shape; a lag smooths it. At the first sample of a run the actuator
+    is at its command.
 
-    Simulation: adds ``γ (u_τ − u)`` to an input, u_τ the input behind a first-order lag, ``τ u̇_τ = u − u_τ``; a γ of
-        one is a plain lag.
-    Drivers: none but the input, all of its course since the run's beginning.
+    Simulation: adds ``γ (u_τ − u)`` to an input u, where u_τ is the input behind a first-order lag,
+        ``τ u̇_τ = u − u_τ``; γ = 1 is a pure lag.
+    Drivers: the input only, with its history since the start of the run.
     Units: γ is a share; the time constant ``lag`` in s.
     Plausible: γ from 0 to 1.
     Source: actuator dynamics; Ogata, "Modern Control Engineering" (2010), 5.2.

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 class InputSaturation(Saturation):
-    """Beyond a limit the actuator gives no more; amplifiers and magnets give way before they reach it.
+    """The actuator saturates at a limit; amplifiers and magnets deviate already below it.
 
-    Simulation: adds ``−γ (u − clip(u, ±c))`` to an input, by :func:`mkc_torch.effects.share.soft_clip`; a γ of one and
-        no softness is a hard limit.
-    Drivers: none but the input.
-    Units: γ is a share; the shape ``limit`` in the unit of what it is of, ``softness`` a share of the limit.
+    Simulation: adds ``−γ (u − clip(u, ±c))`` to an input u, by :func:`mkc_torch.effects.share.soft_clip`; γ = 1 without
+        softness is a hard limit.
+    Drivers: the input only.
+    Units: γ is a share; the shape ``limit`` in the unit of the input, ``softness`` a share of the limit.
     Plausible: γ from 0 to 1.
     Source: Khalil, "Nonlinear Systems" (2002), 1.2.7.
     """
@@ -29,7 +29,7 @@ class InputSaturation(Saturation):
     limits = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
     fitted_shape: Mapping[str, tuple[float, float]] = {"limit": (0.2, 1.5), "softness": SOFTNESS}
     equation = "δu = −γ (u − clip(u, ±c))"
-    explanation = "The actuator reaches its limit: beyond it, a larger command has no more effect."
+    explanation = "The actuator saturates: beyond its limit a larger command has no more effect."
     advice = "Limit the input to this size."
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002

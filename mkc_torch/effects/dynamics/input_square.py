@@ -22,13 +22,12 @@ _SCALE = "scale_of_input"
 class InputSquare(ShareEffect):
     """The system is driven by the square of its input: thrust of a propeller, heat of a resistor, pull of a coil.
 
-    A simulation that is linear in such an input is right at one amplitude alone: small commands do less than it says.
-    At the largest input of the recording the effect changes nothing, so that the simulation's own gain is what it is
-    there.
+    A simulation that is linear in such an input is right at one amplitude only: it overestimates small commands. At the
+    largest input of the recording the effect is 0, so the simulation's own gain keeps its value there.
 
-    Simulation: adds ``γ (u |u| / c − u)`` to an input, c its largest size in the recording; a γ of one is the square,
-        one between the two a line and a square together.
-    Drivers: none but the input.
+    Simulation: adds ``γ (u |u| / c − u)`` to an input u, where c is its largest size in the recording; γ = 1 is the
+        square, a smaller γ a mixture of a line and a square.
+    Drivers: the input only.
     Units: γ is a share; c in the input's unit.
     Plausible: γ from 0 to 1.
     Source: thrust and torque of a propeller, Leishman, "Principles of Helicopter Aerodynamics" (2006), 2.3; Joule's

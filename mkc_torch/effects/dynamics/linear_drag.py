@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 
 class LinearDrag(RateEffect):
-    """Viscous friction or a leak: the state loses in proportion to itself.
+    """Viscous friction or a leak: the state decays in proportion to itself.
 
     Simulation: adds ``−γ x`` to the rate of a state x, or ``−γ (x − u)`` where an input u is its surroundings.
-    Drivers: none but the state.
+    Drivers: the state only.
     Units: γ in 1/s.
     Plausible: γ ≥ 0; a negative drag would feed energy in.
     Source: Stokes' law of drag at small Reynolds numbers; viscous friction of bearings; Newton's law of cooling.
 
     Args:
-        beside: of the difference to the surroundings.
+        to_surroundings: whether it is proportional to the difference from the surroundings.
     """
 
     id = "linear_drag"
@@ -33,7 +33,7 @@ class LinearDrag(RateEffect):
     equation = "δẋ = −γ x"
     explanation = "The motion is damped in proportion to its speed, as by a viscous fluid."
     advice = "Add viscous drag with this coefficient."
-    words_by_kind: Mapping[str, str] = {
+    display_name_by_kind: Mapping[str, str] = {
         "temperature": "loss of heat",
         "level": "leak",
         "pressure": "leak",
@@ -61,11 +61,11 @@ class LinearDrag(RateEffect):
     }
     source = "Stokes' law at small Reynolds numbers; viscous friction of bearings"
 
-    def __init__(self, *, beside: bool = False) -> None:
-        if beside:
+    def __init__(self, *, to_surroundings: bool = False) -> None:
+        if to_surroundings:
             self.needs, self.form_parameters = ("own", SURROUNDINGS), (SURROUNDINGS,)
             self.equation = "δẋ = −γ (x − u)"
-            self.explanation = "The state evens out with its surroundings, in proportion to its difference to them."
+            self.explanation = "The state approaches its surroundings, in proportion to the difference."
             self.advice = "Add a loss to the surroundings with this coefficient."
             self.by_kind = {}
 

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 WIDTHS = (0.3, 0.1, 0.03, 0.01)
-"""Of the smoothed sign, as shares of the typical speed."""
+"""Widths of the smoothed sign, as shares of the typical speed."""
 
 
 class LoadDependentFriction(RateEffect):
-    """Dry friction of a gear: a part that is always there, and a part in proportion to what presses the teeth together.
+    """Dry friction of a gear: a constant part, and a part in proportion to the load on the teeth.
 
-    Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, with a what the inputs add to it at
-    this speed, a motor's braking field included, and h what acts on it at standstill without them.
-    Drivers: none but the states and inputs.
+    Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, where a is the contribution of the
+    inputs at this speed, including a motor's braking field, and h the rate at standstill without inputs.
+    Drivers: the states and inputs only.
     Units: γ₁ in the speed's unit per s; γ₂ is a share; ``width`` in the unit of the speed.
     Plausible: γ ≥ 0.
     Source: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025.
@@ -36,7 +36,7 @@ class LoadDependentFriction(RateEffect):
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
     gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
-    explanation = "Dry friction holds against the motion, the more the harder the drive works against its load."
+    explanation = "Dry friction opposes the motion, the more the larger the load of the drive."
     advice = "Add dry friction with a part in proportion to the load."
     form_parameters = ("width",)
     source = "Duclusaud et al., Extended Friction Models for the Physics Simulation of Servo Actuators, ICRA 2025"

@@ -1,4 +1,4 @@
-"""A spinning body is driven sideways."""
+"""Lift on a spinning body."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ if TYPE_CHECKING:
 
 
 class MagnusLift(RateEffect):
-    """A ball that spins drags air around with it, and is driven across its way, in proportion to spin and speed.
+    """A force on a spinning ball across its path, in proportion to spin and speed.
 
-    Forces of Coriolis on a turning frame and of Lorentz on a charge have the same form; no recording tells them apart.
+    The Coriolis force in a rotating frame and the Lorentz force on a charge have the same form; no recording
+    distinguishes them.
 
-    Simulation: adds ``−γ v_y`` to the rate of a speed v_x and ``γ v_x`` to that of another one, v_y, square to it: it
-        turns the way and takes no energy. Where the spin w is recorded, γ is ``γ₁ + γ₂ (w − w̄)``, w̄ its mean.
-    Drivers: the states; a column whose name begins with ``spin``, if there is one.
-    Units: γ, γ₁ in 1/s; γ₂ in 1/s for each unit of the spin.
+    Simulation: adds ``−γ v_y`` to the rate of a speed v_x and ``γ v_x`` to the rate of a perpendicular speed v_y: it
+        turns the path and takes no energy. Where the spin w is recorded, γ is ``γ₁ + γ₂ (w − w̄)`` with its mean w̄.
+    Drivers: the states; a column whose name begins with ``spin``, if there is such a column.
+    Units: γ, γ₁ in 1/s; γ₂ in 1/s per unit of the spin.
     Plausible: either sign.
     Source: Rayleigh (1877); Mehta, "Aerodynamics of Sports Balls", Annual Review of Fluid Mechanics 17 (1985).
     """
@@ -39,8 +40,8 @@ class MagnusLift(RateEffect):
     gain = "turning"
     plot_axis = "other"
     equation = "δv̇_x = −γ v_y,  δv̇_y = γ v_x"
-    explanation = "Something drives the motion across its way, in proportion to its speed, as air does a spinning ball."
-    advice = "Add a force across the way with this coefficient, and record the spin."
+    explanation = "A force acts across the path, in proportion to the speed, as on a spinning ball in air."
+    advice = "Add a force across the path with this coefficient, and record the spin."
     source = "Mehta, Aerodynamics of Sports Balls, Annual Review of Fluid Mechanics 17 (1985)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

@@ -1,4 +1,4 @@
-"""A vessel that runs over."""
+"""Overflow of a vessel."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 
 RIMS = (0.5, 0.65, 0.8, 0.9)
-"""As shares of the highest level."""
+"""Rims to search, as shares of the highest level."""
 
 
 class Overflow(RateEffect):
-    """Above the rim a vessel loses what comes in.
+    """A vessel overflows above its rim.
 
     Simulation: adds ``−γ h (h/c)ⁿ⁻¹`` with ``h = max(x − c, 0)`` to the rate of a level x. The exponent n is 3/2 for a
-        wide weir and 5/2 for a V-notch; it is searched at 1, and fitted.
-    Drivers: none but the state.
-    Units: γ in 1/s; the shape ``rim`` in the unit of what it is of; ``exponent`` is a number.
+        wide weir and 5/2 for a V-notch; it is 1 in the search and fitted afterwards.
+    Drivers: the state only.
+    Units: γ in 1/s; the shape ``rim`` in the unit of the level; ``exponent`` is a number.
     Plausible: γ ≥ 0.
     Source: flow over weirs; Henderson, "Open Channel Flow" (1966), ch. 6.
     """
@@ -37,7 +37,7 @@ class Overflow(RateEffect):
     gain = "loss"
     power = 1.0
     equation = "δẋ = −γ h (h/c)ⁿ⁻¹,  h = max(x − c, 0)"
-    explanation = "Above a level something is lost, as when a vessel runs over its rim."
+    explanation = "There is a loss above a level, as when a vessel overflows."
     advice = "Add a loss above this level."
     source = "flow over weirs; Henderson, Open Channel Flow (1966)"
 

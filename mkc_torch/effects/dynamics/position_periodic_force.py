@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 24)
-"""Periods in a turn."""
+"""Numbers of periods per turn to search."""
 
 
 class PositionPeriodicForce(RateEffect):
-    """Cogging and eccentricity: a force that repeats with every turn, or a whole fraction of it.
+    """Cogging and eccentricity: a force that repeats with each turn or an integer fraction of a turn.
 
     Simulation: adds ``γ₁ sin(k x) + γ₂ cos(k x)`` to the rate of the speed whose angle is x.
-    Drivers: none but the position.
+    Drivers: the position only.
     Units: γ in the speed's unit per s; x in rad.
     Plausible: either sign.
     Source: Hanselman, "Brushless Permanent Magnet Motor Design" (2003), ch. 9.

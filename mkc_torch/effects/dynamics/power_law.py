@@ -1,4 +1,4 @@
-"""A loss or a restoring force by a power that is no whole number."""
+"""A loss or a restoring force with a fractional exponent."""
 
 from __future__ import annotations
 
@@ -16,48 +16,49 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 EXPONENTS = (0.5, 1.25, 1.5, 1.75, 2.5, 3.0)
-"""That are searched; 1 and 2 are those of linear and quadratic drag."""
+"""Exponents to search; 1 and 2 are linear and quadratic drag."""
 
 ROUNDED = 1e-3
-"""Share of the scale within which the curve is straight, so that its slope at 0 is finite."""
+"""Share of the scale within which the curve is linear, so that its slope at 0 is finite."""
 
 _OF = {"own": "x", "difference": "x − u", "position": "x", "excess": "x − x₀"}
+"""The base of the power, in symbols."""
 
 
 _LOWEST, _HIGHEST = "lowest_of_own", "highest_of_own"
 
 _SPRING = (
-    "Something drives the position back by a power of the deflection, as a spring that hardens does.",
+    "The restoring force is a power of the deflection, as of a hardening spring.",
     "Add a spring with this exponent: 1 is linear, 1.5 a ball on a plate, 3 a beam at large deflections.",
 )
 """Explanation and advice for a power of a position."""
 
 
 class PowerLaw(RateEffect):
-    """A state is driven back by a power of itself: convection, flow through an orifice, wind, a spring of felt.
+    """A loss or restoring force that is a power of the state: convection, orifice flow, wind, a spring of felt.
 
-    Natural convection carries heat off with the 5/4th to 4/3rd power of the difference in temperature, in corners up to
-    the 3/2nd; a vessel empties with the square root of its level; drag between Stokes' and Rayleigh's has an exponent
-    between 1 and 2. What drag, dry friction or a cubic spring explains as well is theirs.
+    The heat flow of natural convection has exponents 5/4 to 4/3 in the temperature difference, in corners up to 3/2; a
+    vessel empties with the square root of its level; drag between Stokes' and Rayleigh's has an exponent between 1 and
+    2. Drag, dry friction and a cubic spring are preferred where they explain the recording as well.
 
-    Simulation: adds ``−γ |y/c|ᵖ sign y`` to the rate of a state, y the state itself, its difference to an input that is
-        its surroundings, the excess of a temperature over the lowest one of the recording where no input tells its
-        surroundings, or the position whose speed it is; within a thousandth of c about 0 the curve is straight.
-    Drivers: none but the state and its surroundings.
-    Units: γ in the state's unit per s, what there is of it at y = c; the scale c, the largest y, in that of y; the
-        exponent p is a number.
-    Plausible: γ ≥ 0, but for a spring, which softens with a negative one.
+    Simulation: adds ``−γ |y/c|ᵖ sign y`` to the rate of a state, where y is the state itself, its difference from an
+        input that is its surroundings, the excess of a temperature over its lowest value in the recording where no
+        input is its surroundings, or the position whose speed it is; for |y| below c / 1000 the curve is linear.
+    Drivers: the state and its surroundings only.
+    Units: γ, the size at y = c, in the state's unit per s; the scale c, the largest y, in the unit of y; the exponent p
+        is a number.
+    Plausible: γ ≥ 0, except for a spring: a negative γ softens it.
     Source: Churchill & Chu, International Journal of Heat and Mass Transfer 18 (1975), of natural convection;
         Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), of drag.
 
     Args:
-        of: what it is a power of, ``own``, ``difference``, ``excess`` or ``position``.
+        of: base of the power, ``own``, ``difference``, ``excess`` or ``position``.
     """
 
     id = "power_law"
     is_generalisation = True
     fitted_shape: Mapping[str, tuple[float, float]] = {"exponent": (0.3, 6.0)}
-    explanation = "Something drives the state back by a power of its size, as natural convection or an orifice does."
+    explanation = "The state decays by a power of its size, as by natural convection or through an orifice."
     advice = "Add a term with this exponent, and look for physics that has it."
     by_kind: Mapping[str, tuple[str, str]] = {
         "temperature": (
@@ -76,7 +77,7 @@ class PowerLaw(RateEffect):
         **dict.fromkeys(
             ("speed", "rotation"),
             (
-                "Something brakes the motion by a power of its speed.",
+                "The motion is braked by a power of its speed.",
                 "Add a drag with this exponent: 1 is viscous, 2 that of air or water at speed.",
             ),
         ),
@@ -87,7 +88,7 @@ class PowerLaw(RateEffect):
         self.of = of
         part = SURROUNDINGS if of == "difference" else of
         self.plot_axis = "position" if of == "position" else "own"
-        # of a temperature in °C a power is no physics
+        # a power of a temperature in °C has no physical meaning
         needs = {"own": ("own", "flowing"), "position": ("position", "deflection"), "excess": ("own", "temperature")}
         self.needs = needs.get(of, ("own", part))
         self.lower = -math.inf if of == "position" else 0.0
@@ -95,7 +96,7 @@ class PowerLaw(RateEffect):
         self._scale = f"scale_of_{of}"
         self.relative: Mapping[str, tuple[str, str]] = {self._scale: (part, "largest")}
         if of == "excess":
-            self.excludes = (SURROUNDINGS,)  # the difference to them is what counts where they are known
+            self.excludes = (SURROUNDINGS,)  # where they are known, the difference from them is used
             self.relative = {_LOWEST: ("own", "lowest"), _HIGHEST: ("own", "highest")}
         elif of == "position":
             self.by_kind, self.explanation, self.advice = {}, _SPRING[0], _SPRING[1]
@@ -108,8 +109,8 @@ class PowerLaw(RateEffect):
             lowest = sized(low, context.unit_of("own"))
             return f"{self.equation},  x₀ = {lowest}, the lowest of the recording,  c = {sized(high - low, 'K')}"
         scale = sized(float(shape[self._scale]), context.unit_of(self.plot_axis))
-        beside = f",  u = {context.parts[SURROUNDINGS]}" if self.of == "difference" else ""
-        return f"{self.equation},  c = {scale}, the largest of the recording{beside}"
+        input_ = f",  u = {context.parts[SURROUNDINGS]}" if self.of == "difference" else ""
+        return f"{self.equation},  c = {scale}, the largest of the recording{input_}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return f"{super().explained(gamma, shape, context)}{self._counted_from(shape, context)}"
@@ -118,7 +119,7 @@ class PowerLaw(RateEffect):
         return f"{super().advised(gamma, shape, context)}{self._counted_from(shape, context)}"
 
     def _counted_from(self, shape: Shape, context: Context) -> str:
-        """A sentence on what a difference or an excess is counted from; empty of the state itself."""
+        """A sentence on the reference of a difference or an excess; empty for the state itself."""
         if self.of == "excess":
             lowest = sized(float(shape[_LOWEST]), context.unit_of("own"))
             return f" The excess is counted from {lowest}, the lowest of the recording."
@@ -135,7 +136,7 @@ class PowerLaw(RateEffect):
         return -t * (t.square() + ROUNDED**2) ** (0.5 * (shape["exponent"] - 1.0))
 
     def _reach(self, shape: Shape) -> float:
-        """The largest excess; of one where the temperature stays the same."""
+        """The largest excess; 1 for a constant temperature."""
         return (shape[_HIGHEST] - shape[_LOWEST]) or 1.0
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 
 class QuadraticDrag(RateEffect):
-    """Drag of a blunt body in air or water: proportional to the square of the speed, against it.
+    """Drag of a blunt body in air or water: against the speed, in proportion to its square.
 
     Simulation: adds ``−γ v |v|`` to the rate of a speed v.
-    Drivers: none but the state.
+    Drivers: the state only.
     Units: γ in 1/m for a speed in m/s: ½ ρ c_d A / m.
     Plausible: γ ≥ 0.
     Source: Rayleigh's drag equation, Reynolds numbers from 10³ on.
     """
 
     id = "quadratic_drag"
-    needs = ("own", "flowing")  # of a temperature it is no physics
+    needs = ("own", "flowing")  # it has no physical meaning for a temperature
     gain = "drag"
     power = 2.0
     equation = "δv̇ = −γ v |v|"

@@ -1,4 +1,4 @@
-"""What effects on the rate of change of one state share."""
+"""The base class of effects on the rate of a state."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ if TYPE_CHECKING:
 __all__ = ["SURROUNDINGS", "RateEffect", "beyond"]
 
 SURROUNDINGS = "surroundings"
-"""The part that is an input which a state is known by its difference to; in a shape, that the effect is of this."""
+"""The part that is the input of a state's surroundings; in a shape it marks an effect of the difference from them."""
 
-_LEAST = 1e-30
+_MIN_BASE = 1e-30
+"""Lower limit of the base of a power whose exponent is differentiated."""
 
 
 class RateEffect(GainEffect):
-    """An effect that adds ``γ · waveform`` to the rate of one state. Give it a ``waveform``, a function of the signal.
+    """An effect that adds ``γ · waveform`` to the rate of a state. Implement ``waveform``, a function of the signal.
 
-    The signal at such a port is all states and inputs; the state whose rate it is, is its part "own", and what that
-    state is the speed of, if anything, its part "position"; an input that is its surroundings, such as the temperature
-    outside, is its part "surroundings".
+    The signal at such a port is all states and inputs. Its part "own" is the state whose rate it is; its part
+    "position" the position whose speed this state is, if any; its part "surroundings" an input that is the state's
+    surroundings, such as the outside temperature.
 
     Attributes:
-        power: of the unit of what it is along in the course, for the unit of γ; 0 for a course without unit.
+        power: power of the unit of ``plot_axis`` in the waveform, for the unit of γ; 0 for a waveform without unit.
     """
 
     port = "rate"
@@ -46,20 +47,20 @@ class RateEffect(GainEffect):
         return quotient(context.signal_unit, context.unit_of(self.plot_axis), int(self.power)) or "1/s"
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        beside = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""
-        return f"{self.equation}{beside}"
+        input_ = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""
+        return f"{self.equation}{input_}"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)
 
 
 def beyond(values: Float[Tensor, " N"], place: float | Tensor, exponent: float | Tensor) -> Float[Tensor, " N"]:
-    """How far values are beyond a place, by a power law: ``h (h / c)ⁿ⁻¹`` with ``h = max(x − c, 0)``.
+    """A power law beyond a place c: ``h (h / c)ⁿ⁻¹`` with ``h = max(x − c, 0)``.
 
     Args:
         values: x.
         place: c, in the values' unit; positive.
-        exponent: n, at least one.
+        exponent: n, at least 1.
 
     Example:
         >>> import torch
@@ -68,6 +69,6 @@ def beyond(values: Float[Tensor, " N"], place: float | Tensor, exponent: float |
     """
     height = (values - place).clamp(min=0.0)
     if isinstance(exponent, float) and exponent == 1.0:
-        return height  # as it is searched, and far quicker than a power
-    # the power's slope in its exponent is a logarithm
-    return height * (height / place).clamp(min=_LEAST) ** (exponent - 1.0)
+        return height  # the value in the search; much faster than a power
+    # the derivative by the exponent is a logarithm of the base
+    return height * (height / place).clamp(min=_MIN_BASE) ** (exponent - 1.0)

@@ -1,4 +1,4 @@
-"""A sensor that shows what was."""
+"""A sensor with a lag."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.002, 0.005, 0.01, 0.02, 0.05)
-"""Time constants that are searched, as shares of the longest run."""
+"""Time constants to search, as shares of the longest run."""
 
 
 class SensorLag(ShareEffect):
-    """The sensor follows what it measures with a lag, as a thermometer in its housing does.
+    """The sensor follows the measured quantity with a lag, as a thermometer in its housing does.
 
-    Simulation: adds ``γ_i (y_τ − y)`` to each output, y_τ the output behind a lag of first order; a γ of one is a
-    plain lag. Where all sensors are alike there is one γ.
-    Drivers: none but the output.
+    Simulation: adds ``γ_i (y_τ − y)`` to each output, where y_τ is the output behind a first-order lag; γ = 1 is a pure
+    lag. Identical sensors share one γ.
+    Drivers: the output only.
     Units: γ is a share; the time constant in s.
     Plausible: γ from 0 to 1.
     Source: Doebelin, "Measurement Systems" (2003), 3.3.
@@ -38,7 +38,7 @@ class SensorLag(ShareEffect):
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
     equation = "δy = γ (y_τ − y),  τ ẏ_τ = y − y_τ"
-    explanation = "The sensor follows what it measures with a lag."
+    explanation = "The sensor follows the measured quantity with a lag."
     advice = "Put a lag of this time constant behind the output."
     source = "Doebelin, Measurement Systems (2003), 3.3"
 
@@ -51,7 +51,7 @@ class SensorLag(ShareEffect):
         return AlikeSensorLag()
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        behind = [lagged(one, context.time, shape["lag"], context.runs) for one in context.signal.unbind(-1)]
+        behind = [lagged(output, context.time, shape["lag"], context.runs) for output in context.signal.unbind(-1)]
         return gamma * (torch.stack(behind, -1) - context.signal)
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ class SensorLag(ShareEffect):
 
 
 class AlikeSensorLag(SensorLag):
-    """The same where all sensors are alike: one share for all outputs."""
+    """A lag of identical sensors: one share for all outputs."""
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, ""),)

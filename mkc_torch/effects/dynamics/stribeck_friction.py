@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 
 SPEEDS = (0.1, 0.3, 1.0)
-"""Below which friction grows, as shares of the typical speed."""
+"""Stribeck speeds to search, below which friction grows, as shares of the typical speed."""
 
 
 class StribeckFriction(RateEffect):
-    """Dry friction, and more of it at small speeds, where the lubricant's film breaks down.
+    """Dry friction that grows at small speeds, where the lubricant's film breaks down.
 
     Simulation: adds ``−(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)`` to the rate of a speed v.
-    Drivers: none but the state.
-    Units: γ in the speed's unit per s; ``width`` and ``stribeck_speed`` in that of the speed.
+    Drivers: the state only.
+    Units: γ in the speed's unit per s; ``width`` and ``stribeck_speed`` in the unit of the speed.
     Plausible: γ ≥ 0.
     Source: Stribeck, VDI-Zeitschrift 46 (1902); Armstrong-Hélouvry, "Control of Machines with Friction" (1991).
     """
@@ -38,7 +38,7 @@ class StribeckFriction(RateEffect):
     reduces_to = CoulombFriction()
     gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
-    explanation = "Dry friction holds against the motion, more of it at small speeds than at large ones."
+    explanation = "Dry friction opposes the motion, and is larger at small speeds."
     advice = "Add dry friction with a rise towards standstill."
     form_parameters = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"

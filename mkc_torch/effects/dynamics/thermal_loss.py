@@ -1,4 +1,4 @@
-"""Heat that is radiated."""
+"""Loss of heat by radiation."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
 
 
 ROOM = 293.15
-"""In K."""
+"""Room temperature in K."""
 
 
 class ThermalLoss(RateEffect):
     """A body loses heat by radiation, with the fourth power of its temperature.
 
     Simulation: adds ``−γ (T⁴ − T₀⁴) / (4 T₀³)`` to the rate of a temperature, T absolute and T₀ 293 K; where an input
-        u is the surroundings', ``−γ (T⁴ − u⁴) / (4 T₀³)``.
-    Drivers: none but the state.
-    Units: γ in 1/s, as of a linear loss near T₀.
+        u is the temperature of the surroundings, ``−γ (T⁴ − u⁴) / (4 T₀³)``.
+    Drivers: the state only.
+    Units: γ in 1/s, the coefficient of a linear loss near T₀.
     Plausible: γ ≥ 0.
     Source: Stefan and Boltzmann's law.
 
     Args:
-        beside: to the surroundings that an input tells.
+        to_surroundings: whether it radiates to surroundings whose temperature is an input.
     """
 
     id = "thermal_loss"
@@ -42,8 +42,8 @@ class ThermalLoss(RateEffect):
     advice = "Add radiation with this coefficient."
     source = "Stefan and Boltzmann's law"
 
-    def __init__(self, *, beside: bool = False) -> None:
-        if beside:
+    def __init__(self, *, to_surroundings: bool = False) -> None:
+        if to_surroundings:
             self.needs, self.form_parameters = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
             self.excludes = ()
             self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"

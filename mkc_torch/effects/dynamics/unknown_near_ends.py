@@ -1,4 +1,4 @@
-"""A force that no named effect describes, near the ends of the way."""
+"""An unnamed force near the ends of the position's range."""
 
 from __future__ import annotations
 
@@ -18,27 +18,29 @@ if TYPE_CHECKING:
 __all__ = ["NUMBERS", "UnknownNearEnds", "curve_within"]
 
 DEGREE = 3
-"""Of the polynomial."""
+"""Degree of the polynomial."""
 
 WIDTHS = (0.4, 0.15)
-"""Of what rises towards either end of the visited range, as shares of it."""
+"""Widths of the terms that rise towards each end of the visited range, as shares of the range."""
 
 NUMBERS = DEGREE + 2 * len(WIDTHS)
+"""Numbers of γ."""
 
-_LEAST = 1e-12
+_MIN_DIVISOR = 1e-12
+"""Lower limit of a range, a divisor."""
 
 
 class UnknownNearEnds(UnknownRate):
-    """The rate of a speed follows a curve of its position that may be steep near the ends of the way.
+    """The rate of a speed follows a curve of its position that may be steep near the ends of the visited range.
 
-    What is near a ground, a rim or a stop acts there alone, and a polynomial that follows it sways everywhere else.
+    A ground, a rim or a stop acts near one end only, where a polynomial that follows it oscillates elsewhere.
 
-    Simulation: adds ``f(x)`` to the rate of the speed whose position is x: over the visited range a cubic spline whose
-        breaks are near its ends, beyond it a cubic as far as the largest value, then a constant.
-    Drivers: none but the position.
-    Units: γ in the speed's unit per s; the ends of the range in that of the position.
+    Simulation: adds ``f(x)`` to the rate of the speed whose position is x: over the visited range a cubic spline with
+        breaks near its ends, beyond the range a cubic up to the largest value, then a constant.
+    Drivers: the position only.
+    Units: γ in the speed's unit per s; the ends of the range in the unit of the position.
     Plausible: any size, either sign.
-    Source: none; it is a curve and no physics. De Boor, "A Practical Guide to Splines" (2001), ch. VIII, of truncated
+    Source: none; it is a curve, not physics. De Boor, "A Practical Guide to Splines" (2001), ch. VIII, of truncated
         powers.
     """
 
@@ -74,15 +76,15 @@ class UnknownNearEnds(UnknownRate):
 def curve_within(
     values: Float[Tensor, " N"], lowest: float, highest: float, heights: Float[Tensor, " q"] | Sequence[float]
 ) -> Float[Tensor, " N"]:
-    """``Σ γ_j P_j(y / r) + Σ γ_k e_k³``: a cubic over ± r, and what rises towards the ends of the visited range.
+    """``Σ γ_j P_j(y / r) + Σ γ_k e_k³``: a cubic over ± r, and terms that rise towards the ends of the visited range.
 
-    r is the largest absolute value of the range, beyond which the cubic is constant. ``e = max(1 − d / w, 0)`` with d
-    the distance to an end and w each of :data:`WIDTHS` of the range; beyond the ends e is 1.
+    r is the largest absolute value in the range; beyond it the cubic is constant. ``e = max(1 − d / w, 0)`` with the
+    distance d to an end and each width w of :data:`WIDTHS`; beyond the ends e is 1.
 
     Args:
         values: y.
         lowest, highest: the ends of the visited range.
-        heights: γ, of Legendre's P₁ to P₃, then of the lower end and the upper end for each width.
+        heights: γ, for Legendre's P₁ to P₃, then for the lower and the upper end at each width.
 
     Example:
         >>> found = curve_within(
@@ -91,12 +93,12 @@ def curve_within(
         >>> found.tolist()
         [4.0, 4.0, 0.0, -2.0, -2.0]
     """
-    given = torch.as_tensor(heights, dtype=values.dtype, device=values.device)
-    t = (values / max(abs(lowest), abs(highest), _LEAST)).clamp(-1.0, 1.0)
-    square, span = t * t, max(highest - lowest, _LEAST)
+    gamma = torch.as_tensor(heights, dtype=values.dtype, device=values.device)
+    t = (values / max(abs(lowest), abs(highest), _MIN_DIVISOR)).clamp(-1.0, 1.0)
+    square, span = t * t, max(highest - lowest, _MIN_DIVISOR)
     curves = [t, 1.5 * square - 0.5, 2.5 * t * square - 1.5 * t]
     for share in WIDTHS:
         for distance in (values - lowest, highest - values):
             rise = (1.0 - distance / (share * span)).clamp(0.0, 1.0)
             curves.append(rise * rise * rise)
-    return torch.stack(curves, -1) @ given
+    return torch.stack(curves, -1) @ gamma

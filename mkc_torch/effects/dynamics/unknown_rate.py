@@ -1,4 +1,4 @@
-"""A smooth force that no named effect describes."""
+"""An unnamed smooth force."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 DEGREE = 4
-"""Of the curve."""
+"""Degree of the polynomial."""
 
 
 class UnknownRate(RateEffect):
-    """The rate of a state follows a smooth curve over a part of the motion: physics that the catalogue does not have.
+    """The rate of a state follows a smooth curve: physics outside the catalogue.
 
-    Simulation: adds ``Σ γ_j P_j(x / reach)`` to the rate, with Legendre polynomials P_1 to P_4 of the state itself, of
-        its difference to an input that is its surroundings, or of the position whose speed it is; beyond the largest
-        value of the recording the curve goes on as a constant.
-    Drivers: none but the state and its surroundings.
-    Units: γ in the state's unit per s; the reach in that of what the curve is over.
+    Simulation: adds ``Σ γ_j P_j(x / reach)`` to the rate, with Legendre polynomials P_1 to P_4; x is the state itself,
+        its difference from an input that is its surroundings, or the position whose speed it is; beyond the largest
+        value in the recording the curve is constant.
+    Drivers: the state and its surroundings only.
+    Units: γ in the state's unit per s; the reach in the unit of x.
     Plausible: any size, either sign.
-    Source: none; it is a curve and no physics.
+    Source: none; it is a curve, not physics.
 
     Args:
-        of: what the curve is over, ``own``, ``difference`` or ``position``.
+        of: argument x of the curve, ``own``, ``difference`` or ``position``.
     """
 
     id = "unknown"
@@ -56,11 +56,11 @@ class UnknownRate(RateEffect):
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         reach = sized(float(shape[self._reach]), context.unit_of(self.plot_axis))
-        of, beside = "x", ""
+        argument, input_ = "x", ""
         if self.of == "difference":
-            of, beside = "(x − u)", f",  u = {context.parts[SURROUNDINGS]}"
-        told = f"f(x) = Σ γ_j P_j({of} / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
-        return f"{self.equation},  {told}{beside}"
+            argument, input_ = "(x − u)", f",  u = {context.parts[SURROUNDINGS]}"
+        series = f"f(x) = Σ γ_j P_j({argument} / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
+        return f"{self.equation},  {series}{input_}"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return ({self._reach: 1.0},)
@@ -69,7 +69,7 @@ class UnknownRate(RateEffect):
         return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, DEGREE + 1))
 
     def over(self, context: Context) -> Float[Tensor, " N"]:
-        """What the curve is over."""
+        """The argument of the curve, (N,)."""
         y = context.part(self.plot_axis)
         return y - context.part(SURROUNDINGS) if self.of == "difference" else y
 
@@ -85,4 +85,4 @@ class UnknownRate(RateEffect):
         t = f"torch.clamp({y} / {shape[self._reach]!r}, -1.0, 1.0)"
         curves = (t, f"(1.5 * {t} ** 2 - 0.5)", f"(2.5 * {t} ** 3 - 1.5 * {t})")
         fourth = f"(35.0 * {t} ** 4 - 30.0 * {t} ** 2 + 3.0) / 8.0"
-        return (" + ".join(f"({one!r}) * {curve}" for one, curve in zip(gamma, (*curves, fourth), strict=True)),)
+        return (" + ".join(f"({height!r}) * {curve}" for height, curve in zip(gamma, (*curves, fourth), strict=True)),)

@@ -1,8 +1,8 @@
-"""Effects between what was simulated and what was measured: one piece of physics a file.
+"""Effects between simulated and measured outputs: one piece of physics a file.
 
 They act on outputs of simulations without a state of their own, :class:`mkc_torch.simulation.Static` and
 :class:`mkc_torch.simulation.Paired`, whose ports have the part "compared". At the output of differential equations most
-of them would only say again, less well, what an effect on a rate or an input says.
+of them would only repeat an effect on a rate or an input, less well.
 """
 
 from __future__ import annotations
@@ -35,4 +35,4 @@ PAIRED: tuple[Effect, ...] = (
     DriverLinear(),
     DriverQuadratic(),
 )
-"""The effects that a diagnosis of outputs tries."""
+"""The candidate effects for outputs of simulations without a state."""

@@ -1,8 +1,8 @@
-"""What effects need that act on all outputs at once, each output with a number of its own."""
+"""The port part of effects that act on all outputs at once with one number per output."""
 
 from __future__ import annotations
 
 __all__ = ["SEVERAL"]
 
 SEVERAL = "several"
-"""The part of the port of all outputs where they are several and have one unit."""
+"""The part of the port of all outputs, where there are several outputs with the same unit."""

@@ -1,4 +1,4 @@
-"""Signals at moments between their samples."""
+"""Signals between their samples."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def shifted(
     later: float | Float[Tensor, " N"],
     run: Int[Tensor, " N"] | None = None,
 ) -> Float[Tensor, " N"]:
-    """Values at moments that much later, along straight lines; beyond the ends of a run its last ones.
+    """Values shifted in time by linear interpolation; beyond the ends of a run its first or last value.
 
     Args:
-        values: at the samples.
-        time: of the samples in s, going on within each run.
-        later: in s; negative for earlier.
-        run: of each sample's run, in ascending order; None where a run begins when time goes back, and only there.
+        values: values at the samples.
+        time: times of the samples in s, ascending within each run.
+        later: shift in s; negative for earlier moments.
+        run: number of each sample's run, ascending; None: a run begins only where time goes back.
 
     Example:
         >>> time = torch.arange(5.0)
@@ -35,14 +35,14 @@ def shifted(
         tensor([ 0.0000,  0.5000,  2.5000,  6.5000, 12.5000])
     """
     run = run_numbers(time) if run is None else run
-    least = time.min()
-    span = time.max() - least + 1.0
+    start = time.min()
+    span = time.max() - start + 1.0
     first = torch.searchsorted(run, run)
     last = torch.searchsorted(run, run, right=True) - 1
-    at = (time - least + later).clamp(0.0, float(span) - 1.0)
-    left = torch.searchsorted(run * span + time - least, run * span + at.detach(), right=True) - 1
+    at = (time - start + later).clamp(0.0, float(span) - 1.0)
+    left = torch.searchsorted(run * span + time - start, run * span + at.detach(), right=True) - 1
     left = torch.minimum(torch.maximum(left, first), torch.maximum(last - 1, first))
     right = torch.minimum(left + 1, last)
     step = (time[right] - time[left]).clamp(min=1e-300)
-    share = ((at - (time[left] - least)) / step).clamp(0.0, 1.0)
+    share = ((at - (time[left] - start)) / step).clamp(0.0, 1.0)
     return torch.lerp(values[left], values[right], share)

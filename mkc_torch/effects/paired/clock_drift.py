@@ -1,4 +1,4 @@
-"""Two clocks of different rate."""
+"""Clocks with different rates."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 class ClockDrift(Effect):
     """The recording's clock and the simulator's run at different rates.
 
-    Simulation: adds ``y(t + γ (t − t₀)) − y(t)`` to all outputs, t₀ the middle of the run.
-    Drivers: none but the outputs.
-    Units: γ is a share: 10⁻⁶ is a part in a million.
+    Simulation: adds ``y(t + γ (t − t₀)) − y(t)`` to all outputs y, where t₀ is the middle of the run.
+    Drivers: the outputs only.
+    Units: γ is a share: 10⁻⁶ is one part per million.
     Plausible: |γ| up to 0.01.
-    Source: quartz clocks are 10⁻⁴ at worst, clocks of operating systems that are being set 5·10⁻⁴; Mills, RFC 5905.
+    Source: at most 10⁻⁴ for quartz clocks, 5·10⁻⁴ for system clocks under adjustment; Mills, RFC 5905.
     """
 
     id = "clock_drift"
@@ -35,7 +35,7 @@ class ClockDrift(Effect):
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
     explanation = "The recording's clock and the simulator's run at different rates."
     advice = "Take both times from one clock, or rescale one of them."
-    recurrence = "clocks that drift apart do so the farther, the longer a recording is"
+    recurrence = "the error of drifting clocks grows with the length of a recording"
     source = "Mills, RFC 5905 (2010)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
@@ -44,7 +44,7 @@ class ClockDrift(Effect):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
         since = _since_middle(context.time, context.runs)
         later = gamma[0] * since
-        columns = [shifted(one, context.time, later, context.runs) - one for one in context.signal.unbind(-1)]
+        columns = [shifted(output, context.time, later, context.runs) - output for output in context.signal.unbind(-1)]
         return torch.stack(columns, -1)
 
 

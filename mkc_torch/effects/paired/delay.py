@@ -1,4 +1,4 @@
-"""A recording that is late, or early."""
+"""A delay between simulation and recording."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 class Delay(Effect):
-    """What is measured comes after what is simulated by a constant time, or before it.
+    """The recording is later than the simulation by a constant time, or earlier.
 
     Simulation: adds ``y(t − γ) − y(t)`` to an output y.
-    Drivers: none but the output.
+    Drivers: the output only.
     Units: γ in s, negative where the recording is early.
-    Plausible: any size; one that is longer than a quarter of the signal's shortest period is not found from nothing.
+    Plausible: any size; the search cannot find a delay longer than a quarter of the signal's shortest period.
     Source: transport delays; Åström & Murray, "Feedback Systems" (2008), 3.4.
     """
 
@@ -34,9 +34,9 @@ class Delay(Effect):
     remembers = True
     settles = ("offset",)
     equation = "δy = y(t − γ) − y(t)"
-    explanation = "What is measured comes later than what is simulated, or earlier."
+    explanation = "The recording is later than the simulation, or earlier."
     advice = "Look for filters and transport on the way to the recording, and for how its clock was set."
-    recurrence = "a delay is as long in a longer recording"
+    recurrence = "a delay does not grow with the length of a recording"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
@@ -44,18 +44,18 @@ class Delay(Effect):
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
         pairs = zip(context.signal.unbind(-1), gamma.expand(context.signal.shape[-1]).unbind(), strict=True)
-        columns = [shifted(own, context.time, -one.expand(len(own)), context.runs) - own for own, one in pairs]
+        columns = [shifted(own, context.time, -delay.expand(len(own)), context.runs) - own for own, delay in pairs]
         return torch.stack(columns, -1)
 
 
 class SeveralDelays(Delay):
-    """The same at all outputs, each late by a time of its own; one for all if that does as well.
+    """A delay of all outputs, one for each; reduced to a common delay where that fits as well.
 
-    Simulation: adds ``y(t − γ) − y(t)``, for each output.
-    Drivers: none but the outputs.
+    Simulation: adds ``y(t − γ) − y(t)`` to each output y.
+    Drivers: the outputs only.
     Units: γ in s.
     Plausible: any size.
-    Source: that of :class:`Delay`.
+    Source: see :class:`Delay`.
     """
 
     port = "outputs"
@@ -70,7 +70,7 @@ class SeveralDelays(Delay):
 
 
 class CommonDelay(Delay):
-    """All outputs late by the same time."""
+    """A common delay of all outputs."""
 
     port = "outputs"
     needs = (SEVERAL,)

@@ -1,4 +1,4 @@
-"""An output that follows a column."""
+"""Linear dependence of an output on a column."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
 
 
 class DriverLinear(GainEffect):
-    """What is measured follows a recorded column that the simulation does not know of.
+    """The measured output depends linearly on a recorded column that the simulation does not use.
 
-    Simulation: adds ``b + k (x − x̄)`` to an output; without b where a parameter of the simulation moves the zero.
-    Drivers: any one column.
-    Units: k in the output's unit for each unit of the column, b in the output's.
+    Simulation: adds ``b + k (x − x̄)`` to an output; without b where a parameter of the simulation shifts the output.
+    Drivers: any column.
+    Units: k in the output's unit per unit of the column, b in the output's unit.
     Plausible: any size.
     Source: the linear response to any small disturbance.
 
     Attributes:
-        degree: of the polynomial in x.
+        degree: degree of the polynomial in x.
     """
 
     id = "driver_linear"
     display_name = "linear dependence"
     port = "output"
     needs = ("own", "compared")
-    is_generalisation = True  # with a zero of its own it has a plain offset as special case
+    is_generalisation = True  # with b, a plain offset is a special case
     roles: tuple[str, ...] = ("any", "temperature", "current")
     equation = "δy = b + k (x − x̄)"
-    explanation = "What is measured follows this column in a straight line."
+    explanation = "The measured output depends linearly on this column."
     advice = "Find out how the column acts on the sensor or the system; correct with the fitted gain until then."
     source = "linear response, first order in the driver"
     degree = 1

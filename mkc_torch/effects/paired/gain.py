@@ -1,4 +1,4 @@
-"""A sensor whose scale is off."""
+"""An error of a sensor's scale."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 class Gain(GainEffect):
-    """What is measured is larger or smaller than what is simulated by a constant share.
+    """The measured output is a constant share larger or smaller than the simulated output.
 
     Simulation: adds ``γ y`` to an output y.
-    Drivers: none but the output.
+    Drivers: the output only.
     Units: γ is a share.
     Plausible: |γ| up to 0.5.
     Source: scale errors of sensors; Doebelin, "Measurement Systems" (2003), 3.2.
@@ -32,9 +32,9 @@ class Gain(GainEffect):
     gain = "gain_error"
     plausible = 0.5
     equation = "δy = γ y"
-    explanation = "What is measured is a constant share larger, or smaller, than what is simulated."
-    advice = "Check the sensor's scale and units, and what the simulator takes for its own."
-    recurrence = "an error of scale grows with the signal"
+    explanation = "The measured output is a constant share larger, or smaller, than the simulated output."
+    advice = "Check the sensor's scale and units, and those that the simulator assumes."
+    recurrence = "a scale error grows with the signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

@@ -1,4 +1,4 @@
-"""A joint that gravity pulls aside."""
+"""Sag of a joint under gravity."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _PER_DEGREE = math.pi / 180.0
 
 
 class GravitySag(Effect):
-    """A joint sags under the weight that it carries, most where the link is level and not where it hangs.
+    """A joint sags under its load: most where the link is level, not at all where it hangs.
 
-    A servo without integral action holds a load with a steady error: the load's torque over its stiffness. Within a
-    small range of angles a sag cannot be told from an offset, which goes first.
+    A servo without integral action holds a load with a static error: the load's torque over its stiffness. Over a small
+    range of angles a sag is indistinguishable from an offset, which is preferred.
 
     Simulation: adds ``γ cos(y − φ)`` to an output y that is an angle.
-    Drivers: none but the output.
-    Units: γ in the output's unit; the angle ``phase`` at which the link is level in rad, within a radian of the zero:
-        farther off a sag would be no more than an error of scale.
+    Drivers: the output only.
+    Units: γ in the output's unit; the angle ``phase``, φ, at which the link is level, in rad, within 1 rad of zero:
+        farther away a sag would be equivalent to a scale error.
     Plausible: up to 0.5 rad.
     Source: static error of a proportional joint controller under gravity; Spong, Hutchinson & Vidyasagar, "Robot
         Modeling and Control" (2006), 8.1.
@@ -47,7 +47,7 @@ class GravitySag(Effect):
     plausible = 0.5
     plausible_unit = "rad"
     equation = "δy = γ cos(y − φ)"
-    explanation = "Gravity pulls the joint aside, by how far depends on its angle: it sags under its load."
+    explanation = "Gravity deflects the joint, by an amount that depends on its angle: it sags under its load."
     advice = "Add the load's torque over the joint's stiffness, or feed gravity forward in its controller."
     recurrence = "a sag changes over a wide range of angles and with the load, an offset does not"
     source = "Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), 8.1"
@@ -64,13 +64,13 @@ class GravitySag(Effect):
 
 
 class SeveralSag(GravitySag):
-    """The same at all joints, each with a sag of its own; they are level at the same angle.
+    """A sag of all joints, one for each; they are level at the same angle.
 
-    Simulation: adds ``γ cos(y − φ)``, for each output.
-    Drivers: none but the outputs.
+    Simulation: adds ``γ cos(y − φ)`` to each output y.
+    Drivers: the outputs only.
     Units: γ in the outputs' unit.
     Plausible: up to 0.5 rad.
-    Source: that of :class:`GravitySag`.
+    Source: see :class:`GravitySag`.
     """
 
     port = "outputs"

@@ -1,4 +1,4 @@
-"""A sensor whose zero is off."""
+"""An error of a sensor's zero."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Offset(GainEffect):
-    """What is measured lies beside what is simulated by a constant.
+    """The measured output differs from the simulated output by a constant.
 
     Simulation: adds γ to an output.
     Drivers: none.
@@ -31,16 +31,16 @@ class Offset(GainEffect):
     needs: tuple[str, ...] = ("own", "compared")
     gain = "offset"
     equation = "δy = γ"
-    explanation = "What is measured lies beside what is simulated by a constant."
-    advice = "Check the sensor's zero, and where the simulator has its own."
+    explanation = "The measured output differs from the simulated output by a constant."
+    advice = "Check the sensor's zero, and that of the simulator."
     by_kind: Mapping[str, tuple[str, str]] = {
         "angle": (
-            "What is measured lies beside what is simulated by a constant, as a wrong zero or a load does.",
-            "Check the joint's zero. Where it carries a load, gravity pulls a servo aside like this: compare with the "
-            "load's torque over the joint's stiffness.",
+            "The measured angle differs from the simulated angle by a constant, as from a wrong zero or a load.",
+            "Check the joint's zero. Under a load gravity deflects a servo like this: compare with the load's "
+            "torque over the joint's stiffness.",
         ),
     }
-    recurrence = "an offset is there without a signal too"
+    recurrence = "an offset is also there without a signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
@@ -48,13 +48,13 @@ class Offset(GainEffect):
 
 
 class SeveralOffsets(Offset):
-    """The same at all outputs, each beside what is simulated by a constant of its own.
+    """An offset of all outputs, one for each.
 
-    Simulation: adds γ, for each output.
-    Drivers: none but the outputs.
+    Simulation: adds γ to each output.
+    Drivers: the outputs only.
     Units: γ in the outputs' unit.
     Plausible: any size.
-    Source: that of :class:`Offset`.
+    Source: see :class:`Offset`.
     """
 
     port = "outputs"

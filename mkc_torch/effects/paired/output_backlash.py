@@ -1,4 +1,4 @@
-"""Play between what was simulated and what was measured."""
+"""Backlash between simulated and measured outputs."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 __all__ = ["OutputBacklash", "SeveralBacklash"]
 
 _START = 1e-9
-"""Half gap, as a share of the largest output, at which the slope at no gap is taken: at 0 there is none."""
+"""Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 there is none."""
 
 
 class OutputBacklash(Effect):
-    """After each reversal what is measured stands still until a gap is crossed: gears, belts, linkages, dry joints.
+    """After each reversal the measured output stands still until a gap is crossed: gears, belts, linkages, dry joints.
 
-    A joint that follows its command with play lags by half the gap in either direction, and stands still while the
-    command turns round. A saturation stands still at one value alone; play does so wherever the command reverses.
+    A joint with play is half the gap behind its command in both directions, and stands still while the command
+    reverses. A saturation stands still at one value only; play does so at any reversal.
 
-    Simulation: adds ``p − y`` to an output y, p the output behind play, ``p = max(y − γ, min(y + γ, p before))``; at
-        the beginning of a run in the middle of the gap.
-    Drivers: none but the output, all of its course since the run's beginning.
+    Simulation: adds ``p − y`` to an output y, where p is the output behind the play,
+        ``p = max(y − γ, min(y + γ, p before))``, in the middle of the gap at the start of a run.
+    Drivers: the output only, with its history since the start of the run.
     Units: γ, half the width of the gap, in the output's unit.
     Plausible: γ ≥ 0.
     Source: the play operator; Visintin, "Differential Models of Hysteresis" (1994), III.2; Nordin & Gutman, Automatica
@@ -45,9 +45,9 @@ class OutputBacklash(Effect):
     remembers = True
     lower = 0.0
     equation = "δy = p − y,  p = max(y − γ, min(y + γ, p before))"
-    explanation = "After each reversal what is measured stands still until a gap is crossed: there is play."
-    advice = "Put play of this width behind the simulated output; preload or tighten the drive to be rid of it."
-    recurrence = "play is as wide at any amplitude and speed"
+    explanation = "After each reversal the measured output stands still until a gap is crossed: there is play."
+    advice = "Put play of this width behind the simulated output; preload or tighten the drive to remove it."
+    recurrence = "play has the same width at any amplitude and speed"
     source = "Visintin, Differential Models of Hysteresis (1994), III.2; Nordin & Gutman, Automatica 38 (2002)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
@@ -62,13 +62,13 @@ class OutputBacklash(Effect):
 
 
 class SeveralBacklash(OutputBacklash):
-    """The same at all outputs, each with a gap of its own: the joints of an arm.
+    """Backlash of all outputs, with one gap for each: the joints of an arm.
 
-    Simulation: adds ``p − y``, for each output.
-    Drivers: none but the outputs.
+    Simulation: adds ``p − y`` to each output y.
+    Drivers: the outputs only.
     Units: γ, half the width of each gap, in the outputs' unit.
     Plausible: γ ≥ 0.
-    Source: that of :class:`OutputBacklash`.
+    Source: see :class:`OutputBacklash`.
     """
 
     port = "outputs"
@@ -77,7 +77,7 @@ class SeveralBacklash(OutputBacklash):
 
 
 def _crossed(own: Float[Tensor, " N"], gap: Tensor, context: Context) -> Float[Tensor, " N"]:
-    """What play adds to an output; its slope at no gap is that from a gap just above."""
+    """The change of an output by play; its derivative at γ = 0 is the one-sided derivative for γ > 0."""
     known = own.detach()
     size = torch.where(gap.detach() > 0.0, gap.detach(), _START * known.abs().amax())
     inside = ~first_of_runs(context.runs)

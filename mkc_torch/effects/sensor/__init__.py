@@ -27,7 +27,7 @@ SENSOR: tuple[Effect, ...] = (
     DriverOffset(),
     Unknown(),
 )
-"""The effects that a diagnosis of a sensor tries."""
+"""The candidate effects for a vector sensor."""
 
 ATTITUDE: tuple[Effect, ...] = (HeadingReset(),)
-"""The effects of an attitude that is recorded beside a sensor."""
+"""The candidate effects for an attitude that is recorded together with a sensor."""

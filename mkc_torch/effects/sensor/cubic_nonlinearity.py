@@ -1,4 +1,4 @@
-"""A sensor whose response bends at large fields."""
+"""A nonlinear response of a sensor at large fields."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 class CubicNonlinearity(Effect):
-    """The sensing element's response to the field is not quite a straight line.
+    """The sensing element's response to the field is not linear.
 
-    Simulation: adds ``α_i B_i³`` to each axis of the sensor, with B the simulated measurement less its offset: the
-    first odd term beyond a linear response; or ``α_i B_i³ + β_i B_i²``, where the element also feels a magnet beside
-    it, which is an offset of the measurement: the cube of a sum has a square in it.
-    Drivers: none but the field itself.
+    Simulation: adds ``α_i B_i³`` to each axis of the sensor, the first odd term beyond a linear response, where B is
+    the simulated measurement without its offset; or ``α_i B_i³ + β_i B_i²``, where the element also measures a nearby
+    magnet, an offset: the cube of the sum contains a square.
+    Drivers: the field only.
     Units: α in 1/µT², β in 1/µT.
     Plausible: up to 4e-5 /µT², 10 % at 50 µT.
     Source: data sheets of AMR, Hall and TMR sensors, linearity of 0.1-1 % of full scale.
@@ -37,9 +37,9 @@ class CubicNonlinearity(Effect):
     id = "cubic_nonlinearity"
     follows_signal = True
     equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
-    explanation = "The sensor's response is not a straight line: it bends at large fields."
+    explanation = "The sensor's response is not linear at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."
-    recurrence = "a response that bends is there at all times, wherever the field along an axis is large"
+    recurrence = "a nonlinear response is there at all times, wherever the field along an axis is large"
     form_parameters = ("terms",)
     plausible = 4e-5
     plausible_unit = "1/µT²"

@@ -6,13 +6,13 @@ from mkc_torch.effects.sensor.driver_offset import DriverOffset
 
 
 class CurrentField(DriverOffset):
-    """Wires that are fixed to the sensor make a field in proportion to their current.
+    """Wires that are fixed to the sensor produce a field in proportion to their current.
 
-    Simulation: adds ``k (I − Ī)`` to the sensor's axes; the field of the mean current Ī is part of the offset.
+    Simulation: adds ``k (I − Ī)`` to the sensor's axes; the offset contains the field of the mean current Ī.
     Drivers: a column with the role current.
     Units: k in µT/A.
-    Plausible: up to 20 µT/A, 1 cm from the wire; 0.1 µT/A is a good installation, and bad ones reach 70 % of the
-    Earth's field at half throttle.
+    Plausible: up to 20 µT/A, 1 cm from the wire; 0.1 µT/A is a good installation, and bad installations reach 70 % of
+    the Earth's field at half throttle.
     Source: Biot-Savart's law, µ₀ I / (2π r).
 
     Example:

@@ -1,4 +1,4 @@
-"""An offset that follows a recorded column: temperature, current, or one whose role is not known."""
+"""An offset that depends on a recorded column: temperature, current, or a column of unknown role."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 class DriverOffset(GainEffect):
-    """The sensor's offset is in proportion to a quantity that nothing else is known about.
+    """The sensor's offset depends linearly on a column of unknown meaning.
 
-    Simulation: adds ``k (x − x̄)`` to the sensor's axes; the part of the mean x̄ is in the offset.
-    Drivers: a column of no known role; effects of a known role build on this one.
-    Units: k in µT for each unit of the column.
+    Simulation: adds ``k (x − x̄)`` to the sensor's axes; the offset contains the contribution of the mean x̄.
+    Drivers: a column of unknown role; effects of known roles derive from this class.
+    Units: k in µT per unit of the column.
     Plausible: any size.
     Source: the linear response to any small disturbance.
 
     Attributes:
-        gain: what a user reads k as.
-        lags: time constants in s that are tried, behind which the sensor follows the column.
+        gain: name of k in reports.
+        lags: time constants in s to search, of a first-order lag of the column.
 
     Example:
         >>> import torch

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class FieldGradient(Effect):
-    """Iron in a building bends the Earth's field, so that it changes with position.
+    """Iron in a building distorts the Earth's field, so that it changes with position.
 
-    Simulation: adds a polynomial of the position, less its mean, of degree one or two to the ambient field. Where the
-    port carries the field's vector (east, north, up), the polynomial is the gradient of a harmonic one, as that of a
-    field without sources in the room is: 5 terms of degree one and 7 of degree two. Where the port carries the strength
-    alone it is any polynomial: 3 terms and 6.
+    Simulation: adds a polynomial of degree 1 or 2 of the centred position to the ambient field. Where the port carries
+    the field's vector (east, north, up), the polynomial is the gradient of a harmonic polynomial, as in a room without
+    sources: 5 terms of degree 1 and 7 of degree 2. Where the port carries only the strength it is any polynomial: 3 and
+    6 terms.
     Drivers: the position, three columns.
     Units: gradient in µT/m, curvature in µT/m².
     Plausible: up to 200 µT/m; some µT/cm occur near steel.
@@ -40,9 +40,9 @@ class FieldGradient(Effect):
     port = "field"
     roles = ("position",)
     equation = "B(p) = B₀ + G p + …,  ∇·B = 0, ∇×B = 0"
-    explanation = "The ambient field is not the same everywhere: iron nearby bends it."
+    explanation = "The ambient field is not uniform: nearby iron distorts it."
     advice = "Record in the open, or turn the sensor on the spot."
-    recurrence = "what belongs to a place comes again at that place, and is gone in the open"
+    recurrence = "an effect of the place recurs at that place, and is gone in the open"
     form_parameters = ("degree",)
     location_specific = True
     plausible = 200.0
@@ -60,17 +60,16 @@ class FieldGradient(Effect):
         return (gradient,) if shape["degree"] < 2 else (gradient, curvature)
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        alone = len(context.channels) == 1
-        bent, second = ("", "") if shape["degree"] < 2 else (" + ½ (p − p̄)ᵀ H (p − p̄)", ", H = ∂²B/∂p²")
-        if alone:
-            return f"B(p) = B₀ + g·(p − p̄){bent},  B the strength,  g = ∂B/∂p{second} at p̄"
-        return f"B(p) = B₀ + G (p − p̄){bent},  ∇·B = 0, ∇×B = 0,  G = ∂B/∂p{second} at p̄"
+        quadratic, second = ("", "") if shape["degree"] < 2 else (" + ½ (p − p̄)ᵀ H (p − p̄)", ", H = ∂²B/∂p²")
+        if len(context.channels) == 1:
+            return f"B(p) = B₀ + g·(p − p̄){quadratic},  B the strength,  g = ∂B/∂p{second} at p̄"
+        return f"B(p) = B₀ + G (p − p̄){quadratic},  ∇·B = 0, ∇×B = 0,  G = ∂B/∂p{second} at p̄"
 
     def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
-        alone = len(context.channels) == 1
+        strength_only = len(context.channels) == 1
         if quantity == "gradient":
-            return _SLOPES if alone else _GRADIENT
-        return _BENDS if alone else _CURVATURE
+            return _STRENGTH_GRADIENT if strength_only else _GRADIENT
+        return _STRENGTH_CURVATURE if strength_only else _CURVATURE
 
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         terms = _polynomials if len(context.channels) == 1 else _harmonic_gradients
@@ -80,9 +79,9 @@ class FieldGradient(Effect):
         return combined(self.basis(shape, context), gamma)
 
 
-_SLOPES = ("∂B/∂x", "∂B/∂y", "∂B/∂z")
-_BENDS = ("½ ∂²B/∂x²", "½ ∂²B/∂y²", "½ ∂²B/∂z²", "∂²B/∂x∂y", "∂²B/∂x∂z", "∂²B/∂y∂z")
-"""What the coefficients of :func:`_polynomials` are of the field's strength."""
+_STRENGTH_GRADIENT = ("∂B/∂x", "∂B/∂y", "∂B/∂z")
+_STRENGTH_CURVATURE = ("½ ∂²B/∂x²", "½ ∂²B/∂y²", "½ ∂²B/∂z²", "∂²B/∂x∂y", "∂²B/∂x∂z", "∂²B/∂y∂z")
+"""The coefficients of :func:`_polynomials` as derivatives of the field's strength."""
 
 _GRADIENT = (
     "∂B_x/∂y = ∂B_y/∂x", "∂B_x/∂z = ∂B_z/∂x", "∂B_y/∂z = ∂B_z/∂y", "(∂B_x/∂x − ∂B_y/∂y) / 2", "∂B_z/∂z / 2",
@@ -96,11 +95,11 @@ _CURVATURE = (
     "∂²B_y/∂z² / 8",
     "∂²B_z/∂z² / 12",
 )
-"""What the coefficients of :func:`_harmonic_gradients` are of the field, in the axes of the position."""
+"""The coefficients of :func:`_harmonic_gradients` as derivatives of the field, in the axes of the position."""
 
 
 def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]:
-    """Monomials x, y, z, and of degree two x², y², z², xy, xz, yz."""
+    """The monomials x, y, z and, for degree 2, x², y², z², xy, xz, yz."""
     x, y, z = p.unbind(-1)
     terms = [x, y, z]
     if degree > 1:
@@ -109,7 +108,7 @@ def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]
 
 
 def _harmonic_gradients(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 3"]:
-    """Gradients of the harmonic polynomials of degree two, and three."""
+    """Gradients of the harmonic polynomials of degree 2 and, for degree 2, of degree 3 as well."""
     x, y, z = p.unbind(-1)
     o = torch.zeros_like(x)
     fields = [(y, x, o), (z, o, x), (o, z, y), (x, -y, o), (-x, -y, 2 * z)]

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 
 class HardIronStep(GainEffect):
-    """A magnetised or steel part that moves with the sensor changed its field all at once.
+    """A magnetised or steel part that moves with the sensor changed its field abruptly.
 
     Simulation: adds Δb to the sensor's axes from the onset on.
-    Drivers: none, it is bound to a time; in a later recording Δb is there throughout.
+    Drivers: none, it is bound to a time; a later recording has Δb throughout.
     Units: Δb in µT, the onset in s.
-    Plausible: up to 200 µT; parts that are attached or taken off make 1-50 µT.
-    Source: BROAD trials 34-36, a magnet on the board that is taken off (Laidig et al., Data 6(7):72, 2021).
+    Plausible: up to 200 µT; attached or removed parts cause 1-50 µT.
+    Source: BROAD trials 34-36, a magnet that is removed from the board (Laidig et al., Data 6(7):72, 2021).
 
     Example:
         >>> import torch
@@ -37,7 +37,7 @@ class HardIronStep(GainEffect):
     gain = "offset_change"
     continuous: Mapping[str, tuple[float, float]] = {"onset": (0.08, 0.92)}
     equation = "δB = Δb · 1[t ≥ t₀]"
-    explanation = "The sensor's offset jumped: something magnetic that moves with the sensor was attached or taken off."
+    explanation = "The sensor's offset jumped: a magnetic part that moves with the sensor was attached or removed."
     advice = "Look for what changed at that time; use the calibration from after the step."
     recurrence = "a step does not come at the same moment again"
     plausible = 200.0
@@ -45,17 +45,17 @@ class HardIronStep(GainEffect):
     source = "sizes of 1-50 µT as seen when parts are mounted; BROAD trials 34-36 (Laidig et al., Data 6(7):72, 2021)"
 
     SPACING = 0.01
-    """Of the searched onsets, as a share of the recording's length."""
+    """Spacing of the onsets to search, as a share of the recording's length."""
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         first, length = float(time[0]), float(time[-1] - time[0])
         count = round(1.0 / self.SPACING)
-        # a shorter side could not be held out in blocks, nor told from a burst of outliers
+        # a shorter side could not be held out in blocks, nor distinguished from a burst of outliers
         return tuple({"onset": first + length * k / count} for k in range(8, count - 7))
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return after(context.time, shape["onset"])
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
-        """What is left of it in another recording of the sensor: the offset at the end."""
+        """The change that remains in a later recording of the sensor: the offset at the end."""
         return gamma.expand(len(context.time), -1)

@@ -1,4 +1,4 @@
-"""A recorded attitude whose heading was set anew while the sensor did not turn."""
+"""A recorded attitude whose heading was reset while the sensor did not turn."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 class HeadingReset(Effect):
-    """The filter that the attitude is from set its heading anew, by an angle that the sensor did not turn by.
+    """The attitude filter reset its heading by an angle by which the sensor did not turn.
 
-    Simulation: turns the ambient field about the vertical, by φ_k from the k-th jump of the recorded heading on.
-    Drivers: none; the jumps are those of the attitude that the gyroscope knows nothing of.
+    Simulation: rotates the ambient field about the vertical by φ_k, from the k-th jump of the recorded heading on.
+    Drivers: none; the jumps are those of the attitude that the gyroscope does not show.
     Units: φ in °.
     Plausible: up to 180°.
     Source: filters align their heading by the compass again at arming and after take-off (ArduPilot, EKF yaw resets).
@@ -36,19 +36,20 @@ class HeadingReset(Effect):
 
     id = "heading_reset"
     port = "heading"
-    least, most = -180.0, 180.0
+    lower = -180.0
+    upper = 180.0
     equation = "B = R_z(Σ φ_k · 1[t > t_k]) B₀"
-    explanation = "The recorded heading was set anew: the attitude turned about the vertical and the sensor did not."
-    advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
-    recurrence = "an attitude that this sensor does not steer is not set anew"
+    explanation = "The recorded heading was reset: the attitude turned about the vertical and the sensor did not."
+    advice = "Use an attitude that does not depend on this sensor, or only the samples between two jumps."
+    recurrence = "an attitude that does not depend on this sensor is not reset"
     location_specific = True
-    follows_signal = False  # what passes here is known and has no noise
+    follows_signal = False  # the signal here is known and has no noise
     plausible = 180.0
     plausible_unit = "°"
     source = "filters align their heading by the compass again at arming and after take-off"
 
     def moments(self, context: Context) -> tuple[float, ...]:
-        # the last sample before each jump, as the simulation tells them
+        # the last sample before each jump
         before = (context.signal <= 0.0).sum(0) - 1
         return tuple(context.time[before].tolist())
 

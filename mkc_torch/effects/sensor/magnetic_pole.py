@@ -1,4 +1,4 @@
-"""An ambient field with a magnetic pole in it, as the end of a beam or a bar is one."""
+"""An ambient field with a magnetic pole, such as the end of a beam or a bar."""
 
 from __future__ import annotations
 
@@ -9,29 +9,32 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import combined
-from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_GRID, _RADIUS = (-0.8, -0.4, 0.0, 0.4, 0.8), 0.1
-"""Places that are searched along each axis, and the radius, over the distance of the farthest sample."""
+_GRID = (-0.8, -0.4, 0.0, 0.4, 0.8)
+"""Positions to search along each axis, over the distance of the farthest sample from the middle of the path."""
+
+_RADIUS = 0.1
+"""Radius of the pole, over the same distance."""
 
 _FAR = 3.0
-"""Places that are fitted, likewise: from farther away a field looks like a polynomial."""
+"""Bound of the fitted position along each axis, over the same distance: farther away a field is a polynomial."""
 
 
 class MagneticPole(Effect):
-    """The end of a magnetised beam, bar or pipe bends the field around it.
+    """The end of a magnetised beam, bar or pipe distorts the field around it.
 
-    Simulation: adds to the ambient field that of a pole at a place c, ``q r / (r² + s²)^(3/2)`` with r from c to the
-    sensor and s a tenth of how far the path reaches from its middle, for no pole is a point. Where the port carries
-    the field's vector (east, north, up) there is one amplitude, q; where it carries the strength alone there are three,
-    q along the axes, for the direction of the ambient field is not known.
+    Simulation: adds to the ambient field the field of a pole at a place c, ``q r / (r² + s²)^(3/2)``, with r from c to
+    the sensor and s a tenth of the distance of the farthest sample, because no pole is a point. Where the port carries
+    the field's vector (east, north, up) there is one amplitude, q; where it carries only the strength there are three,
+    q along the axes, because the direction of the ambient field is not known.
     Drivers: the position, three columns.
     Units: q in µT·m², the place in m from the middle of the path.
     Plausible: up to 100 µT·m², a beam of 0.01 m² magnetised to 10⁵ A/m.
@@ -53,11 +56,11 @@ class MagneticPole(Effect):
     roles = ("position",)
     equation = "B(p) = B₀ + q r / r³,  r = p - c"
     explanation = (
-        "The ambient field is not the same everywhere: the end of a beam or a bar of iron is near. Its place is given "
-        "from the middle of the path."
+        "The ambient field is not uniform: the end of a beam or a bar of iron is near. Its position is given from the "
+        "middle of the path."
     )
     advice = "Record in the open, or turn the sensor on the spot."
-    recurrence = "what belongs to a place comes again at that place, and is gone in the open"
+    recurrence = "an effect of the place recurs at that place, and is gone in the open"
     form_parameters = ("radius",)
     location_specific = True
     plausible = 100.0
@@ -78,8 +81,8 @@ class MagneticPole(Effect):
         return (Quantity("pole", 3 if len(context.channels) == 1 else 1, unit),)
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        alone = len(context.channels) == 1
-        pole = "q·r / (r² + s²)^(3/2),  B the strength" if alone else "q r / (r² + s²)^(3/2)"
+        strength_only = len(context.channels) == 1
+        pole = "q·r / (r² + s²)^(3/2),  B the strength" if strength_only else "q r / (r² + s²)^(3/2)"
         size = sized(float(shape["radius"]), context.units[0])
         return f"B(p) = B₀ + {pole},  r = p − p̄ − c,  s = {size}, chosen, for no pole is a point"
 
@@ -89,8 +92,8 @@ class MagneticPole(Effect):
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers
         place = torch.stack([torch.as_tensor(shape[f"place_{a}"], dtype=p.dtype, device=p.device) for a in "xyz"])
-        away, least = make_dual(p, place[0]) - place, make_dual(p.new_tensor(shape["radius"] ** 2), place[0])
-        field = away * (away.square().sum(-1, keepdim=True) + least) ** -1.5
+        away, softening = make_dual(p, place[0]) - place, make_dual(p.new_tensor(shape["radius"] ** 2), place[0])
+        field = away * (away.square().sum(-1, keepdim=True) + softening) ** -1.5
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

@@ -16,22 +16,25 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.05, 0.1, 0.2, 0.4)
-"""Time constants that are searched, as shares of the recording's length."""
+"""Time constants to search, as shares of the recording's length."""
 
-MIDDLES, WIDTHS = (0.25, 0.5, 0.75), (0.05, 0.12)
-"""Where a sigmoid drift has its middle, and its width, as shares of the recording's length."""
+MIDDLES = (0.25, 0.5, 0.75)
+"""Middles of a logistic drift to search, as shares of the recording's length."""
+
+WIDTHS = (0.05, 0.12)
+"""Widths of a logistic drift to search, as shares of the recording's length."""
 
 
 class OffsetDrift(GainEffect):
     """Electronics that warm up, relax or age shift the sensor's offset slowly.
 
-    Simulation: adds ``Δb s(t)`` to the sensor's axes, with a course s that runs from 0 to 1 over the recording and
-    never turns back: a straight line; ``1 − exp(−t/τ)``, warm-up of first order; ``√t``, heat that diffuses in; or a
-    logistic curve, a change that sets in and comes to its end.
-    Drivers: none, it is bound to a time; in a later recording Δb is there throughout.
+    Simulation: adds ``Δb s(t)`` to the sensor's axes, with a monotonic waveform s from 0 to 1 over the recording: a
+    straight line; ``1 − exp(−t/τ)``, first-order warm-up; ``√t``, diffusion of heat; or a logistic curve, a transition
+    within the recording.
+    Drivers: none, it is bound to a time; a later recording has Δb throughout.
     Units: Δb in µT; the time constant, the middle and the width in s from the start of the recording.
     Plausible: up to 50 µT.
-    Source: Newton's law of cooling; the diffusion of heat into a half-space, which goes with the root of time.
+    Source: Newton's law of cooling; diffusion of heat into a half-space, in proportion to the square root of time.
 
     Example:
         >>> from mkc_torch.effects import Context
@@ -51,12 +54,12 @@ class OffsetDrift(GainEffect):
     shape_units: Mapping[str, str] = dict.fromkeys(("time_constant", "middle", "width"), "s")
     equation = "δB = Δb s(t),  s from 0 to 1 over the recording"
     explanation = "The sensor's offset drifted slowly over the recording, as it does while electronics warm up."
-    advice = "Let the sensor warm up before calibrating, or record its temperature beside it."
+    advice = "Let the sensor warm up before calibrating, or record its temperature."
     recurrence = "a warm-up comes again after a cold start"
     form_parameters = ("power",)
     plausible = 50.0
     plausible_unit = "µT"
-    source = "warm-up of first order; diffusion of heat into a half-space goes with the root of time"
+    source = "first-order warm-up; diffusion of heat into a half-space goes with the square root of time"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         length = float(time[-1] - time[0])
@@ -65,15 +68,15 @@ class OffsetDrift(GainEffect):
         return ({}, *exponential, {"power": 0.5}, *logistic)
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        course = "t / T"
+        waveform = "t / T"
         if "time_constant" in shape:
-            course = "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"
+            waveform = "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"
         elif "middle" in shape:
-            course = "(l(t) − l(0)) / (l(T) − l(0)),  l(t) = 1 / (1 + exp(−(t − middle) / width))"
+            waveform = "(l(t) − l(0)) / (l(T) − l(0)),  l(t) = 1 / (1 + exp(−(t − middle) / width))"
         elif "power" in shape:
-            course = "√(t / T)"
+            waveform = "√(t / T)"
         length = sized(float(context.time[-1] - context.time[0]), "s")
-        return f"δB = Δb s(t),  s(t) = {course},  t from the recording's start,  T = {length}"
+        return f"δB = Δb s(t),  s(t) = {waveform},  t from the recording's start,  T = {length}"
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         elapsed = context.time - context.time[0]
@@ -87,5 +90,5 @@ class OffsetDrift(GainEffect):
         return (elapsed / length).pow(shape.get("power", 1.0))
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
-        """What is left of it in another recording of the sensor: the offset at the end."""
+        """The change that remains in a later recording of the sensor: the offset at the end."""
         return gamma.expand(len(context.time), -1)

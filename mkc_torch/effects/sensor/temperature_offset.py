@@ -1,4 +1,4 @@
-"""An offset that follows the temperature."""
+"""An offset that depends on the temperature."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class TemperatureOffset(DriverOffset):
     """The offset of the sensing element and its amplifier changes with their temperature.
 
-    Simulation: adds ``k (T − T̄)`` to the sensor's axes, T as recorded or behind a first-order lag, for the sensing
-    element may warm later than the thermometer; or ``k (T − T̄)(1 + c (T − T̄))``, a response that bends a little.
+    Simulation: adds ``k (T − T̄)`` to the sensor's axes, with T as recorded or behind a first-order lag, because the
+    sensing element may warm up later than the thermometer; or ``k (T − T̄)(1 + c (T − T̄))``, with a small curvature.
     Drivers: a column with the role temperature.
     Units: k in µT/K, the lag in s, the curvature c in 1/K.
     Plausible: up to 5 µT/K.
@@ -63,5 +63,5 @@ class TemperatureOffset(DriverOffset):
         return per("1", context.units[0]) if name == "curvature" else super().unit_of_shape(name, context)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        follows = super().waveform(shape, context)
-        return follows * (1.0 + shape.get("curvature", 0.0) * follows)
+        linear = super().waveform(shape, context)
+        return linear * (1.0 + shape.get("curvature", 0.0) * linear)

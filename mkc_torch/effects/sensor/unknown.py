@@ -1,4 +1,4 @@
-"""A smooth response to a recorded column that no named effect describes."""
+"""An unnamed smooth response to a recorded column."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 DEGREE = 3
-"""Of the curve."""
+"""Degree of the polynomial."""
 
 
 class Unknown(Effect):
-    """The offset follows a column along a smooth curve, by physics that the catalogue does not have.
+    """The offset depends on a column by a smooth curve: physics outside the catalogue.
 
     Simulation: adds ``Σ γ_j P_j(x)`` to the sensor's axes, with Legendre polynomials P_1 to P_3 and the column's range
-    in the recording mapped to [-1, 1]; outside of it the curve goes on as a constant.
-    Drivers: one column, whatever its role.
+    in the recording mapped to [-1, 1]; outside of it the curve is constant.
+    Drivers: one column of any role.
     Units: γ in µT.
     Plausible: any size.
-    Source: none; it is a curve and no physics.
+    Source: none; it is a curve, not physics.
 
     Example:
         >>> from mkc_torch.effects import Context
@@ -42,7 +42,7 @@ class Unknown(Effect):
     is_curve = True
     roles = ("temperature", "current", "any")
     equation = "δB = f(x), a smooth curve"
-    explanation = "The offset follows this column along a curve that no effect of the catalogue describes."
+    explanation = "The offset depends on this column by a curve that no effect of the catalogue describes."
     advice = "Look at the curve; find out what the column does to the sensor."
     source = "none: a curve, not physics"
 
@@ -67,6 +67,6 @@ class Unknown(Effect):
         return polynomials @ gamma.reshape(DEGREE, -1)
 
     def bind(self, shape: Shape, context: Context) -> Shape:
-        """The shape with the column's range in this recording, for use on another one."""
+        """The shape with the column's range in this recording, for use on another recording."""
         x = context.drivers[:, 0]
         return {**shape, "low": float(x.min()), "high": float(x.max())}

@@ -1,4 +1,4 @@
-"""A course of the offset along one direction whose cause no column recorded."""
+"""A variation of the offset along one direction whose cause is not recorded."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 __all__ = ["COURSE", "Unrecorded"]
 
 COURSE = "course_"
-"""What the numbers of the course are called, before their number."""
+"""Prefix of the names of the waveform's coefficients, before their number."""
 
 
 class Unrecorded(GainEffect):
-    """Something that was not recorded, such as a heater or a supply current, moves the offset to and fro.
+    """A cause that was not recorded, such as a heater or a supply current, changes the offset back and forth.
 
-    Simulation: adds ``Δb s(t)`` to the sensor's axes, with one course s for all of them that spans a range of 1 over
-    the recording and ends at 0.
-    Drivers: none that was recorded.
-    Units: Δb in µT; the course is a sum of cosines, ``Σ c_k cos(π k (n + ½) / N)`` of sample n of N, and has no unit.
+    Simulation: adds ``Δb s(t)`` to the sensor's axes, with one waveform s for all axes that spans a range of 1 over the
+    recording and ends at 0.
+    Drivers: no recorded column.
+    Units: Δb in µT; the waveform is a sum of cosines, ``Σ c_k cos(π k (n + ½) / N)`` of sample n of N, without unit.
     Plausible: any size.
-    Source: none; what moves the axes together is one cause, whatever it is.
+    Source: none; a common variation of the axes has one cause.
 
     Example:
         >>> from mkc_torch.effects import Context
@@ -44,31 +44,31 @@ class Unrecorded(GainEffect):
     is_curve = True
     unrecorded = True
     gain = "offset_change"
-    equation = "δB = Δb s(t),  one course s for all axes"
-    explanation = "Something that was not recorded moved the sensor's offset to and fro along one direction."
-    advice = "Look at its course over time: find out what was warmed, switched or moved then, and record it."
-    source = "none: a course, not physics"
+    equation = "δB = Δb s(t),  one waveform s for all axes"
+    explanation = "A cause that was not recorded changed the sensor's offset back and forth along one direction."
+    advice = "Look at its variation over time: find out what was warmed, switched or moved then, and record it."
+    source = "none: a waveform, not physics"
 
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
-        course = "s(t) = Σ c_k cos(π k (n + ½) / N) less its last value"
-        return f"{self.equation},  {course},  sample n of N,  {len(shape)} numbers c_k in model.json"
+        waveform = "s(t) = Σ c_k cos(π k (n + ½) / N) less its last value"
+        return f"{self.equation},  {waveform},  sample n of N,  {len(shape)} numbers c_k in model.json"
 
     def reports(self, name: str) -> bool:
-        """The course is drawn, and its numbers are not told one by one."""
+        """Whether reports list a shape parameter; the waveform is plotted, its coefficients are not listed."""
         return not name.startswith(COURSE)
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        # its course is read off the noise, and none can be tried before
+        # its waveform is estimated from the residual; there is no grid
         return ()
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         time = context.time
         phase = math.pi * (torch.arange(len(time), dtype=time.dtype, device=time.device) + 0.5) / len(time)
-        course = torch.zeros_like(time)
+        waveform = torch.zeros_like(time)
         for name, amplitude in shape.items():
-            course = course + amplitude * torch.cos(int(name.removeprefix(COURSE)) * phase)
-        return course - course[-1]
+            waveform = waveform + amplitude * torch.cos(int(name.removeprefix(COURSE)) * phase)
+        return waveform - waveform[-1]
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
-        """Nothing: the offset that the sensor is left with, where the course ends, is its own one."""
+        """Zero: the waveform ends at 0, so the sensor keeps its own offset."""
         return torch.zeros_like(gamma).expand(len(context.time), -1)

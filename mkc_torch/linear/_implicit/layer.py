@@ -1,11 +1,11 @@
-"""Differentiate a robust fit by what holds at its end: the gradient of its objective is zero.
+"""Differentiate a robust fit through its stationarity condition: the gradient of its objective is zero.
 
-A fit is found by searches, steps and stops that have no useful derivative. Its result θ solves ``g(θ, x) = 0`` for the
-data x, so near the data at hand it moves by ``-H⁻¹ ∂g/∂x`` with H the Hessian of the objective. That is what
-``θ - H⁻¹ g(θ, x)`` has for a derivative when θ and H are constants. Applied once more to its own result it has the
-right second derivatives too: each application removes one order of the error, since ``1 - H⁻¹ ∂g/∂θ`` vanishes at the
-solution. Third derivatives are not right. Everything after the search is plain torch, so reverse and forward mode and
-vmap need no rules of their own.
+The searches, steps and stopping rules of a fit have no useful derivative. Its result θ solves ``g(θ, x) = 0`` for the
+data x, so it moves with the data by ``-H⁻¹ ∂g/∂x``, where H is the Hessian of the objective. The expression
+``θ - H⁻¹ g(θ, x)`` with constant θ and H has this derivative. Applied once more to its own result, it has the right
+second derivatives too: each application removes one order of the error, since ``1 - H⁻¹ ∂g/∂θ`` vanishes at the
+solution. Third derivatives are not right. Everything after the search is plain torch, so reverse mode, forward mode and
+vmap need no custom rules.
 
 H is the Hessian of the likelihood in the coefficients, σ and d at once; of the coefficients alone it is
 ``Σ x xᵀ w (1 - z² / σ²) / d²``, not the ``Σ x xᵀ w / d²`` of the fixed point (15).
@@ -25,22 +25,22 @@ from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.density.energy import energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.linear._implicit.refusal import Refusing
-from mkc_torch.linear._implicit.stationary import FitData, StationaryPoint, stationary
+from mkc_torch.linear._implicit.stationary import FitData, FitState, stationary
 from mkc_torch.linear._mkc import coefficient_covariance
-from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
+from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
 from mkc_torch.linear.covariance import CovarianceKind
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Given", "Layer", "fit_layer", "wanted"]
+__all__ = ["Given", "Layer", "fit_layer", "needs_derivatives"]
 
 _APPLICATIONS = 2
 """Orders of derivatives that are right."""
 
 
 class Given(NamedTuple):
-    """What a fit is given beside the data, None where it is not: σ, d and domain (*, m), coefficients to start from."""
+    """What a fit is given in addition to the data, or None: σ, d and domain (*, m), starting coefficients."""
 
     sigma: Tensor | None
     d: Tensor | None
@@ -66,8 +66,8 @@ class Layer:
     single_channel: bool
 
 
-def wanted(*values: object) -> bool:
-    """Whether derivatives by any of these are being recorded, or a transform of ``torch.func`` is at work."""
+def needs_derivatives(*values: object) -> bool:
+    """Whether derivatives by any of these values are recorded, or a transform of ``torch.func`` is active."""
     if functorch_is_active():
         return True
     return any(
@@ -81,7 +81,7 @@ def fit_layer(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None,
-    solve: Callable[[LinearProblem, Given], StationaryPoint],
+    solve: Callable[[LinearProblem, Given], FitState],
     *,
     sigma: float | Tensor | None,
     d: float | Tensor | None,
@@ -89,19 +89,19 @@ def fit_layer(
     start: Tensor | None = None,
     covariance: tuple[CovarianceKind, float | None] = ("sandwich", None),
 ) -> Layer:
-    """A fit with derivatives by X, Y, the weights, and σ, d and domain where they are given.
+    """Fit with derivatives by X, Y, the weights, and by σ, d and domain where they are given.
 
     Args:
         X, Y, sample_weight: as in :func:`linear_problem`.
-        solve: the fit, from checked constants.
-        sigma, d, bound: a number, (m,) or (*, m); None is found by the fit.
-        start: coefficients (n,) or (*, n) to start from, or None.
+        solve: the fit, called with checked constants.
+        sigma, d, bound: a number, (m,) or (*, m); None lets the fit estimate it.
+        start: starting coefficients (n,) or (*, n), or None.
         covariance: kind and bandwidth of the covariance of the coefficients.
 
     Raises:
         ValueError: bad input, as in :func:`linear_problem`.
     """
-    values = laid_out(X, Y, sample_weight)
+    values = checked_shapes(X, Y, sample_weight)
     rank = len(values.batch)
     given = Given(*(_of_rank(v, rank, values.Y) for v in (sigma, d, bound, start)))
     search = _Search(solve, covariance)
@@ -116,7 +116,7 @@ def _with_batch_rank(value: Tensor, rank: int) -> Tensor:
 
 
 def _of_rank(value: float | Tensor | None, rank: int, like: Tensor) -> Tensor | None:
-    """A parameter with all the batch dimensions, of size 1 where it has none of its own, so that one more can lead."""
+    """Reshape a parameter to all batch dimensions, of size 1 where it lacks them, so that vmap can prepend another."""
     if value is None:
         return None
     t = value.to(like) if isinstance(value, Tensor) else torch.as_tensor(value, dtype=like.dtype, device=like.device)
@@ -124,7 +124,7 @@ def _of_rank(value: float | Tensor | None, rank: int, like: Tensor) -> Tensor | 
 
 
 class _Found(NamedTuple):
-    """Constants that a search hands over, each with the user's batch dimensions in front."""
+    """Constants that a search returns, each with the user's batch dimensions in front."""
 
     to_coef: Float[Tensor, "*#batch n n"]
     beta: Float[Tensor, "*batch n"]
@@ -140,14 +140,14 @@ class _Found(NamedTuple):
 
 
 class _Search(NamedTuple):
-    solve: Callable[[LinearProblem, Given], StationaryPoint]
+    solve: Callable[[LinearProblem, Given], FitState]
     covariance: tuple[CovarianceKind, float | None]
 
     @torch.no_grad()
     def run(self, X: Tensor, Y: Tensor, weight: Tensor | None, given: Given) -> tuple[Tensor, ...]:
         problem = linear_problem(X, Y, weight)
-        rest = self.solve(problem, given)
-        at = stationary(problem, rest)
+        fit_state = self.solve(problem, given)
+        at = stationary(problem, fit_state)
         shared = problem.to_coef.shape[0] == 1
         lead = (1,) * len(problem.batch) if shared else tuple(problem.batch)
         covariance = coefficient_covariance(problem, at.beta, at.kappa, torch.exp(at.log_d), *self.covariance)
@@ -155,23 +155,23 @@ class _Search(NamedTuple):
             at.beta,
             at.kappa,
             at.log_d,
-            torch.zeros_like(at.log_d) if rest.log_bound is None else rest.log_bound,
+            torch.zeros_like(at.log_d) if fit_state.log_bound is None else fit_state.log_bound,
             at.unit,
             at.total,
             at.inverse,
             at.cause,
-            rest.converged,
+            fit_state.converged,
         )
         return (
             problem.to_coef.reshape(lead + tuple(problem.to_coef.shape[1:])),
             *(problem.restore(v) for v in own),
             covariance,
-            *(problem.restore(v) for v in rest.extras),
+            *(problem.restore(v) for v in fit_state.extras),
         )
 
 
 class _Solve(torch.autograd.Function):
-    """The search itself, whose results are constants to every transform; vmap hands it one batch dimension more."""
+    """The search; its results are constants to every transform, and vmap adds a batch dimension to its inputs."""
 
     @staticmethod
     def forward(
@@ -216,7 +216,7 @@ class _Solve(torch.autograd.Function):
             weight = weight.expand(info.batch_size, *weight.shape[1:])
         found: tuple[Tensor, ...] = _Solve.apply(search, X, Y, weight, *given)  # type: ignore[no-untyped-call]
         to_coef, *others = found
-        if to_coef.shape[0] == 1:  # one X for all, kept once
+        if to_coef.shape[0] == 1:  # all problems share X, kept once
             return (to_coef.squeeze(0), *others), (None, *(0 for _ in others))
         return found, (0,) * len(found)
 
@@ -227,7 +227,7 @@ def _values_left(values: CanonicalShapes) -> Tensor:
 
 
 def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras: tuple[Tensor, ...]) -> Layer:
-    """The solution again, in plain torch from the data: found values, derivatives by two chord steps of Newton."""
+    """Recompute the solution from the data in plain torch: same values, derivatives by two Newton chord steps."""
     rows = torch.matmul(values.X.flatten(-3, -2), found.to_coef)
     likelihood = found.inverse.shape[-1] > found.beta.shape[-1]
     n, m = found.beta.shape[-1], found.kappa.shape[-1]

@@ -1,4 +1,4 @@
-"""Gradients that do not exist: which problems, and why."""
+"""Errors for gradients that do not exist: which problems, and why."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ __all__ = ["NotDifferentiableError"]
 
 
 class NotDifferentiableError(ValueError):
-    """A derivative was asked for of a fit that is no strict minimum, or that did not come to rest."""
+    """A derivative was taken of a fit that has not converged or is not at a strict minimum."""
 
 
 class Refusing(torch.autograd.Function):
-    """The identity, whose derivative is refused for problems with a cause against it.
+    """The identity, whose derivative raises for problems with a nonzero ``cause``.
 
-    Backward refuses only what is asked for: a problem left out of the loss has a gradient of zeros.
+    Backward raises only where a gradient arrives: a problem left out of the loss has a gradient of zeros.
     """
 
     @staticmethod
     def forward(value: Tensor, cause: Tensor, check: str) -> Tensor:
         refused = cause != 0
         if check and bool(refused.any()):
-            asked = refused & (value != 0).any(-1) if check == "asked" else refused
-            if _somewhere(asked):
+            requested = refused & (value != 0).any(-1) if check == "requested" else refused
+            if _somewhere(requested):
                 raise NotDifferentiableError(_refusal(cause, refused))
         return value.clone()
 
@@ -36,7 +36,7 @@ class Refusing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return Refusing.apply(grad, ctx.saved_tensors[0], "asked"), None, None  # type: ignore[no-untyped-call]
+        return Refusing.apply(grad, ctx.saved_tensors[0], "requested"), None, None  # type: ignore[no-untyped-call]
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
@@ -58,21 +58,24 @@ class Refusing(torch.autograd.Function):
 def _somewhere(mask: Tensor) -> bool:
     try:
         return bool(mask.any())
-    except RuntimeError:  # gradients batched by autograd itself have no one value
+    except RuntimeError:  # gradients that autograd itself batches have no single value
         return True
 
 
-_NOT_AT_REST, _NO_MINIMUM = 1, 2
+_NOT_CONVERGED, _NO_MINIMUM = 1, 2
 
 
 def _refusal(cause: Tensor, refused: Tensor) -> str:
     first = tuple(int(i) for i in refused.nonzero()[0])
     which = f"problem {', '.join(map(str, first))}" if first else "a fit"
     leave_out = ", or leave the problem out of the loss by `differentiable_`" if first else ""
-    if int(cause[first]) == _NOT_AT_REST:
-        return f"Expected a fit at rest to differentiate but got {which} short of it; raise `max_iter`{leave_out}."
+    if int(cause[first]) == _NOT_CONVERGED:
+        return (
+            f"Expected a converged fit to differentiate but got {which} that has not converged; raise "
+            f"`max_iter`{leave_out}."
+        )
     return (
         f"Expected a strict minimum to differentiate at but got {which} where the Hessian of the objective is singular "
-        "or not positive definite, so that its result follows the data in no smooth way; take more samples, or a "
+        "or not positive definite, so that the result is not a smooth function of the data; take more samples, or a "
         f"larger `sigma` or `d` where they are given{leave_out}."
     )

@@ -1,4 +1,4 @@
-"""A fixed point polished to rest, and the curvature of its objective there."""
+"""Polishing of a fit to a stationary point by Newton steps, and the inverse Hessian of its objective there."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from torch import Tensor
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
 from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
 from mkc_torch.density.normalizer import _log_partition_and_slopes
-from mkc_torch.linear._implicit.refusal import _NO_MINIMUM, _NOT_AT_REST
+from mkc_torch.linear._implicit.refusal import _NO_MINIMUM, _NOT_CONVERGED
 from mkc_torch.linear._problem import LinearProblem
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["FlatStationaryPoint", "StationaryPoint", "free_unknowns", "inverse_where", "moved"]
+__all__ = ["FitState", "Unknowns", "free_unknowns", "inverse_where", "moved"]
 
 _POLISHING_STEPS = 12
+"""Largest number of Newton steps that polish a fit."""
 
 
 @dataclass(frozen=True)
-class StationaryPoint:
-    """Where a fit came to rest, in the basis of its problem and flat batch dimensions.
+class FitState:
+    """Unknowns of a fit, their limits and which of them are free, in the problem's basis and flat batch dimensions.
 
-    With ``log_bound`` the objective is the negative log-likelihood, in which κ and log d are free where the flags say
-    so; without, it is the loss (13) at the given κ and d. ``extras`` are results that the fit passes on.
+    With ``log_bound`` the objective is the negative log-likelihood, in which κ and log d are free according to the
+    flags. Without, it is the loss (13) at the given κ and d. ``extras`` are further results of the fit.
     """
 
     beta: Float[Tensor, "B n"]
@@ -43,7 +44,7 @@ class StationaryPoint:
 
 @dataclass(frozen=True)
 class FitData:
-    """What the gradient of the objective depends on; rows are one (K, n) for all problems where they share X."""
+    """Data of the gradient of the objective; ``rows`` is a single (K, n) for all problems that share X."""
 
     rows: Float[Tensor, "*#batch K n"]
     Y: Float[Tensor, "*batch N m"]
@@ -63,7 +64,7 @@ class FitData:
         return (values if self.weight is None else self.weight * values).sum(-2)
 
     def gradient(self, beta: Tensor, kappa: Tensor, log_d: Tensor) -> Float[Tensor, "*batch p"]:
-        """Of the mean objective, by the coefficients in units of ``unit`` and, for a likelihood, κ and log d."""
+        """Gradient of the mean objective by the coefficients in ``unit`` and, for a likelihood, by κ and log d."""
         precision = torch.exp(-log_d)
         z, k = self.residual(beta) * precision.unsqueeze(-2), kappa.unsqueeze(-2)
         influence = energy_dz(z, k)
@@ -84,56 +85,60 @@ class FitData:
 
 
 @dataclass(frozen=True)
-class FlatStationaryPoint:
+class Unknowns:
+    """Coefficients, κ and log d."""
+
     beta: Float[Tensor, "B n"]
     kappa: Float[Tensor, "B m"]
     log_d: Float[Tensor, "B m"]
 
 
 @dataclass(frozen=True)
-class _AtRest(FlatStationaryPoint):
+class _StationaryPoint(Unknowns):
     unit: Float[Tensor, "B 1"]
     total: Float[Tensor, "B 1"]
     inverse: Float[Tensor, "B p p"]
     cause: Int[Tensor, " B"]
 
 
-def stationary(problem: LinearProblem, rest: StationaryPoint) -> _AtRest:
-    """Newton steps to where the gradient is rounding, with the inverse Hessian there; as it was where that fails."""
-    size, m = rest.kappa.shape
+def stationary(problem: LinearProblem, fit_state: FitState) -> _StationaryPoint:
+    """Polish by Newton steps until the gradient is rounding; where that fails, keep the fit and return a cause."""
+    size, m = fit_state.kappa.shape
     rows = problem.basis.flatten(-3, -2)
-    unit = torch.exp(rest.log_d.amin(-1, keepdim=True))
+    unit = torch.exp(fit_state.log_d.amin(-1, keepdim=True))
     data = FitData(
         rows=rows[0] if rows.shape[0] == 1 else rows,
         Y=problem.Y,
         weight=problem.sample_weight,
-        log_bound=rest.log_bound,
+        log_bound=fit_state.log_bound,
         unit=unit,
         total=problem.total_weight().sum(-1, keepdim=True),
     )
     eps = torch.finfo(unit.dtype).eps
-    point = FlatStationaryPoint(rest.beta, rest.kappa, rest.log_d)
+    point = Unknowns(fit_state.beta, fit_state.kappa, fit_state.log_d)
     rounding = (10 * eps * problem.Y.abs().amax((-2, -1)) / unit.squeeze(-1)).square()
     before = rounding.new_full((size,), torch.inf)
     for step in range(_POLISHING_STEPS + 1):
         gradient = data.gradient(point.beta, point.kappa, point.log_d)
         hessian, head = _hessian(problem, data, point)
-        keep = free_unknowns(rest, point, gradient)
+        keep = free_unknowns(fit_state, point, gradient)
         inverse, strict = inverse_where(hessian, keep)
         move = -torch.matmul(inverse, torch.where(keep, gradient, 0.0).unsqueeze(-1)).squeeze(-1)
-        # what a step would still gain, in mean squares of the fitted values in d
+        # predicted gain of a further step, in mean squares of the fitted values in units of d
         gain = -(move * gradient).sum(-1)
         near = gain <= eps * head + rounding
         done = ~strict | (near & ((gain <= (1e4 * eps) ** 2 * head) | (gain >= 0.25 * before)))
         if bool(done.all()) or step == _POLISHING_STEPS:
             break
-        point, before = moved(rest, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
-    cause = torch.where(strict | ~rest.converged, torch.where(near & rest.converged, 0, _NOT_AT_REST), _NO_MINIMUM)
+        point, before = moved(fit_state, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
+    cause = torch.where(
+        strict | ~fit_state.converged, torch.where(near & fit_state.converged, 0, _NOT_CONVERGED), _NO_MINIMUM
+    )
     refused = (cause != 0).unsqueeze(-1)
-    return _AtRest(
-        beta=torch.where(refused, rest.beta, point.beta),
-        kappa=torch.where(refused, rest.kappa, point.kappa),
-        log_d=torch.where(refused, rest.log_d, point.log_d),
+    return _StationaryPoint(
+        beta=torch.where(refused, fit_state.beta, point.beta),
+        kappa=torch.where(refused, fit_state.kappa, point.kappa),
+        log_d=torch.where(refused, fit_state.log_d, point.log_d),
         unit=unit,
         total=data.total,
         inverse=torch.where(refused.unsqueeze(-1), 0.0, inverse),
@@ -142,9 +147,9 @@ def stationary(problem: LinearProblem, rest: StationaryPoint) -> _AtRest:
 
 
 def _hessian(
-    problem: LinearProblem, data: FitData, point: FlatStationaryPoint
+    problem: LinearProblem, data: FitData, point: Unknowns
 ) -> tuple[Float[Tensor, "B p p"], Float[Tensor, " B"]]:
-    """Of the objective whose gradient :class:`FitData` gives, and the mean square of z under the kernel's weights."""
+    """Hessian of the objective of :class:`FitData`, and the mean square of z under the weights."""
     kappa, log_d = point.kappa, point.log_d
     error = data.residual(point.beta)
     precision = torch.exp(-log_d)
@@ -178,22 +183,22 @@ def _hessian(
     return torch.cat(rows, -2), head
 
 
-def free_unknowns(
-    rest: StationaryPoint, point: FlatStationaryPoint, gradient: Float[Tensor, "B p"]
-) -> Bool[Tensor, "B p"]:
-    """The unknowns that follow the data: not those given, nor those that a bound holds back."""
+def free_unknowns(fit_state: FitState, point: Unknowns, gradient: Float[Tensor, "B p"]) -> Bool[Tensor, "B p"]:
+    """Mask of the unknowns that are estimated and not held at a limit."""
     coefficients = torch.ones_like(point.beta, dtype=torch.bool)
-    if rest.log_bound is None or rest.log_d_min is None:
+    if fit_state.log_bound is None or fit_state.log_d_min is None:
         return coefficients
     n, m = point.beta.shape[-1], point.kappa.shape[-1]
     g_kappa, g_log_d = gradient[:, n : n + m], gradient[:, n + m :]
     held_kappa = ((point.kappa <= 0) & (g_kappa >= 0)) | ((point.kappa >= KAPPA_MAX) & (g_kappa <= 0))
-    held_d = ((point.log_d <= rest.log_d_min) & (g_log_d >= 0)) | ((point.log_d >= rest.log_bound) & (g_log_d <= 0))
-    return torch.cat([coefficients, ~held_kappa & rest.free_kappa, ~held_d & rest.free_d], -1)
+    held_d = ((point.log_d <= fit_state.log_d_min) & (g_log_d >= 0)) | (
+        (point.log_d >= fit_state.log_bound) & (g_log_d <= 0)
+    )
+    return torch.cat([coefficients, ~held_kappa & fit_state.free_kappa, ~held_d & fit_state.free_d], -1)
 
 
 def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"], Bool[Tensor, " B"]]:
-    """Inverse of the Hessian of the unknowns kept, 0 for the others, and whether it is safely positive definite."""
+    """Inverse Hessian of the unknowns in ``keep``, 0 for the others, and whether it is safely positive definite."""
     both = keep.unsqueeze(-1) & keep.unsqueeze(-2)
     hessian = torch.where(both, hessian, torch.diag_embed((~keep).to(hessian.dtype)))
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
@@ -207,14 +212,12 @@ def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"]
     return torch.where(both & strict[:, None, None], inverse, 0.0), strict
 
 
-def moved(
-    rest: StationaryPoint, point: FlatStationaryPoint, move: Float[Tensor, "B p"], unit: Tensor, m: int
-) -> FlatStationaryPoint:
+def moved(fit_state: FitState, point: Unknowns, move: Float[Tensor, "B p"], unit: Tensor, m: int) -> Unknowns:
     n = point.beta.shape[-1]
     beta = point.beta + unit * move[:, :n]
-    if rest.log_bound is None or rest.log_d_min is None:
-        return FlatStationaryPoint(beta, point.kappa, point.log_d)
-    kappa = (point.kappa + move[:, n : n + m]).clamp(0.0, KAPPA_MAX) if rest.free_kappa else point.kappa
+    if fit_state.log_bound is None or fit_state.log_d_min is None:
+        return Unknowns(beta, point.kappa, point.log_d)
+    kappa = (point.kappa + move[:, n : n + m]).clamp(0.0, KAPPA_MAX) if fit_state.free_kappa else point.kappa
     log_d = point.log_d + move[:, n + m :]
-    bounded = torch.minimum(torch.maximum(log_d, rest.log_d_min), rest.log_bound)
-    return FlatStationaryPoint(beta, kappa, bounded if rest.free_d else point.log_d)
+    bounded = torch.minimum(torch.maximum(log_d, fit_state.log_d_min), fit_state.log_bound)
+    return Unknowns(beta, kappa, bounded if fit_state.free_d else point.log_d)

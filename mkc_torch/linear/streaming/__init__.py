@@ -1,4 +1,4 @@
-"""Regression on more rows than memory holds, over blocks that come again in every pass, on one machine or many."""
+"""Regression on more rows than memory holds, from batches that are read again in every pass, on one machine or many."""
 
 from mkc_torch._support.ranks import RanksError
 from mkc_torch.linear.streaming.regression import StreamChangedError, StreamedMKCRegression

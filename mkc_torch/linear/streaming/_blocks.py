@@ -1,4 +1,4 @@
-"""Batches as blocks of float64 that fit a processor's cache, each checked for its kind and shape."""
+"""Batches as float64 blocks that fit a processor's cache, each checked for type and shape."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ if TYPE_CHECKING:
     from jaxtyping import Float64, Shaped
 
 BLOCK_VALUES = 80_000
-"""Numbers of a block at most: 640 kB in float64, which stay in a cache of 1 MB while some ten operations go over them.
-Set where rows of nine numbers were fastest, at 4000 to 8000 of them."""
+"""Largest number of values in a block: 640 kB in float64, which stay in a cache of 1 MB during some ten operations.
+
+Chosen where rows of nine values were fastest, at 4000 to 8000 rows."""
 
 _LEAST_ROWS = 64
+"""Least number of rows in a block."""
 
 
 @dataclass(frozen=True)
 class StreamBlock:
-    """Rows of one batch in float64: where they stand, its number and the first row's in it, and whether they are
-    of float32.
+    """Rows of one batch in float64, with the number of the batch, the first row in it, and whether it is float32.
 
-    Each column is contiguous, with which products of columns and their sums take a third of the time.
+    Each column is contiguous; products of columns and their sums then take a third of the time.
     """
 
     joined: Float64[np.ndarray, "m n+1 B"]
@@ -48,7 +49,7 @@ class StreamBlock:
 
 @dataclass(frozen=True)
 class Shape:
-    """What every batch of a stream has: m channels of n columns, one channel given without its dimension, weights."""
+    """Shape of all batches of a stream: m channels of n columns, whether one-channel input, whether weighted."""
 
     m: int
     n: int
@@ -57,40 +58,40 @@ class Shape:
 
 
 def checked_source(batches: object) -> Iterable[Any]:
-    """``batches``, which can be gone through again and again.
+    """Return ``batches`` if it can be iterated over repeatedly, else raise.
 
     Raises:
-        TypeError: it cannot, or it holds one batch alone.
+        TypeError: it cannot, or it is a single batch.
     """
     if isinstance(batches, Tensor) or is_array(batches):
         raise TypeError(
-            f"Expected argument `batches` to give batches (X, Y) but got {type(batches).__name__}; arrays are cut "
-            "into batches by from_memmap(X, Y)."
+            f"Expected argument `batches` to yield batches (X, Y) but got {type(batches).__name__}; split arrays into "
+            "batches by from_memmap(X, Y)."
         )
     if isinstance(batches, Iterator):
         raise TypeError(
-            f"Expected argument `batches` to be an iterable that begins anew in every pass but got "
-            f"{format_value(batches)}, which is used up by one; pass a DataLoader, a list, from_memmap(X, Y), or an object "
-            "whose __iter__ is a generator function."
+            f"Expected argument `batches` to be an iterable that can be read again in every pass but got "
+            f"{format_value(batches)}, which can be read once; pass a DataLoader, a list, from_memmap(X, Y), or an "
+            "object whose __iter__ is a generator function."
         )
     if not hasattr(batches, "__iter__"):
         raise TypeError(
-            f"Expected argument `batches` to be an iterable of (X, Y) but got {format_value(batches)}; a DataLoader or a list "
-            "of batches is one."
+            f"Expected argument `batches` to be an iterable of (X, Y) but got {format_value(batches)}; pass a "
+            "DataLoader or a list of batches."
         )
     return batches
 
 
 def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple[Shape, StreamBlock]]:
-    """One pass over the batches, in blocks; a block's memory is used again for the next.
+    """Yield the blocks of one pass over the batches; the memory of a block is reused for the next.
 
     Args:
-        batches: of (X, Y) or (X, Y, weight).
-        shape: what they have to have; None takes the first one's.
+        batches: iterable of (X, Y) or (X, Y, weight).
+        shape: required shape of all batches; None takes that of the first.
 
     Raises:
-        TypeError: a batch is no pair or triple of arrays of real numbers.
-        ValueError: a batch has other columns, channels or rows than it should.
+        TypeError: a batch is not a pair or triple of arrays of real numbers.
+        ValueError: a batch has a wrong number of columns, channels or rows.
     """
     buffer = np.empty(0)
     for number, batch in enumerate(batches):
@@ -109,7 +110,7 @@ def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple
 def pieces(
     batches: Iterable[Any], shape: Shape, rows: int
 ) -> Iterator[tuple[Shaped[np.ndarray, "B m n"], Shaped[np.ndarray, "B m"], Shaped[np.ndarray, "B m"] | None]]:
-    """One pass over the batches as they lie in memory, so many rows at a time.
+    """Yield arrays of ``rows`` rows in one pass over the batches, without a copy.
 
     Raises:
         TypeError, ValueError: as :func:`blocks`.
@@ -132,16 +133,19 @@ def _arrays(batch: Any, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
         kind = (
             f"{type(batch).__name__} of {len(batch)}" if isinstance(batch, (tuple, list, dict)) else format_value(batch)
         )
-        raise TypeError(f"Expected every batch to be (X, Y) or (X, Y, weight) but got {kind} as batch {number}.")
+        raise TypeError(
+            f"Expected every batch to be (X, Y) or (X, Y, weight) but got {kind} as batch {number}; yield tuples of "
+            "arrays."
+        )
     names = ("X", "Y", "weight")
     x, y, *rest = (_array(f"{name} of batch {number}", value) for name, value in zip(names, batch, strict=False))
     return x, y, rest[0] if rest else None
 
 
 def _array(name: str, value: Any) -> np.ndarray:
-    """Real numbers as they lie in memory where that is possible."""
+    """The values as an array, without a copy where possible."""
     if isinstance(value, np.ndarray) and value.dtype in (np.float32, np.float64):
-        # a memmap's own slices take ten times as long as a plain array's
+        # slicing a memmap takes ten times as long as slicing a plain array
         return np.asarray(value)
     tensor = value if isinstance(value, Tensor) else as_tensor(name, value)
     if tensor.is_complex():
@@ -152,10 +156,10 @@ def _array(name: str, value: Any) -> np.ndarray:
 
 def _checked_shape(X: np.ndarray, Y: np.ndarray, weight: np.ndarray | None, number: int, shape: Shape | None) -> Shape:
     if X.ndim not in (2, 3) or Y.shape != X.shape[:-1] or X.shape[-1] == 0 or (X.ndim == 3 and X.shape[1] == 0):
-        mend = "; one channel is Y.squeeze(-1)" if X.ndim == 2 and Y.shape == (len(X), 1) else ""
+        remedy = "; one channel is Y.squeeze(-1)" if X.ndim == 2 and Y.shape == (len(X), 1) else ""
         raise ValueError(
             f"Expected `X` (N, n) with `Y` (N,), or (N, m, n) with (N, m), but got {X.shape} and {Y.shape} in batch "
-            f"{number}{mend}."
+            f"{number}{remedy}."
         )
     if weight is not None and weight.shape not in ((len(X),), Y.shape):
         raise ValueError(
@@ -164,8 +168,8 @@ def _checked_shape(X: np.ndarray, Y: np.ndarray, weight: np.ndarray | None, numb
     found = Shape(X.shape[1] if X.ndim == 3 else 1, X.shape[-1], X.ndim == 2, weight is not None)
     if shape is not None and found != shape:
         raise ValueError(
-            f"Expected every batch like the first, {_of(shape)}, but got {_of(found)} in batch {number}; give all the "
-            "same columns."
+            f"Expected every batch like the first, {_of(shape)}, but got {_of(found)} in batch {number}; yield the "
+            "same columns in every batch."
         )
     return found
 
@@ -176,7 +180,7 @@ def _of(shape: Shape) -> str:
 
 
 def _filled(buffer: np.ndarray, X: np.ndarray, Y: np.ndarray, shape: Shape) -> np.ndarray:
-    """X and Y in float64 in the buffer, each column in a row of it and Y of a channel behind its X."""
+    """X and Y in float64 in the buffer: each column is a row of it, and Y of a channel follows its X."""
     count, m, n = len(X), shape.m, shape.n
     joined = buffer[: m * (n + 1) * count].reshape(m, n + 1, count)
     np.copyto(joined[:, :n], X.reshape(count, m, n).transpose(1, 2, 0))

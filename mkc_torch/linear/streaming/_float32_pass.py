@@ -1,4 +1,4 @@
-"""A pass in float32, of data of float32: half the time, for steps that go further than its rounding."""
+"""A pass over float32 data in float32: half the time, for steps that are longer than its rounding error."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from torch import Tensor
 
-__all__ = ["LEAST_KAPPA_OF_ROUGH", "float32_pass"]
+__all__ = ["LEAST_FLOAT32_KAPPA", "float32_pass"]
 
-LEAST_KAPPA_OF_ROUGH = 0.01
-"""1/σ² from which float32 tells the energy's derivative by it to a thousandth."""
+LEAST_FLOAT32_KAPPA = 0.01
+"""Least κ = 1/σ² of a float32 pass: from it on, the derivative of the energy by κ is accurate to a thousandth."""
 
 _ROWS = 32_768
-"""Of a block: three rows of it in float32 are 400 kB. Set where a pass over rows of nine numbers was fastest."""
+"""Rows of a block: three float32 arrays of it are 400 kB. Chosen where a pass over rows of nine values was fastest."""
 
 
 def float32_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Float64[Tensor, " k"]:
-    """The sums of :class:`StreamSums` without the curvature, to six digits: worked out in float32, added up in float64.
+    """The sums of :class:`StreamSums` without curvature, to six digits: computed in float32, accumulated in float64.
 
     Args:
-        batches: of float32 data; they are read where they lie.
-        shape: of every batch.
-        point: where; its columns are not turned, and κ is 0.01 at least.
+        batches: float32 data, read without a copy.
+        shape: shape of every batch.
+        point: point of the pass; without a change of basis, and with κ at least 0.01.
     """
     flat = np.zeros(StreamSums.length(shape))
     channels = flat[1 : 1 + 6 * shape.m].reshape(6, shape.m)

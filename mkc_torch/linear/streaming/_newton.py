@@ -1,7 +1,7 @@
-"""Newton's method on the coefficients and each channel's 1/σ² and log d at once, one pass over the rows a step.
+"""Newton's method on the coefficients and each channel's 1/σ² and log d jointly, one pass over the rows a step.
 
-The Hessian is worked out where the steps have to be found anew, and kept while they shrink fast: near the maximum a
-pass for the gradient alone does as well as one of twice the time.
+The Hessian is kept while the steps shrink fast, and recomputed otherwise: near the maximum a pass for the gradient
+alone is as good as a pass of twice the time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.likelihood import normaliser_derivatives
-from mkc_torch.linear.streaming._float32_pass import LEAST_KAPPA_OF_ROUGH
+from mkc_torch.linear.streaming._float32_pass import LEAST_FLOAT32_KAPPA
 from mkc_torch.linear.streaming._sums import StreamSums
 
 if TYPE_CHECKING:
@@ -22,19 +22,25 @@ if TYPE_CHECKING:
 
 __all__ = ["NEAR", "Likelihood", "NewtonState", "StreamParameters"]
 
-_KAPPA_OFFSET, _LONGEST, _FURTHEST_DOWN = 0.02, 2.0, 0.1353352832366127
-"""A step in κ is measured in shares of κ and the first; it and one in log d have the length of the second at most; the
-third is the share of κ that it leaves at least. They are those of the E-step in memory."""
+_KAPPA_OFFSET = 0.02
+"""A step in κ is measured in units of κ plus this."""
+
+_LONGEST = 2.0
+"""Largest step in log d, and in κ in its units, as in the E-step in memory."""
+
+_FURTHEST_DOWN = 0.1353352832366127
+"""Least factor by which a step reduces κ, as in the E-step in memory."""
 
 NEAR = 1e-13
-"""Of the mean log-likelihood, what a step is still to gain where one with a Hessian of its own ends: 4e-7 d is then to
-go, of which such a step leaves the square."""
+"""Remaining gain, in mean log-likelihood, at which a last step with a new Hessian ends the fit.
 
-_ROUGH = 1e-9
-"""Of the mean log-likelihood, what steps are to gain that a pass in float32 can tell: its gradient is good to 1e-6."""
+The remaining distance is then 4e-7 d, of which such a step leaves the square."""
+
+_FLOAT32_GAIN = 1e-9
+"""Least remaining gain, in mean log-likelihood, for a float32 pass: its gradient is accurate to 1e-6."""
 
 _FAST = 1e-2
-"""A Hessian is kept while each step gains less than this share of what the one before it did."""
+"""The Hessian is kept while each step gains less than this share of the gain of the step before."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +54,15 @@ class StreamParameters:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The mean negative log-likelihood as a function of a place, given sums over the rows.
+    """Mean negative log-likelihood as a function of the parameters, from sums over the rows.
 
     Attributes:
-        weight: sums of the weights, (m,).
-        log_bound, log_d_min: of the domain, and the least log d, (m,).
-        free_kappa, free_d: whether these are learned.
-        to_basis: takes sums over the rows to the basis, (n, n).
-        largest: absolute value of Y.
-        single: passes in float32 are possible.
+        weight: sum of the weights, (m,).
+        log_bound, log_d_min: log half-width of the domain and least log d, (m,).
+        free_kappa, free_d: whether κ and log d are learned.
+        to_basis: matrix that takes sums over the rows to the basis, (n, n).
+        largest: largest absolute value of Y.
+        single: whether float32 passes are possible.
     """
 
     weight: Float64[Tensor, " m"]
@@ -69,14 +75,14 @@ class Likelihood:
     single: bool
 
     def channels(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, " m"]:
-        """The mean of each channel."""
+        """Mean negative log-likelihood of each channel."""
         return sums.energy / self.weight + normaliser_derivatives(place.kappa, place.log_d, self.log_bound).value
 
     def value(self, place: StreamParameters, sums: StreamSums) -> float:
         return float((self.weight * self.channels(place, sums)).sum() / self.weight.sum())
 
     def gradient(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, " p"]:
-        """By the coefficients in units of the smallest d, κ and log d."""
+        """Gradient by the coefficients in units of the smallest d, by κ and by log d."""
         norm = normaliser_derivatives(place.kappa, place.log_d, self.log_bound)
         unit, precision = torch.exp(place.log_d.min()), torch.exp(-2.0 * place.log_d)
         by_beta = -unit * (precision @ sums.score) @ self.to_basis
@@ -85,7 +91,7 @@ class Likelihood:
         return torch.cat([by_beta, by_kappa, by_log_d]) / self.weight.sum()
 
     def hessian(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, "p p"]:
-        """By the same unknowns."""
+        """Hessian by the unknowns of :meth:`gradient`."""
         norm = normaliser_derivatives(place.kappa, place.log_d, self.log_bound)
         unit, precision = torch.exp(place.log_d.min()), torch.exp(-2.0 * place.log_d)
         gram = unit.square() * torch.einsum("c,cij->ij", precision, sums.gram)
@@ -104,20 +110,20 @@ class Likelihood:
         return torch.cat(rows, -2) / self.weight.sum()
 
     def free(self, place: StreamParameters, gradient: Float64[Tensor, " p"]) -> Bool[Tensor, " p"]:
-        """The unknowns that follow the data: not those given, nor those that a limit holds back."""
+        """Mask of the unknowns that are learned and not held at a limit."""
         n, m = place.beta.shape[0], place.kappa.shape[0]
         g_kappa, g_log_d = gradient[n : n + m], gradient[n + m :]
         held_kappa = ((place.kappa <= 0) & (g_kappa >= 0)) | ((place.kappa >= KAPPA_MAX) & (g_kappa <= 0))
         held_d = ((place.log_d <= self.log_d_min) & (g_log_d >= 0)) | ((place.log_d >= self.log_bound) & (g_log_d <= 0))
         return torch.cat([torch.ones(n, dtype=torch.bool), ~held_kappa & self.free_kappa, ~held_d & self.free_d])
 
-    def allows_rough(self, place: StreamParameters) -> bool:
-        """Whether a pass in float32 is good to six digits there: not where residuals are digits of large numbers."""
+    def allows_float32(self, place: StreamParameters) -> bool:
+        """Whether a float32 pass is accurate to six digits; it is not if residuals are small compared to Y."""
         far = self.largest > 1e3 * float(torch.exp(place.log_d.min()))
-        return self.single and not far and float(place.kappa.min()) >= LEAST_KAPPA_OF_ROUGH
+        return self.single and not far and float(place.kappa.min()) >= LEAST_FLOAT32_KAPPA
 
     def moved(self, place: StreamParameters, step: Float64[Tensor, " p"]) -> StreamParameters:
-        """The place a step away, the step in κ in shares of it, within the limits."""
+        """The parameters after a step, with the step in κ in its units, clipped to the limits."""
         n, m = place.beta.shape[0], place.kappa.shape[0]
         chain = place.kappa + _KAPPA_OFFSET
         kappa = chain * (1.0 + step[n : n + m]).clamp(min=_FURTHEST_DOWN) - _KAPPA_OFFSET
@@ -131,19 +137,19 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class NewtonState:
-    """Where the method stands between two passes.
+    """State of the iteration between two passes.
 
     Attributes:
-        trial: where the next pass is made.
-        curvature: whether it is to work out the Hessian.
-        rough: whether it is to be made in float32.
-        place, value, gradient, hessian: the best place so far, and what is known of it.
-        stale: the Hessian is that of another place, or of a sample.
-        loose: the value is one of float32.
-        gain: what the last step was to gain, in the mean log-likelihood.
+        trial: parameters at which the next pass is made.
+        curvature: whether the next pass computes the Hessian.
+        rough: whether the next pass is in float32.
+        place, value, gradient, hessian: best parameters so far, with value and derivatives.
+        stale: whether the Hessian is that of other parameters, or of a sample.
+        loose: whether the value is from a float32 pass.
+        gain: predicted gain of the last step, in mean log-likelihood.
         damping: added to the scaled Hessian.
-        near: what is left to gain is for a step with a Hessian of its own.
-        history: sum over channels of the mean negative log-likelihood, at every pass.
+        near: whether a single step with a new Hessian remains.
+        history: mean negative log-likelihood, summed over channels, at every pass.
     """
 
     trial: StreamParameters
@@ -161,11 +167,11 @@ class NewtonState:
     history: tuple[float, ...] = ()
 
     def after(self, likelihood: Likelihood, sums: StreamSums) -> NewtonState:
-        """Where it stands after the pass at the trial."""
+        """State after the pass at ``trial``."""
         value = likelihood.value(self.trial, sums)
         history = (*self.history, float(likelihood.channels(self.trial, sums).sum()))
         if self.place is not None and not value <= self.value + self._rounding(value):
-            return self._back(likelihood, history)
+            return self._shorter_step(likelihood, history)
         here = replace(
             self,
             place=self.trial,
@@ -179,7 +185,7 @@ class NewtonState:
         )
         step, gain = here._step(likelihood)
         share = gain / self.gain if self.gain > 0 else 0.0
-        # steps shrink by the same share at least
+        # steps shrink by at least the same share
         left = gain * min(1.0, share)
         head = float(2.0 * sums.qw.sum() / likelihood.weight.sum())
         eps = torch.finfo(torch.float64).eps
@@ -191,19 +197,19 @@ class NewtonState:
             trial=trial,
             gain=gain,
             curvature=share > _FAST and self.place is not None,
-            rough=left > _ROUGH and share <= _FAST and likelihood.allows_rough(trial),
+            rough=left > _FLOAT32_GAIN and share <= _FAST and likelihood.allows_float32(trial),
             near=not self.rough and here.damping == 0.0 and (left <= NEAR * head + rounded or still),
         )
 
     def _rounding(self, value: float) -> float:
-        """By which two values differ where they are the same."""
+        """Difference of two values up to which they count as equal."""
         if self.rough or self.loose:
             return 1e-5 * (1.0 + abs(value))
-        # close to the maximum the value is rounding, and the gradient alone tells
+        # close to the maximum differences of the value are rounding, and only the gradient is informative
         return max(1e-13 * (1.0 + abs(value)), 1e-3 * self.gain if self.gain < 1e-10 else 0.0)
 
-    def _back(self, likelihood: Likelihood, history: tuple[float, ...]) -> NewtonState:
-        """The step was too long: a shorter one from the place before, whose own Hessian is worked out first."""
+    def _shorter_step(self, likelihood: Likelihood, history: tuple[float, ...]) -> NewtonState:
+        """State after a step that was too long: a shorter step from the best place, with a new Hessian if stale."""
         assert self.place is not None
         back = replace(self, history=history, damping=max(10.0 * self.damping, 1e-2))
         back = replace(back, curvature=False, rough=False)
@@ -213,7 +219,7 @@ class NewtonState:
         return replace(back, trial=likelihood.moved(self.place, step), gain=gain)
 
     def _step(self, likelihood: Likelihood) -> tuple[Float64[Tensor, " p"], float]:
-        """The damped Newton step, 0 for what is held, and what it is to gain."""
+        """Damped Newton step, 0 for unknowns that are held, and its predicted gain."""
         assert self.place is not None
         assert self.gradient is not None
         assert self.hessian is not None

@@ -1,4 +1,4 @@
-"""Where a streamed fit begins: the fit of a sample of its rows, in memory."""
+"""Start of a streamed fit: the fit of a sample of its rows, in memory."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, slopes_pas
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["PilotFit", "begun_from"]
+__all__ = ["PilotFit", "fit_pilot"]
 
 _LEAST_D = 0.1
-"""d of all rows in d of the sample, at least: a scale that samples of a few hundred rows know to a tenth."""
+"""Least d of all rows, in d of the sample; a sample of a few hundred rows knows its scale to a tenth."""
 
 _HELD = 1e-3
-"""Slope of the mean log-likelihood by log d from which d has ended at its least; at rest it is below 1e-5."""
+"""Slope of the mean log-likelihood by log d above which d ended at its least; at convergence it is below 1e-5."""
 
 
 @dataclass(frozen=True)
 class PilotFit:
-    """What a sample says of where the maximum is sought.
+    """Fit of a sample, as the start of the fit to all rows.
 
     Attributes:
         coef, kappa, log_d: the sample's maximum, (n,), (m,), (m,).
-        log_bound, log_d_min: of the sample's domain, and the least log d, (m,).
+        log_bound, log_d_min: log half-width of the sample's domain and least log d, (m,).
         free_kappa, free_d: whether 1/σ² and d are learned.
-        exact: most values lie on the fit to rounding.
-        rows: of the sample.
-        weight: sums of its weights, (m,).
-        sums: of :class:`StreamSums` over it at its maximum, flat.
+        exact: whether most values lie on the fit to rounding.
+        rows: number of rows of the sample.
+        weight: sum of its weights, (m,).
+        sums: :class:`StreamSums` over the sample at its maximum, flat.
     """
 
     coef: Float64[Tensor, " n"]
@@ -54,16 +54,16 @@ class PilotFit:
     sums: Float64[Tensor, " k"]
 
 
-def begun_from(
+def fit_pilot(
     drawn: Drawn, shape: Shape, estimator: MKCRegression, to_basis: Float64[Tensor, "n n"] | None = None
 ) -> PilotFit:
-    """The fit of :class:`MKCRegression` to a sample.
+    """Fit :class:`MKCRegression` to a sample.
 
     Args:
         drawn: the sample.
-        shape: of the batches.
-        estimator: with the parameters of the fit.
-        to_basis: turns the columns for the sums, where it is to be.
+        shape: shape of the batches.
+        estimator: estimator with the parameters of the fit.
+        to_basis: change of basis of the columns for the sums, or None.
 
     Raises:
         RankDeficientError: the sample's columns are linearly dependent.
@@ -74,12 +74,14 @@ def begun_from(
         fit = estimator.fit(x, y, weight)
     except RankDeficientError as error:
         raise RankDeficientError(
-            f"In the sample of {len(x)} rows that the fit begins from: {error} Or raise `pilot`, where the rows that "
-            "tell these columns apart are few."
+            f"In the sample of {len(x)} rows from which the fit starts: {error} If few rows distinguish these columns, "
+            "raise `pilot`."
         ) from None
     coef, kappa, log_d, log_bound = fit.coef_, fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
-    turned = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
-    point = StreamPoint(turned.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy())
+    transformed = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
+    point = StreamPoint(
+        transformed.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy()
+    )
     flat = slopes_pass([(x, y) if weight is None else (x, y, weight)], shape, point, curvature=True)
     total = _total_weight(weight, len(x), shape.m)
     exact = bool(fit.exact_fit_)

@@ -1,4 +1,4 @@
-"""How far a streamed fit has come between two passes: all that it needs to go on, whatever the number of rows."""
+"""State of a streamed fit between two passes; its size does not depend on the number of rows."""
 
 from __future__ import annotations
 
@@ -30,15 +30,19 @@ __all__ = ["Phase", "StreamChangedError", "StreamProgress"]
 Phase = Literal["range", "climb", "report", "done"]
 
 FORMAT = 1
-"""Of a saved state; another one is refused."""
+"""Version of a saved state; another version is refused."""
 
-_SAME, _SAME_OF_ROUGH = 1e-9, 1e-5
-"""Share of a sum's absolute values by which it may differ from pass to pass, in float64 and float32: rounding in
-another order is a hundredth of it, and a millionth of the rows in other values is seen."""
+_SAME = 1e-9
+"""Share of a column's absolute sum by which its sum may differ between float64 passes.
+
+Rounding in another order is a hundredth of it, and a millionth of the rows with other values exceeds it."""
+
+_SAME_FLOAT32 = 1e-5
+"""The same for a float32 pass."""
 
 
 class StreamChangedError(ValueError):
-    """The rows of a pass are not those that the fit began with."""
+    """A pass had other rows than the first pass."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +50,15 @@ class StreamProgress:
     """A fit between two passes.
 
     Attributes:
-        settings: what the fit was asked for, by name.
-        survey: of all rows.
-        begun: of the sample.
-        phase: what the next pass is for: the range of the residuals, the maximum, or the covariance at it; or "done".
-        passes: made so far.
-        log_bound: of the domain, (m,).
-        climb: to the maximum, once that has begun.
-        gaussian: a Gaussian density at least squares has been looked at.
-        converged: the maximum is one.
+        settings: parameters of the fit, by name.
+        survey: the survey of all rows.
+        begun: the pilot fit.
+        phase: purpose of the next pass: the range of the residuals, the maximum, or the covariance at it; or "done".
+        passes: number of passes made.
+        log_bound: log half-width of the domain, (m,).
+        climb: state of the maximisation, once it has begun.
+        gaussian: whether a Gaussian density at least squares has been tried.
+        converged: whether the maximum was reached.
     """
 
     settings: dict[str, Any]
@@ -69,14 +73,16 @@ class StreamProgress:
 
     @staticmethod
     def begin(settings: dict[str, Any], survey: Survey, begun: PilotFit) -> StreamProgress:
-        # a sample of all rows has had their range
+        # with a sample of all rows the range is known
         known = settings["bound"] is not None or begun.rows == survey.rows
         progress = StreamProgress(settings, survey, begun, "range", 1, begun.log_bound)
         return progress._climbing(begun.log_bound) if known else progress
 
     def likelihood(self) -> Likelihood:
-        turned = (
-            torch.eye(self.survey.shape.n, dtype=torch.float64) if self.survey.is_turned() else self.survey.to_coef()
+        transformed = (
+            torch.eye(self.survey.shape.n, dtype=torch.float64)
+            if self.survey.is_ill_conditioned()
+            else self.survey.to_coef()
         )
         return Likelihood(
             weight=self.survey.weight,
@@ -84,30 +90,30 @@ class StreamProgress:
             log_d_min=self.begun.log_d_min,
             free_kappa=self.begun.free_kappa,
             free_d=self.begun.free_d,
-            to_basis=turned,
+            to_basis=transformed,
             largest=float(self.survey.largest.max()),
-            single=self.survey.single and not self.survey.is_turned(),
+            single=self.survey.single and not self.survey.is_ill_conditioned(),
         )
 
     def point(self) -> StreamPoint:
-        """Where the next pass is made."""
+        """The point at which the next pass is made."""
         if self.climb is None:
             beta, kappa, log_d = self._in_basis(self.begun.coef), self.begun.kappa, self.begun.log_d
         else:
             beta, kappa, log_d = self.climb.trial.beta, self.climb.trial.kappa, self.climb.trial.log_d
-        to_coef, turned = self.survey.to_coef(), self.survey.is_turned()
+        to_coef, transformed = self.survey.to_coef(), self.survey.is_ill_conditioned()
         return StreamPoint(
-            coef=(beta if turned else to_coef @ beta).numpy(),
+            coef=(beta if transformed else to_coef @ beta).numpy(),
             kappa=kappa.numpy(),
             d=torch.exp(log_d).numpy(),
-            to_basis=to_coef.numpy() if turned else None,
+            to_basis=to_coef.numpy() if transformed else None,
         )
 
     def after_range(self, parts: list[Extremes]) -> StreamProgress:
-        """The domain is half the range of all rows' residuals, and no less than the sample's: its ten d are in that.
+        """Set the domain: half the range of all residuals, and at least the sample's, which includes ten of its d.
 
         Args:
-            parts: of the ranks, in their order.
+            parts: results of the ranks, in their order.
 
         Raises:
             StreamChangedError: the pass had other rows.
@@ -119,7 +125,7 @@ class StreamProgress:
         return replace(self, passes=self.passes + 1)._climbing(torch.log(bound))
 
     def after_slopes(self, sums: StreamSums, max_passes: int) -> StreamProgress:
-        """One step nearer to the maximum.
+        """Make one Newton step towards the maximum.
 
         Raises:
             StreamChangedError: the pass had other rows.
@@ -129,8 +135,7 @@ class StreamProgress:
         likelihood = self.likelihood()
         climb = self.climb.after(likelihood, sums)
         now = replace(self, passes=self.passes + 1, climb=climb)
-        # a fit through most values to rounding is at the limit of what can be said
-        # a fit through most values to rounding is at the limit of what can be said
+        # the precision of a fit through most values to rounding is limited
         near = climb.near or (self.begun.exact and len(climb.history) >= 8)
         if not near and now.passes < max_passes - 1:
             return now
@@ -143,7 +148,7 @@ class StreamProgress:
         return replace(now, climb=replace(climb, curvature=True, rough=False), phase="report", gaussian=True)
 
     def after_report(self, sums: StreamSums, max_passes: int) -> StreamProgress:
-        """A last step, by the Hessian that the report has with it; on with the climb where that is too long a one.
+        """Make a last step with the Hessian of the report pass; continue the maximisation if the step is too long.
 
         Raises:
             StreamChangedError: the pass had other rows.
@@ -152,52 +157,52 @@ class StreamProgress:
         self._refuse_other_sums(sums, self.climb)
         climb = self.climb.after(self.likelihood(), sums)
         head = float(2.0 * sums.qw.sum() / self.survey.weight.sum())
-        rested = self.begun.exact or climb.near or climb.gain <= 10.0 * NEAR * head
+        converged = self.begun.exact or climb.near or climb.gain <= 10.0 * NEAR * head
         now = replace(self, passes=self.passes + 1, climb=climb)
-        if rested or now.passes >= max_passes:
-            return replace(now, phase="done", converged=rested)
+        if converged or now.passes >= max_passes:
+            return replace(now, phase="done", converged=converged)
         return replace(now, phase="climb")
 
     def _refuse_other_sums(self, sums: StreamSums, climb: NewtonState) -> None:
         coef = self.survey.to_coef() @ climb.trial.beta
-        self.refuse_other_rows(int(sums.rows), sums.residual, coef, _SAME_OF_ROUGH if climb.rough else _SAME)
+        self.refuse_other_rows(int(sums.rows), sums.residual, coef, _SAME_FLOAT32 if climb.rough else _SAME)
 
     def refuse_other_rows(
         self, rows: int, residual: Float64[Tensor, " m"], coef: Float64[Tensor, " n"], same: float
     ) -> None:
-        """Refuse a pass whose rows are not those of the first.
+        """Refuse a pass whose rows differ from those of the first.
 
         Args:
-            rows: of the pass.
+            rows: number of rows of the pass.
             residual: sums of its weighted residuals.
-            coef: coefficients that these are of.
-            same: share of the sums of absolute values by which those of the same rows may differ.
+            coef: coefficients of these residuals.
+            same: tolerance as a share of the sums of absolute values.
 
         Raises:
-            StreamChangedError: they are others.
+            StreamChangedError: the rows differ.
         """
         survey, n = self.survey, self.survey.shape.n
         if rows != survey.rows:
             raise StreamChangedError(
-                f"Expected `batches` to give the same rows in every pass but got {rows}, after {survey.rows} in the "
-                "first; shuffling is fine, dropping a last batch or drawing rows anew is not."
+                f"Expected `batches` to yield the same rows in every pass but got {rows}, after {survey.rows} in the "
+                "first; shuffle if you like, but do not drop a last batch or redraw rows."
             )
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
-        # of a column's absolute values, by Cauchy and Schwarz at most
+        # upper bound of a column's sum of absolute values, by Cauchy-Schwarz
         size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
         size = size[:, n] + size[:, :n] @ coef.abs()
         wrong = ~((residual - expected).abs() <= same * size)
         if bool(wrong.any()):
             raise StreamChangedError(
-                "Expected `batches` to give the same values in every pass but got residuals that sum to "
+                "Expected `batches` to yield the same values in every pass but got residuals that sum to "
                 f"{float(residual[wrong][0]):.6g} where those of the first pass sum to "
-                f"{float(expected[wrong][0]):.6g}; leave out random transforms, and go on only with the data of the "
-                "state."
+                f"{float(expected[wrong][0]):.6g}; remove random transforms, and resume only with the data of the "
+                "saved state."
             )
 
     def _climbing(self, log_bound: Float64[Tensor, " m"]) -> StreamProgress:
         begun = self.begun
-        # the density of the tail stays as it is on a longer domain: exp(-1/κ) / bound
+        # keep the tail density exp(-1/κ) / bound unchanged on the longer domain
         longer = torch.where(begun.kappa > 0, begun.kappa, 1.0).reciprocal() + log_bound - begun.log_bound
         kappa = torch.where(begun.kappa > 0, longer.reciprocal(), 0.0) if begun.free_kappa else begun.kappa
         place = StreamParameters(self._in_basis(begun.coef), kappa, begun.log_d)
@@ -205,11 +210,11 @@ class StreamProgress:
         likelihood = now.likelihood()
         of_sample = replace(likelihood, weight=begun.weight)
         hessian = of_sample.hessian(place, StreamSums.of(begun.sums, self.survey.shape))
-        rough = likelihood.allows_rough(place) and begun.rows < self.survey.rows
+        rough = likelihood.allows_float32(place) and begun.rows < self.survey.rows
         return replace(now, climb=NewtonState(place, curvature=False, rough=rough, hessian=hessian, stale=True))
 
     def _gaussian(self, likelihood: Likelihood) -> tuple[StreamParameters, float]:
-        """The Gaussian density at weighted least squares, as in memory, and its mean negative log-likelihood."""
+        """Gaussian density at weighted least squares, as in memory, and its mean negative log-likelihood."""
         n = self.survey.shape.n
         triangle = self.survey.triangle.clone()
         triangle[..., :n] = triangle[..., :n] @ self.survey.to_coef()
@@ -233,19 +238,20 @@ class StreamProgress:
         return torch.linalg.solve(self.survey.to_coef(), coef.unsqueeze(-1)).squeeze(-1)
 
     def state_dict(self) -> dict[str, Any]:
-        """Numbers, texts and tensors, as ``torch.load(..., weights_only=True)`` reads them."""
+        """Return the state as numbers, texts and tensors, readable by ``torch.load(..., weights_only=True)``."""
         return {"format": FORMAT, **asdict(self)}
 
     @staticmethod
     def of(state: dict[str, Any]) -> StreamProgress:
-        """From :meth:`state_dict`.
+        """Restore from :meth:`state_dict`.
 
         Raises:
-            ValueError: it is no such state.
+            ValueError: not such a state.
         """
         if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise ValueError(
-                "Expected the state of a streamed fit of this version but got another thing; begin anew without it."
+                "Expected a state of StreamedMKCRegression, of this version, but got something else; start over without "
+                "it."
             )
         fields = {key: value for key, value in state.items() if key != "format"}
         survey, climb = dict(fields["survey"]), fields["climb"]
@@ -259,14 +265,14 @@ class StreamProgress:
         return StreamProgress(**fields)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state to a file, whole or not at all."""
+        """Write the state to a file atomically."""
         buffer = io.BytesIO()
         torch.save(self.state_dict(), buffer)
         write_atomically(path, buffer.getvalue(), overwrite=True)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> StreamProgress | None:
-        """The state in a file; None where there is no file.
+        """Read the state from a file; None if there is no file.
 
         Raises:
             ValueError: the file holds something else.
@@ -275,17 +281,17 @@ class StreamProgress:
             return None
         try:
             state = torch.load(path, weights_only=True)
-        except OSError:  # a file that may not be read is not a damaged one
+        except OSError:  # an unreadable file is not a damaged file
             raise
-        except Exception as error:  # torch has no one error for what it did not write
+        except Exception as error:  # torch raises various errors for foreign files
             raise ValueError(
-                f"Expected argument `checkpoint` to be a file of a streamed fit but {path} is none, or a damaged one; "
-                "choose another name."
+                f"Expected argument `checkpoint` to be a checkpoint of StreamedMKCRegression but {path} is not, or is "
+                "damaged; delete it to start over, or choose another name."
             ) from error
         return StreamProgress.of(state)
 
     def refuse_other_settings(self, settings: dict[str, Any]) -> None:
-        """Refuse to go on with a fit that was asked for with other parameters.
+        """Refuse to resume a fit that was made with other parameters.
 
         Raises:
             ValueError: they differ.
@@ -293,6 +299,6 @@ class StreamProgress:
         for name, value in settings.items():
             if self.settings.get(name) != value:
                 raise ValueError(
-                    f"Expected argument `{name}` of the fit that the state is of, {self.settings.get(name)!r}, but got "
-                    f"{value!r}; take that, or begin anew without the state."
+                    f"Expected argument `{name}` as in the saved state, {self.settings.get(name)!r}, but got {value!r}; "
+                    "use that value, or start over without the state."
                 )

@@ -1,7 +1,7 @@
-"""A uniform sample of rows, drawn while they stream by: those with the smallest of random keys.
+"""A uniform sample of rows from a stream: the rows with the smallest random keys.
 
-The keys are a row's by its number among all rows, so neither the sizes of batches nor, where every rank knows how many
-rows it has, the number of ranks changes which are drawn.
+A row's key depends on its number among all rows. The sample is therefore independent of batch sizes and, where every
+rank knows its number of rows, of the number of ranks.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ __all__ = ["Drawn", "Reservoir", "merged"]
 
 @dataclass(frozen=True)
 class Drawn:
-    """Rows with their keys and numbers, in the order of rows; columns are X, Y and, with weights, these."""
+    """Sampled rows with keys and row numbers, in row order; the columns are X, Y and, if given, weights."""
 
     keys: Float64[np.ndarray, " k"]
     numbers: Int64[np.ndarray, " k"]
     rows: Float64[np.ndarray, "k columns"]
 
     def smallest(self, size: int) -> Drawn:
-        """Those of the smallest keys."""
+        """The rows with the ``size`` smallest keys."""
         if len(self.keys) <= size:
             return self
         chosen = np.sort(np.argpartition(self.keys, size - 1)[:size])
@@ -36,13 +36,13 @@ class Drawn:
 
 
 class Reservoir:
-    """At most ``size`` rows, each of all rows as likely as another.
+    """A uniform sample of at most ``size`` rows.
 
     Args:
-        size: of the sample.
-        seed: of the keys.
-        first: the number of the rows before this rank's, where it is known.
-        rank: stands for it where it is not.
+        size: largest number of rows of the sample.
+        seed: seed of the keys.
+        first: number of rows on the ranks before this one, or None if unknown.
+        rank: this rank, which replaces ``first`` if that is unknown.
 
     Example:
         >>> from mkc_torch.linear.streaming._blocks import StreamBlock
@@ -64,7 +64,7 @@ class Reservoir:
         self._held = 0
 
     def add(self, block: StreamBlock) -> None:
-        """Look at the rows of a block."""
+        """Draw from the rows of a block."""
         count = block.Y.shape[-1]
         keys = self._random.random((count,))
         chosen = np.flatnonzero(keys < self._limit)
@@ -79,7 +79,7 @@ class Reservoir:
             self._shrink()
 
     def drawn(self) -> Drawn | None:
-        """The sample; None of no rows."""
+        """The sample; None if there were no rows."""
         if self._parts:
             self._shrink()
         return self._parts[0] if self._parts else None
@@ -92,7 +92,7 @@ class Reservoir:
 
 
 def merged(parts: list[Drawn], size: int) -> Drawn:
-    """The sample of all rows from those of parts of them, in the order of the parts."""
+    """Merge the samples of parts of the rows, in the order of the parts."""
     return _joined(parts).smallest(size)
 
 

@@ -1,4 +1,4 @@
-"""What a streamed fit found, from its last pass and the step that followed."""
+"""Results of a streamed fit, from its last pass and the step after it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["results"]
 
 
 def results(before: StreamProgress, progress: StreamProgress, report: Report) -> dict[str, Any]:
-    """The attributes of a fitted estimator by name.
+    """Return the attributes of a fitted estimator by name.
 
     Args:
-        before: where the fit stood at the last pass, at whose place its sums are.
-        progress: where it stands after it.
-        report: the sums of the last pass.
+        before: progress before the last pass; the sums of that pass are at its trial.
+        progress: progress after the last pass.
+        report: sums of the last pass.
     """
     assert before.climb is not None
     assert progress.climb is not None
@@ -48,12 +48,12 @@ def results(before: StreamProgress, progress: StreamProgress, report: Report) ->
 
 
 def covariance(before: StreamProgress, report: Report) -> Float64[Tensor, "n n"]:
-    """Sandwich covariance of the coefficients for independent rows, with N / (N - n) for what the fit has used."""
+    """Sandwich covariance of the coefficients for independent rows, with N / (N - n) for the degrees of freedom."""
     assert before.climb is not None
     survey, turn = before.survey, before.likelihood().to_basis
     n, to_coef = survey.shape.n, survey.to_coef()
     left = survey.used - n
-    if left <= 0:  # as many coefficients as values leave nothing to tell errors from
+    if left <= 0:  # with as many coefficients as values no residual is left to estimate the errors from
         return torch.full((n, n), torch.inf, dtype=torch.float64)
     curvature = torch.einsum("c,cij->ij", torch.exp(-2.0 * before.climb.trial.log_d), report.slopes.gram)
     inverse = torch.linalg.pinv(turn.mT @ curvature @ turn, hermitian=True)

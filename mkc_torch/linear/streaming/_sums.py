@@ -1,7 +1,7 @@
-"""Sums over rows that the likelihood, its gradient and its Hessian are made of: what one pass works out.
+"""Sums over rows from which the likelihood, its gradient and its Hessian are computed, in one pass.
 
 With ``w = exp(-κ z² / 2)`` the energy is ``(1 - w) / κ``, and each of its derivatives by κ and log d is a combination
-of the sums of 1, w, w r² and w r⁴. So a pass has a handful of operations on each residual r and one on each row.
+of the sums of 1, w, w r² and w r⁴. So a pass needs a few operations per residual r and one per row.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ if TYPE_CHECKING:
 __all__ = ["Extremes", "Report", "StreamPoint", "StreamSums", "range_pass", "report_pass", "slopes_pass"]
 
 LEAST_KAPPA = 1e-3
-"""1/σ² below which the derivatives by it are taken term by term: as differences of sums they would lose more than six
-of sixteen digits."""
+"""Least 1/σ² at which derivatives are differences of sums; below it they are summed term by term.
+
+Differences would lose more than six of sixteen digits there."""
 
 
 @dataclass(frozen=True)
 class StreamPoint:
-    """Where a pass is made: coefficients, κ = 1/σ² and d of each channel.
+    """The point of a pass: coefficients, κ = 1/σ² and d of each channel.
 
-    ``to_basis`` turns the columns, block by block, where they are so nearly dependent that sums of their products
-    would be of no use; the coefficients then are those of the columns it makes.
+    ``to_basis`` changes the basis of the columns, block by block, if they are so nearly dependent that sums of their
+    products lose their digits; the coefficients then refer to the new columns.
     """
 
     coef: Float64[np.ndarray, " n"]
@@ -45,16 +46,16 @@ class StreamPoint:
 
 @dataclass(frozen=True)
 class StreamSums:
-    """Sums over rows at a point, of each channel, as views of one flat tensor.
+    """Sums over rows at a point, per channel, as views of one flat tensor.
 
     Attributes:
-        rows: their number, a scalar.
-        residual: of the weighted residuals, by which the rows are known again, (m,).
-        energy, first, second: of the energy and of what its first and second derivatives by κ are, (m,).
-        qw, q2w: of w z²/2 and w z⁴/4, (m,).
-        score: of w r x, (m, n).
-        cubed: of w r³ x, (m, n); 0 unless the curvature is worked out.
-        gram: of w (1 - κ z²) x xᵀ, (m, n, n); 0 unless the curvature is worked out.
+        rows: number of rows, a scalar.
+        residual: sum of the weighted residuals, which identifies the rows, (m,).
+        energy, first, second: sums of the energy and of the terms of its first and second derivative by κ, (m,).
+        qw, q2w: sums of w z²/2 and w z⁴/4, (m,).
+        score: sum of w r x, (m, n).
+        cubed: sum of w r³ x, (m, n); 0 without curvature.
+        gram: sum of w (1 - κ z²) x xᵀ, (m, n, n); 0 without curvature.
     """
 
     rows: Tensor
@@ -95,10 +96,10 @@ def slopes_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint, *, cur
     """The sums of :class:`StreamSums` over this rank's rows, flat.
 
     Args:
-        batches: of this rank.
-        shape: of every batch.
-        point: where.
-        curvature: work out also what the Hessian is made of, which takes two to three times as long.
+        batches: batches of this rank.
+        shape: shape of every batch.
+        point: point of the pass.
+        curvature: compute the sums of the Hessian too, which takes two to three times as long.
     """
     adding = _GrowingSums(shape, point, curvature=curvature)
     for block in _in_basis(batches, shape, point):
@@ -107,15 +108,16 @@ def slopes_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint, *, cur
 
 
 class _GrowingSums:
-    """The sums of a pass while they grow, and memory for what is worked out of a block: new memory for each operation
-    would take as long as the operations."""
+    """Accumulates the sums of a pass in memory that all blocks share.
+
+    Allocation for every operation would take as long as the operations."""
 
     def __init__(self, shape: Shape, point: StreamPoint, *, curvature: bool, report: bool = False) -> None:
         self.flat = np.zeros(StreamSums.length(shape))
         self.meat, self.light, self._report = np.zeros((shape.n, shape.n)), 0, report
         into = StreamSums.of(torch.from_numpy(self.flat), shape)
         self._channels = self.flat[1 : 1 + 6 * shape.m].reshape(6, shape.m)
-        self._score, self._cubed, self._gram = (one.numpy() for one in (into.score, into.cubed, into.gram))
+        self._score, self._cubed, self._gram = (view.numpy() for view in (into.score, into.cubed, into.gram))
         self._point, self._curvature = point, curvature
         self._space = np.empty((5 + 2 * shape.n, 0))
 
@@ -158,7 +160,7 @@ class _GrowingSums:
             products = space[5 : 5 + len(x)]
             if self._report:
                 self._add_score(c, np.multiply(x, s * inverse, out=products), r2)
-            # the curvature's weight takes the place of r²
+            # the weight of the curvature replaces r²
             r2 *= -kappa * inverse
             r2 += 1.0
             r2 *= w
@@ -170,7 +172,7 @@ class _GrowingSums:
         self._channels[:, c] += (residual, energy, first, second, qw, q2w)
 
     def _add_score(self, c: int, score: Float64[np.ndarray, "n B"], r2: Float64[np.ndarray, " B"]) -> None:
-        """Each row's score, whose products with itself are summed when all its channels are in it."""
+        """Accumulate each row's score over its channels, for the sum of its outer products."""
         whole = self._space[-len(score) :, : score.shape[1]]
         np.copyto(whole, score) if c == 0 else np.add(whole, score, out=whole)
         exponent = 0.5 * float(self._point.kappa[c] / self._point.d[c] ** 2)
@@ -184,7 +186,7 @@ def _few_terms(
     inverse: float,
     w: Float64[np.ndarray, " B"],
 ) -> float:
-    """The sum of the energy; ``w`` gets the kernel's weight times the sample's."""
+    """Sum of the energy; writes the weight times the sample weight to ``w``."""
     np.multiply(r2, -0.5 * kappa * inverse, out=w)
     np.exp(w, out=w)
     if weight is not None:
@@ -200,16 +202,16 @@ def _all_terms(
     inverse: float,
     w: Float64[np.ndarray, " B"],
 ) -> tuple[float, float, float]:
-    """The sums of the energy and of its first and second derivative by κ; ``w`` gets the weights as above."""
+    """Sums of the energy and of its first and second derivative by κ; writes the weights to ``w`` as above."""
     own = np.ones_like(w) if weight is None else weight
     if kappa > 0.0:
-        error, share = (torch.from_numpy(np.ascontiguousarray(one)).unsqueeze(-1) for one in (r, own))
-        at = (torch.tensor([one], dtype=torch.float64) for one in (kappa, -0.5 * math.log(inverse)))
+        error, share = (torch.from_numpy(np.ascontiguousarray(array)).unsqueeze(-1) for array in (r, own))
+        at = (torch.tensor([number], dtype=torch.float64) for number in (kappa, -0.5 * math.log(inverse)))
         found = energy_derivatives(error, share, *at)
         np.exp(np.multiply(r * r, -0.5 * kappa * inverse, out=w), out=w)
         w *= own
         return float(found.value), -float(found.kappa), float(found.kappa_kappa)
-    # capped where its cube overflows
+    # limited, since its cube would overflow
     q = np.minimum(np.multiply(r * r, 0.5 * inverse, out=w), 1e100, out=w)
     own_q = own * q
     energy, first = float(own_q.sum()), 0.5 * float(np.dot(own_q, q))
@@ -220,7 +222,7 @@ def _all_terms(
 
 
 def _in_basis(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Iterator[StreamBlock]:
-    """The blocks of a pass, their columns turned where the point says so."""
+    """The blocks of a pass, in the basis of ``point`` if it has one."""
     for _, block in blocks(batches, shape):
         if point.to_basis is not None:
             block = replace(block, joined=np.concatenate([np.matmul(point.to_basis.T, block.X), block.Y[:, None]], 1))
@@ -229,12 +231,12 @@ def _in_basis(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Itera
 
 @dataclass(frozen=True)
 class Extremes:
-    """The residuals of rows that count, of one rank or of all.
+    """Residuals of the rows in use, of one rank or of all.
 
     Attributes:
-        rows: their number.
+        rows: number of rows.
         residual: sum of the weighted residuals, (m,).
-        high, low: the largest and the smallest residual of positive weight, (m,).
+        high, low: largest and smallest residual of positive weight, (m,).
     """
 
     rows: int
@@ -252,7 +254,7 @@ class Extremes:
 
 
 def range_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Extremes:
-    """The extremes of this rank's residuals; ``kappa`` and ``d`` of the point are of no use here."""
+    """Extremes of this rank's residuals; ``kappa`` and ``d`` of the point are not used."""
     nothing = np.full(shape.m, np.inf)
     found = Extremes(0, np.zeros(shape.m), -nothing, nothing)
     for block in _in_basis(batches, shape, point):
@@ -269,9 +271,9 @@ class Report:
     """Sums of the last pass, made at the solution.
 
     Attributes:
-        slopes: as in every pass, with the curvature.
-        meat: of the products of each row's score with itself, summed over its channels, (n, n).
-        light: values of a weight below 0.1, a scalar.
+        slopes: sums as in every pass, with curvature.
+        meat: sum of the outer products of the rows' scores, each summed over its channels, (n, n).
+        light: number of values with a weight below 0.1, a scalar.
     """
 
     slopes: StreamSums

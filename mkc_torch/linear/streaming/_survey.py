@@ -1,7 +1,7 @@
-"""The first pass: every value is checked, rows are counted and summed, their triangle is made and some are drawn.
+"""First pass: check every value, count and sum the rows, compute their triangle and draw a sample.
 
-The triangle of a channel is the R of a QR decomposition of [X y], rows times the roots of their weights. It is carried
-from block to block, so that it is as accurate as one of all rows at once, and says everything of least squares.
+The triangle of a channel is the R of a QR decomposition of [X y], rows times the roots of their weights. Updated from
+block to block, it is as accurate as a decomposition of all rows at once, and determines least squares.
 
 Demmel, Grigori, Hoemmen & Langou, "Communication-optimal parallel and sequential QR and LU factorizations", SIAM J.
 Sci. Comput. 34 (2012).
@@ -24,31 +24,33 @@ from mkc_torch.linear.streaming._reservoir import Reservoir
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Survey", "surveyed"]
+__all__ = ["Survey", "survey_rows"]
 
 NEARLY_DEPENDENT = 1e5
-"""Ratio of the singular values of the scaled columns above which they are turned in every block: sums of products of
-the columns as they are lose digits by its square, ten of sixteen here."""
+"""Ratio of the singular values of the scaled columns above which every block is transformed to an orthonormal basis.
+
+Sums of products of the original columns lose digits by its square, ten of sixteen here."""
 
 LEAST_PIVOT = 1e-3
-"""Of Cholesky's factor of the scaled products of a block's columns. Above it the products say as much as the rows, to
-ten digits; only blocks of nearly dependent columns, or of a target that they all but explain, need a QR decomposition,
-which takes five times as long."""
+"""Least pivot of the Cholesky factor of the scaled products of a block's columns.
+
+Above it the products are as accurate as the rows, to ten digits. Only blocks of nearly dependent columns, or of a
+target that the columns explain almost exactly, need a QR decomposition, which takes five times as long."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What one pass says of rows, of one rank or of all.
+    """Summary of the rows of one rank or of all ranks, from one pass.
 
     Attributes:
-        shape: of every batch.
-        rows: their number.
-        used: values of a positive weight.
-        triangle: of each channel's [X y], (m, n + 1, n + 1).
-        total: weighted sums of [x y], (m, n + 1), by which the rows are known again.
-        weight: sums of the weights, (m,).
-        largest: absolute values of Y, (m,).
-        single: all are of float32.
+        shape: shape of every batch.
+        rows: number of rows.
+        used: number of values with positive weight.
+        triangle: triangle of each channel's [X y], (m, n + 1, n + 1).
+        total: weighted sums of [x y], which identify the rows, (m, n + 1).
+        weight: sum of the weights, (m,).
+        largest: largest absolute value of Y, (m,).
+        single: whether all batches are float32.
     """
 
     shape: Shape
@@ -62,19 +64,19 @@ class Survey:
 
     @staticmethod
     def of_all(parts: list[Survey]) -> Survey:
-        """That of all ranks.
+        """Merge the surveys of all ranks.
 
         Raises:
-            ValueError: the ranks have other columns, or there is no value of positive weight in some channel.
+            ValueError: the ranks have different columns, or a channel has no value of positive weight.
             RankDeficientError: columns are linearly dependent.
         """
         if not parts:
-            raise ValueError("Expected argument `batches` to have rows but got none; there is nothing to fit.")
+            raise ValueError("Expected argument `batches` to have rows but got none; pass at least one batch.")
         shape = parts[0].shape
         if any(part.shape != shape for part in parts):
             raise ValueError(
                 f"Expected every rank to have the same columns, channels and weights but got "
-                f"{[part.shape for part in parts]}; give each rank rows of one table."
+                f"{[part.shape for part in parts]}; give each rank rows of the same table."
             )
         triangle = parts[0].triangle
         for part in parts[1:]:
@@ -104,7 +106,7 @@ class Survey:
         self.to_coef()
 
     def to_coef(self) -> Float64[Tensor, "n n"]:
-        """Takes coefficients in a basis in which the columns are orthonormal to those of the columns.
+        """Matrix that takes coefficients in an orthonormal basis to those of the columns.
 
         Raises:
             RankDeficientError: columns are linearly dependent.
@@ -116,16 +118,16 @@ class Survey:
         refuse_dependent(upper, scale, self.rows * self.shape.m)
         return torch.linalg.inv(upper) / scale.unsqueeze(-1)
 
-    def is_turned(self) -> bool:
-        """Whether the columns are so nearly dependent that they are turned in every block."""
+    def is_ill_conditioned(self) -> bool:
+        """Whether the columns are so nearly dependent that every block is transformed to an orthonormal basis."""
         n = self.shape.n
         stacked = self.triangle[:, :, :n].reshape(-1, n)
         singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
         return bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1])
 
 
-def surveyed(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
-    """The survey of this rank's rows, None of no rows; the reservoir gets to see each of them.
+def survey_rows(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
+    """Survey of this rank's rows, None without rows; the reservoir draws from the same rows.
 
     Raises:
         TypeError, ValueError: a batch is not like the first, a value is not finite, a weight is negative.
@@ -139,7 +141,7 @@ def surveyed(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
 
 
 class _GrowingSurvey:
-    """The sums of a survey while they grow."""
+    """Accumulates the sums of a survey."""
 
     def __init__(self, shape: Shape) -> None:
         m, k = shape.m, shape.n + 1
@@ -158,7 +160,7 @@ class _GrowingSurvey:
         weighted = self._space[: joined.size].reshape(joined.shape)
         own = np.ones((m, count)) if block.weight is None else block.weight
         total = np.matmul(joined, own[:, :, None])[:, :, 0]
-        # a sum says in a fraction of the time that no element is NaN or infinite
+        # checking the sums is much faster than checking every element for NaN and infinity
         if not np.isfinite(total).all() or own.min() < 0:
             refuse_bad_values(block)
         self._rows += count
@@ -185,7 +187,7 @@ class _GrowingSurvey:
 
 
 def _is_good(gram: Float64[np.ndarray, "m k k"]) -> bool:
-    """Whether Cholesky's factor of products of columns has ten digits; sums of such products have it too."""
+    """Whether the Cholesky factor of products of columns has ten digits; sums of such products then have them too."""
     size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
     if not (size > 0).all():
         return False
@@ -197,10 +199,10 @@ def _is_good(gram: Float64[np.ndarray, "m k k"]) -> bool:
 
 
 def refuse_bad_values(block: StreamBlock) -> None:
-    """Name the first value that is NaN or infinite, or the first negative weight.
+    """Raise an error that names the first NaN or infinite value, or the first negative weight.
 
     Raises:
-        ValueError: there is one.
+            ValueError: there is such a value.
     """
     for name, values in (("X", block.X), ("Y", block.Y), ("weight", block.weight)):
         if values is None:
@@ -214,7 +216,7 @@ def refuse_bad_values(block: StreamBlock) -> None:
         place = f", at {tuple(inside)} in it" if np.prod(values.shape[:-1]) > 1 else ""
         raise ValueError(
             f"Expected `{name}` to be {kind} but got {values[(*inside, row)]} in row {block.first + row} of batch "
-            f"{block.batch}{place}; leave that row out, or give it the weight 0 and a finite value."
+            f"{block.batch}{place}; drop that row, or give it the weight 0 and a finite value."
         )
 
 

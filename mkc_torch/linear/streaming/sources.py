@@ -1,4 +1,4 @@
-"""Tables on disk as batches that come again in every pass: memory-mapped arrays, and Parquet by row groups."""
+"""Tables on disk as batches that are read again in every pass: memory-mapped arrays, and Parquet by row groups."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 __all__ = ["MemmapBatches", "ParquetBatches", "from_memmap", "from_parquet"]
 
 _ROWS = 65_536
-"""Rows of a batch unless another number is asked for: half a megabyte of one column of float64."""
+"""Default number of rows of a batch: half a megabyte per float64 column."""
 
 
 class MemmapBatches:
-    """Batches of arrays that lie on disk or in memory, as :func:`from_memmap` makes them.
+    """Batches of arrays on disk or in memory; see :func:`from_memmap`.
 
     Attributes:
-        rows: of all batches.
-        first: the number of the first of them in the arrays.
+        rows: number of rows of all batches.
+        first: index of their first row in the arrays.
 
     Example:
         >>> batches = MemmapBatches(np.ones((5, 2)), np.ones(5), rows=4)
@@ -50,8 +50,8 @@ class MemmapBatches:
                 )
             if len(array) != len(X):
                 raise ValueError(
-                    f"Expected argument `{name}` of as many rows as `X`, {len(X)}, but got {len(array)}; they are the "
-                    "same samples."
+                    f"Expected argument `{name}` of as many rows as `X`, {len(X)}, but got {len(array)}; pass one row "
+                    "for each sample."
                 )
         self._step = checked_whole("rows", rows, 1, "65536 is usual")
         self.first, end = _share(len(X), shard)
@@ -71,21 +71,21 @@ def from_memmap(
     rows: int = _ROWS,
     shard: tuple[int, int] | None = None,
 ) -> MemmapBatches:
-    """Batches of arrays on disk, read anew in every pass.
+    """Return batches of arrays on disk, read again in every pass.
 
-    A table in one file is cut into X and Y by columns, ``from_memmap(table[:, :8], table[:, 8])``: side by side they
-    are read as one.
+    Split a table in one file into X and Y by columns, ``from_memmap(table[:, :8], table[:, 8])``: adjacent columns are
+    read together.
 
     Args:
         X: (N, n), or (N, m, n) for m channels; ``np.memmap``, ``np.load(path, mmap_mode="r")``, or an array.
         Y: (N,), or (N, m).
         weight: (N,) or (N, m), non-negative.
-        rows: of a batch.
-        shard: (rank, ranks) takes the rank's share of the rows, shares in a row one after the other; None takes all.
+        rows: number of rows of a batch.
+        shard: (rank, ranks) takes a rank's contiguous share of the rows; None takes all.
 
     Raises:
-        TypeError: no NumPy array.
-        ValueError: other numbers of rows, or no such shard.
+        TypeError: not a NumPy array.
+        ValueError: different numbers of rows, or no such shard.
 
     Example:
         >>> import tempfile
@@ -103,12 +103,12 @@ def from_memmap(
 
 
 class ParquetBatches:
-    """Batches of Parquet files, row group by row group, as :func:`from_parquet` makes them.
+    """Batches of Parquet files, row group by row group; see :func:`from_parquet`.
 
     Attributes:
-        rows: of all batches.
-        first: the number of the first of them in the files.
-        column_names: of X.
+        rows: number of rows of all batches.
+        first: index of their first row in the files.
+        column_names: column names of X.
 
     Example:
         >>> import tempfile, pyarrow
@@ -144,13 +144,13 @@ class ParquetBatches:
         self.rows = sum(count for _, _, count in self._mine)
 
     def _groups(self, path: str | os.PathLike[str]) -> list[tuple[int, int]]:
-        """Numbers of the row groups of a file, each with that of its rows."""
+        """Index and number of rows of each row group of a file."""
         with _opened(path) as file:
             arrow = _pyarrow()
             for name in self._columns:
                 if name not in file.schema_arrow.names:
-                    known = ", ".join(f"`{one}`" for one in file.schema_arrow.names)
-                    raise ValueError(f"Expected {path} to have a column `{name}` but got {known}; name one of these.")
+                    known = ", ".join(f"`{column}`" for column in file.schema_arrow.names)
+                    raise ValueError(f"Expected {path} to have a column `{name}` but got {known}; use one of these.")
                 kind = file.schema_arrow.field(name).type
                 if not (arrow.types.is_integer(kind) or arrow.types.is_floating(kind) or arrow.types.is_boolean(kind)):
                     raise TypeError(f"Expected column `{name}` of {path} to hold real numbers but got {kind}.")
@@ -166,7 +166,7 @@ class ParquetBatches:
                             yield self._arrays(part)
 
     def _arrays(self, part: Any) -> tuple[np.ndarray, ...]:
-        # a missing value is NaN, which the fit names by batch and row
+        # a missing value is NaN, which the fit reports by batch and row
         found = {name: part.column(name).to_numpy(zero_copy_only=False) for name in self._columns}
         found = {
             name: array if array.dtype == np.float32 else array.astype(np.float64) for name, array in found.items()
@@ -188,21 +188,20 @@ def from_parquet(
     rows: int = _ROWS,
     shard: tuple[int, int] | None = None,
 ) -> ParquetBatches:
-    """Batches of Parquet files, of which one batch at a time is in memory.
+    """Return batches of Parquet files; one batch at a time is in memory.
 
     Args:
-        path: of a file, or of several with the same columns.
-        inputs: names of the columns of X; for m channels a list of them for each channel.
-        targets: the name of the column of Y; for m channels a list of m.
-        weight: the name of the column of weights.
-        rows: of a batch at most; a batch ends with its row group too.
-        shard: (rank, ranks) takes the rank's share of the row groups, shares in a row one after the other; None takes
-            all.
+        path: path of a file, or of several files with the same columns.
+        inputs: column names of X; for m channels a list of names for each channel.
+        targets: column name of Y; for m channels a list of m names.
+        weight: column name of the weights.
+        rows: largest number of rows of a batch; a batch also ends with its row group.
+        shard: (rank, ranks) takes a rank's contiguous share of the row groups; None takes all.
 
     Raises:
         ImportError: pyarrow is not installed.
-        FileNotFoundError, ValueError, TypeError: no such file, no Parquet file, no such columns, columns of something
-            else than numbers, or no such shard.
+        FileNotFoundError, ValueError, TypeError: no such file, not a Parquet file, no such columns, columns that are
+            not numeric, or no such shard.
 
     Example:
         >>> import tempfile, pyarrow
@@ -219,36 +218,36 @@ def from_parquet(
 
 
 def _checked_columns(inputs: Any, targets: Any) -> list[list[str]]:
-    """Names of the columns of each channel."""
+    """Column names of each channel."""
     if isinstance(targets, str):
-        refuse_text("inputs", inputs, "a list of names of columns")
+        refuse_text("inputs", inputs, "a list of column names")
         channels = [list(inputs)]
     else:
-        refuse_text("targets", targets, "the name of a column, or a list of them")
-        if isinstance(inputs, str) or not all(isinstance(one, (list, tuple)) for one in inputs):
+        refuse_text("targets", targets, "a column name, or a list of column names")
+        if isinstance(inputs, str) or not all(isinstance(names, (list, tuple)) for names in inputs):
             raise TypeError(
                 f"Expected argument `inputs` to be a list of names for each of the {len(targets)} targets but got "
-                f"{format_value(inputs)}; one target is a name, targets={targets[0]!r}."
+                f"{format_value(inputs)}; a single target is a name, targets={targets[0]!r}."
             )
-        channels = [list(one) for one in inputs]
-        if len(channels) != len(targets) or len({len(one) for one in channels}) > 1:
+        channels = [list(names) for names in inputs]
+        if len(channels) != len(targets) or len({len(names) for names in channels}) > 1:
             raise ValueError(
                 f"Expected argument `inputs` to be {len(targets)} lists of equal length, one for each target, but got "
-                f"lengths {[len(one) for one in channels]}."
+                f"lengths {[len(names) for names in channels]}."
             )
     if not channels or not channels[0]:
-        raise ValueError("Expected argument `inputs` to name a column at least but got none.")
+        raise ValueError("Expected argument `inputs` to name at least one column but got none.")
     return channels
 
 
 def _share(count: int, shard: tuple[int, int] | None) -> tuple[int, int]:
-    """First and end of a rank's share of so many things in a row."""
+    """First and end index of a rank's contiguous share of ``count`` items."""
     if shard is None:
         return 0, count
-    good = isinstance(shard, (tuple, list)) and len(shard) == 2 and all(isinstance(one, int) for one in shard)
+    good = isinstance(shard, (tuple, list)) and len(shard) == 2 and all(isinstance(number, int) for number in shard)
     if not good or not 0 <= shard[0] < shard[1]:
         raise ValueError(
-            f"Expected argument `shard` to be (rank, ranks) with 0 <= rank < ranks but got {format_value(shard)}; it is "
+            f"Expected argument `shard` to be (rank, ranks) with 0 <= rank < ranks but got {format_value(shard)}; pass "
             "(dist.get_rank(), dist.get_world_size())."
         )
     rank, ranks = shard
@@ -259,7 +258,7 @@ def _pyarrow() -> Any:
     try:
         import pyarrow
     except ImportError as error:
-        raise ImportError("Parquet row groups are read by pyarrow; pip install 'mkc-torch[parquet]'.") from error
+        raise ImportError("Reading Parquet files needs pyarrow; run pip install 'mkc-torch[parquet]'.") from error
     return pyarrow
 
 
@@ -270,4 +269,4 @@ def _opened(path: str | os.PathLike[str]) -> Any:
     try:
         return ParquetFile(os.fspath(path), pre_buffer=False)
     except arrow.ArrowInvalid as error:
-        raise ValueError(f"{path}: this is no Parquet file, or a damaged one: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"{path} is not a Parquet file, or is damaged: {str(error).splitlines()[0]}") from error

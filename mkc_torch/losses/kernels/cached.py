@@ -1,4 +1,4 @@
-"""Launching a Triton kernel without the search for its compiled form, which takes most of the time of a small batch."""
+"""Launch of a Triton kernel without Triton's look-up of the compiled form, which dominates for small batches."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ __all__ = ["CachedKernel"]
 
 _INT32 = 2**31
 _BY_POSITION = tuple(int(part) for part in triton.__version__.split(".")[:2]) >= (3, 3)
-"""Whether a compiled kernel takes its constants among its arguments, as it does from Triton 3.3 on."""
+"""Whether a compiled kernel takes its constants as arguments: from Triton 3.3 on."""
 
 
 class CachedKernel:
-    """A Triton kernel whose compiled forms are kept by all that they are compiled for.
+    """A Triton kernel with a cache of its compiled forms.
 
-    Triton compiles for the dtypes and the alignment of pointers, for numbers that are 1, multiples of 16 or beyond 32
-    bits, and for constants. All of them are in the key here. Pointers are passed as numbers, which need no look-up.
+    Triton compiles a form for each combination of dtypes and alignment of pointers, of numbers that are 1, multiples of
+    16 or beyond 32 bits, and of constants. The key of the cache contains all of these. Pointers are passed as numbers,
+    which need no look-up.
 
     Args:
         kernel: a function under ``triton.jit`` whose parameters are tensors, then numbers, then constants.
@@ -32,7 +33,7 @@ class CachedKernel:
 
     @property
     def is_interpreted(self) -> bool:
-        """Whether Triton's interpreter runs it."""
+        """Whether Triton's interpreter runs the kernel."""
         return not isinstance(self.kernel, triton.JITFunction)
 
     def launch(
@@ -46,9 +47,9 @@ class CachedKernel:
         """Run the kernel on the device and the current stream of the first tensor.
 
         Args:
-            grid: programs along three axes.
-            tensors, numbers, constants: arguments of the kernel, in its order.
-            warps: warps of a program.
+            grid: number of programs along three axes.
+            tensors, numbers, constants: arguments of the kernel, in order.
+            warps: warps per program.
         """
         device = tensors[0].device
         if device.type == "cuda" and torch.cuda.current_device() != device.index:
@@ -57,14 +58,14 @@ class CachedKernel:
         if self.is_interpreted:
             self.kernel[grid](*tensors, *numbers, *constants, num_warps=warps)
             return None
-        addresses = [one.data_ptr() for one in tensors]
+        addresses = [tensor.data_ptr() for tensor in tensors]
         key = (
             device.index,
             warps,
             constants,
-            *[one.dtype for one in tensors],
+            *[tensor.dtype for tensor in tensors],
             *[address % 16 == 0 for address in addresses],
-            *[(one == 1, one % 16 == 0, one >= _INT32) for one in numbers],
+            *[(number == 1, number % 16 == 0, number >= _INT32) for number in numbers],
         )
         compiled = self._compiled.get(key)
         if compiled is None:

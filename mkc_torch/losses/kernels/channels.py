@@ -1,4 +1,4 @@
-"""The running state and the numbers of each channel: one program a channel."""
+"""Running state and numbers of each channel: one program per channel."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ TABLE = (
     "floor",
     "log_bandwidth",
 )
-"""Rows of the table that a pass over a batch needs, (14, m): those of ChannelTable, then the rest of ChannelState."""
+"""Rows of the table (14, m) for a pass over a batch: the fields of ChannelTable, then the rest of ChannelState."""
 
 
 @triton.jit
 def quantile(size, weight, LEVEL: tl.constexpr, WIDE: tl.constexpr):
-    """The least size up to which a share LEVEL of the weight lies, by bisection on the bits of the number."""
+    """Weighted quantile at LEVEL of non-negative sizes, by bisection on the bits of the number."""
     wanted = LEVEL * tl.sum(weight, 0)
     if WIDE:
         bits = size.to(tl.int64, bitcast=True)
@@ -57,7 +57,7 @@ def quantile(size, weight, LEVEL: tl.constexpr, WIDE: tl.constexpr):
 
 @triton.jit
 def load_rows(x, t, w, row, mask, channel, inner, so, sc, sk, wo, wc, wk, HAS_WEIGHT: tl.constexpr, like):
-    """Residuals, predictions and weights of rows of a batch; what does not count is 0."""
+    """Residuals, predictions and weights of rows of a batch; 0 where masked or not finite."""
     outer, k = row // inner, row % inner
     place = outer * so + channel * sc + k * sk
     prediction = tl.load(x + place, mask=mask, other=0.0).to(like)
@@ -73,7 +73,7 @@ def load_rows(x, t, w, row, mask, channel, inner, so, sc, sk, wo, wc, wk, HAS_WE
 
 @triton.jit
 def risk_of(influence, slope, share, step_of_initial, standardised, size):
-    """Estimated risk of one loss: variance and the square of the shrinkage beyond chance."""
+    """Estimated risk of a loss: variance plus the square of the shrinkage beyond chance."""
     slope = tl.maximum(tl.sum(slope * share, 0), 1e-3)
     mean = tl.sum(influence * share, 0)
     variance = tl.sum(influence * influence * share, 0) / (slope * slope)
@@ -100,9 +100,9 @@ def channel_kernel(
     LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, OWN_BOUND: tl.constexpr, OWN_FLOOR: tl.constexpr,
     NORMALIZE: tl.constexpr, WIDTHS: tl.constexpr, WIDTHS_PAD: tl.constexpr, NODES: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Update the running scale (SCALE) and the schedule (SCHEDULE) by a batch, and make the table (MAKE_TABLE).
+    """Update the running scale (SCALE) and the schedule (SCHEDULE) by a batch, and fill the table (MAKE_TABLE).
 
-    With PEEK the scale is not stored: channels that have had no batch take it from this one for the table alone.
+    With PEEK the scale is not stored: channels without a batch so far take it from this batch, for the table alone.
     """
     channel = tl.program_id(0)
     like = tl.float64 if WIDE else tl.float32
@@ -224,7 +224,7 @@ def channel_kernel(
     if MAKE_TABLE:
         row = tl.arange(0, 16)
         tl.store(table + row * m + channel, tl.zeros((16,), like), mask=row < 14)
-        tl.debug_barrier()  # what was stored above is loaded or stored again below
+        tl.debug_barrier()  # the rows stored above are loaded or stored again below
         if HAS_SCALE:
             if not (SCALE or PEEK):
                 own, wider = tl.load(log_scale + channel), tl.load(half_range + channel)

@@ -1,4 +1,4 @@
-"""One pass over a batch: values, gradients and the sums of each channel."""
+"""Pass over a batch: values, gradients and the sums of each channel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["elements_kernel", "finish_kernel", "rescale_kernel"]
 @triton.jit
 def finish(sum_network, sum_energy, sum_kappa, sum_d, weight, table, channel, mask, m, divisor,
            LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr, by_kappa, by_d):  # fmt: skip
-    """The share of each channel in the value, and the stored gradients by the raw parameters."""
+    """Contribution of each channel to the value; stores the gradients by the raw parameters."""
     total = sum_network + sum_energy
     if NORMALIZE:
         total += weight * tl.load(table + 4 * m + channel, mask=mask, other=0.0)
@@ -40,11 +40,11 @@ def walk(
     CURVE: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """The pass of one program, in the phase of the schedule that ANNEALED and INITIAL name; the likelihood has neither.
+    """The pass of a program. ANNEALED, INITIAL: whether that loss is used in this phase; the likelihood has neither.
 
-    Returns sums of each place of the tile: of the network's term, of the energy, of its derivatives by kappa and, times
-    -d, by d, and of the upstream gradients. The derivative by kappa is that of each element with CURVE; else a
-    difference of the other sums, which keeps its digits where no kappa is small.
+    Returns, for each place of the tile, the sums of the network term, of the energy, of its derivative by kappa, of -d
+    times its derivative by d, and of the upstream gradients. With CURVE the derivative by kappa is summed over
+    elements; without, it is computed from the other sums, which is accurate unless a kappa is small.
     """
     like = tl.float64 if WIDE else tl.float32
     m: tl.constexpr = CHANNELS
@@ -152,7 +152,7 @@ def walk(
         if SUMS:
             if LEARN_KAPPA and CURVE:
                 curve = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
-            # the upstream gradient of each element, less the divisor, which finish() has
+            # the upstream gradient of each element; finish() applies the divisor
             if HAS_WEIGHT and EACH:
                 part = weight * given
             elif HAS_WEIGHT:
@@ -188,7 +188,7 @@ def walk_by_kappa(
     LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """:func:`walk` with the derivative by kappa of each element, a third of the work, only where kappa is small."""
+    """:func:`walk`, with the derivative by kappa per element, a third of the work, only if a kappa is small."""
     if LEARN_KAPPA and SUMS and not WIDE:
         if least_kappa >= 0.1:
             sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
@@ -224,10 +224,9 @@ def elements_kernel(
 ):  # fmt: skip
     """Values of elements (WRITE_VALUES), gradients by the input (WRITE_SLOPES) and sums of each channel (SUMS).
 
-    UPSTREAM is 0 where the upstream gradient is 1, 1 where it is one number and 2 where each element has its own. The
-    columns of a tile are, by LAYOUT, 0: places within the one channel of a program; 1: channels; 2: channels of several
-    rows one after the other, all memory in one line. With FINISH the one program that there is makes the value and the
-    gradients by the raw parameters itself.
+    UPSTREAM: 0 if the upstream gradient is 1, 1 if it is a number, 2 if each element has its own. LAYOUT of a tile's
+    columns: 0, places within the single channel of a program; 1, channels; 2, channels of successive rows in contiguous
+    memory. With FINISH a single program also computes the value and the gradients by the raw parameters.
     """
     like = tl.float64 if WIDE else tl.float32
     m: tl.constexpr = CHANNELS
@@ -250,7 +249,7 @@ def elements_kernel(
     if ROBUST:
         low = tl.min(tl.load(table + 10 * m + channel, mask=channel < m, other=1.0), 0)
         high = tl.max(tl.load(table + 10 * m + channel, mask=channel < m, other=0.0), 0)
-        # most batches lie before or after the change from one loss to the other
+        # most batches are before or after the annealing, where a single loss is used
         if high <= 0.0:
             sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk_by_kappa(
                 least_kappa, x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk,
@@ -278,7 +277,7 @@ def elements_kernel(
     if SUMS:
         total_energy, total_network = tl.sum(sum_energy, 0), tl.sum(sum_network, 0)
         total_kappa, total_d, total_given = tl.sum(sum_kappa, 0), tl.sum(sum_d, 0), tl.sum(sum_weight, 0)
-        if LAYOUT == 0:  # the one channel of this program, in the first lane
+        if LAYOUT == 0:  # the single channel of this program, in the first lane
             total_energy = tl.where(lane == 0, tl.sum(total_energy, 0), 0.0)
             total_network = tl.where(lane == 0, tl.sum(total_network, 0), 0.0)
             total_kappa = tl.where(lane == 0, tl.sum(total_kappa, 0), 0.0)
@@ -328,7 +327,7 @@ def finish_kernel(
     ROBUST: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     GIVEN: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Add up the sums of all programs in a fixed order, and finish; ``value`` gets a share for each program."""
+    """Add up the sums of all programs in a fixed order and finish; ``value`` gets a summand per program."""
     like = tl.float64 if WIDE else tl.float32
     channel = tl.program_id(0) * BLOCK_COL + tl.arange(0, BLOCK_COL)
     known = channel < m
@@ -374,7 +373,7 @@ def rescale_kernel(
     slopes, by_kappa, by_d, upstream, count, m, programs,
     BLOCK: tl.constexpr, HAS_SLOPES: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr,
 ):  # fmt: skip
-    """Multiply stored gradients by the upstream gradient, in place; where that is 1 nothing is read."""
+    """Multiply stored gradients by the upstream gradient, in place; nothing is read if that is 1."""
     given = tl.load(upstream)
     if given != 1.0:
         if HAS_SLOPES:

@@ -1,4 +1,4 @@
-"""Where the losses enter the kernels: by an autograd function in eager code, by an operator in compiled code."""
+"""Forward passes of the losses by kernels: an autograd function in eager code, an operator in compiled code."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from mkc_torch.losses.kernels.sample_operators import operator_sample_loss
 __all__ = ["kernel_loss", "label_loss", "sample_loss", "takes_labels"]
 
 INT32 = 2**31
-"""Numbers that 32 bits hold."""
+"""Limit of counts in signed 32-bit integers."""
 
 
 def kernel_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
-    """The forward pass of a loss by kernels; by formulas under transforms, and where a weight wants a gradient."""
+    """Forward pass of an MKCLoss by kernels; by formulas under transforms, or if a weight requires a gradient."""
     axis = loss._checked_axis(input, target)
     own = loss._parameters  # attributes of modules take a microsecond each
     raw_kappa, raw_d = own.get("raw_kappa"), own.get("raw_d")
-    given = [one for one in (input, target, weight, raw_kappa, raw_d) if one is not None]
+    given = [entry for entry in (input, target, weight, raw_kappa, raw_d) if entry is not None]
     compiling = torch.compiler.is_compiling()
-    if not compiling and any(is_transformed(one) for one in given):
+    if not compiling and any(is_transformed(entry) for entry in given):
         return loss._computed(input, target, weight)
     if weight is not None:
         if weight.requires_grad:
             return loss._computed(input, target, weight)
         weight = checked_weight(weight, input, axis, cast=False)[0]
-    if compiling or any(type(one) is not Tensor and type(one) is not torch.nn.Parameter for one in given):
+    if compiling or any(type(entry) is not Tensor and type(entry) is not torch.nn.Parameter for entry in given):
         return operator_loss(loss, input, target, weight, axis)
     batch, work = prepared(loss, input, target, weight, axis)
     function: Any = EachFunction if loss.reduction == "none" else ReducedFunction
@@ -44,23 +44,23 @@ def kernel_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None)
 
 
 def sample_loss(loss: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, weight: Tensor | None) -> Tensor:
-    """The forward pass of a loss by kernels.
+    """Forward pass of a HeteroscedasticMKCLoss by kernels.
 
-    It takes the formulas under transforms, where a weight wants a gradient, and for a sigma or a d of another shape
-    than the input, one for many channels say.
+    The formulas are used under transforms, if a weight requires a gradient, and if sigma or d differs in shape from the
+    input, for example with one value for many channels.
     """
     axis = loss._checked_axis(input, target)
     loss._check_scales(input, sigma, d)
-    given = [one for one in (input, target, sigma, d, weight) if one is not None]
+    given = [entry for entry in (input, target, sigma, d, weight) if entry is not None]
     compiling = torch.compiler.is_compiling()
     same = sigma.shape == input.shape and d.shape == input.shape
-    # 32 bits count within one round of the channels
+    # indices within a cycle of the channels are 32-bit
     short = loss.bound.numel() == 1 or input.shape[axis:].numel() < 2**30
-    transformed = not compiling and any(is_transformed(one) for one in given)
+    transformed = not compiling and any(is_transformed(entry) for entry in given)
     if transformed or not (same and short) or (weight is not None and weight.requires_grad):
         return loss._computed(input, target, sigma, d, weight)
     own_weight = None if weight is None else checked_weight(weight, input, axis, cast=False)[0]
-    if compiling or any(type(one) is not Tensor and type(one) is not torch.nn.Parameter for one in given):
+    if compiling or any(type(entry) is not Tensor and type(entry) is not torch.nn.Parameter for entry in given):
         return operator_sample_loss(loss, input, target, sigma, d, own_weight, axis)
     with torch.no_grad():
         batch = arranged_samples(
@@ -72,7 +72,7 @@ def sample_loss(loss: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tens
 
 
 def takes_labels(loss: Any, input: object, target: object) -> bool:
-    """Whether the kernels compute such a batch: labels of rows (N, C). Others, and wrong ones, go to the formulas."""
+    """Whether the kernels compute this batch: labels of rows (N, C). The formulas compute or refuse other batches."""
     if not (isinstance(input, Tensor) and isinstance(target, Tensor)) or not input.is_floating_point():
         return False
     if input.dim() != 2 or input.numel() == 0 or target.shape != input.shape[:1]:
@@ -87,7 +87,7 @@ def takes_labels(loss: Any, input: object, target: object) -> bool:
 
 
 def label_loss(loss: Any, input: Tensor, target: Tensor) -> Tensor:
-    """The forward pass of a loss by kernels, of a batch that :func:`takes_labels`."""
+    """Forward pass of a GeneralizedCrossEntropyLoss by kernels, for a batch that :func:`takes_labels` accepts."""
     plain = type(target) is Tensor and type(input) in (Tensor, torch.nn.Parameter)
     if torch.compiler.is_compiling() or not plain:
         return operator_label_loss(loss, input, target)

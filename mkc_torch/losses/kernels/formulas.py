@@ -1,4 +1,4 @@
-"""What the kernels compute of an element and of a channel, as Triton functions."""
+"""Formulas of an element and of a channel as Triton functions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["energy", "energy_by_kappa", "initial", "log_partition"]
 
 @triton.jit
 def series(minus_x, WIDE: tl.constexpr):
-    """``(1 - exp(-x)) / x`` for 0 <= x <= 0.25, to the digits of float32 or, WIDE, of float64."""
+    """``(1 - exp(-x)) / x`` for 0 <= x <= 0.25, accurate to float32 or, with WIDE, to float64."""
     if WIDE:
         value = 1.0 / 39916800 + minus_x * (1.0 / 479001600)
         value = 1.0 / 3628800 + minus_x * value
@@ -47,11 +47,11 @@ def curve_series(minus_x, WIDE: tl.constexpr):
 
 @triton.jit
 def energy(z, kappa, inverse_kappa, WIDE: tl.constexpr):
-    """Energy of a standardised error, its derivative by it, -x = -kappa z² / 2, exp(-x) and z² / 2.
+    """Energy of a standardised error z, its derivative by z, -x = -kappa z² / 2, exp(-x) and z² / 2.
 
-    ``inverse_kappa`` is anything finite where kappa is 0.
+    ``inverse_kappa`` may be any finite number where kappa is 0.
     """
-    minus_x = (z * (-0.5 * kappa)) * z  # in this order 0 times a square that overflows is 0
+    minus_x = (z * (-0.5 * kappa)) * z  # this order gives 0 at kappa = 0, even where z² overflows
     inlier = tl.exp(minus_x)
     half = (0.5 * z) * z
     near = half * series(tl.maximum(minus_x, -0.25), WIDE)
@@ -61,7 +61,7 @@ def energy(z, kappa, inverse_kappa, WIDE: tl.constexpr):
 
 @triton.jit
 def energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE: tl.constexpr):
-    """Derivative of the energy by kappa, from what :func:`energy` returns."""
+    """Derivative of the energy by kappa, from the results of :func:`energy`."""
     near = -half * half * curve_series(tl.maximum(minus_x, -0.5), WIDE)
     far = (inlier * (1.0 - tl.maximum(minus_x, -1e4)) - 1.0) * (inverse_kappa * inverse_kappa)
     return tl.where(minus_x > -0.5, near, far)
@@ -69,7 +69,7 @@ def energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE: tl.constexpr):
 
 @triton.jit
 def initial(z, WIDE: tl.constexpr):
-    """The initial loss, which bends at 0.2 scales, and its derivative."""
+    """The initial loss, with sharpness 0.2 scales, and its derivative."""
     ratio = z * 5.0
     if WIDE:
         root = tl.sqrt(1.0 + ratio * ratio)
@@ -87,9 +87,9 @@ def initial(z, WIDE: tl.constexpr):
 
 @triton.jit
 def log_partition(kappa, length, rule, NODES: tl.constexpr):
-    """``log Z`` of one channel and its derivatives by kappa and by length, all in float64.
+    """``log Z`` of a channel and its derivatives by kappa and by length, all in float64.
 
-    ``rule`` has NODES nodes on [0, 1] and then as many weights: those of mkc_torch.density.normalizer.
+    ``rule`` has NODES nodes on [0, 1], then their weights: those of mkc_torch.density.normalizer.
     """
     lane = tl.arange(0, NODES)
     nodes, weights = tl.load(rule + lane), tl.load(rule + NODES + lane)

@@ -1,6 +1,6 @@
-"""What :class:`mkc_torch.GeneralizedCrossEntropyLoss` computes of integer labels by kernels.
+"""Forward and backward pass of :class:`mkc_torch.GeneralizedCrossEntropyLoss` on integer labels by kernels.
 
-A few labels take one launch forward, many three; backward there is one.
+The forward pass takes a single launch for few labels and three for many, the backward pass a single launch.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ __all__ = [
 ]
 
 TILE = 1024
-"""Logits of a tile of several rows."""
+"""Logits per tile of several rows."""
 
 WIDEST = 4096
-"""Classes of a row that a program holds; rows of more classes are read twice, the second time from the cache."""
+"""Classes per row that a program holds; longer rows are read twice, the second time from the cache."""
 
 BLOCK_OF_ROW = 2048
-"""Logits of a block of a wider row."""
+"""Logits per block of a longer row."""
 
 ALONE = 1 << 12
-"""Logits up to which one program makes the value alone."""
+"""Logits up to which a single program computes the value."""
 
 COUNTED_BY_EACH = 2048
-"""Labels whose weights each program adds up itself."""
+"""Labels up to which each program adds up the weights itself."""
 
 COUNTERS = 128
-"""Programs that add up the weights of more labels, a thousand at a time."""
+"""Programs that add up the weights of more labels, in blocks of 1024."""
 
 PROGRAMS_EACH = 32
-"""Programs for each multiprocessor."""
+"""Programs per multiprocessor."""
 
 _INT32 = 2**31
 
@@ -52,7 +52,7 @@ _COUNT, _LABELS = CachedKernel(count_kernel), CachedKernel(labels_kernel)
 
 
 class Labels(NamedTuple):
-    """A batch of logits without gaps, its labels, and the numbers of the loss."""
+    """Contiguous logits, their labels, and the parameters of the loss."""
 
     input: Tensor
     target: Tensor
@@ -67,7 +67,7 @@ class Labels(NamedTuple):
 
 
 def arranged_labels(input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor | None, ignore_index: int) -> Labels:
-    """A batch as the kernel walks through it; with copies where memory has gaps."""
+    """A batch in the kernel's memory layout; copied where it is not contiguous."""
     return Labels(input.contiguous(), target.contiguous(), kappa, weight, ignore_index)
 
 
@@ -76,7 +76,7 @@ def _power(count: int) -> int:
 
 
 def _counted(batch: Labels) -> Tensor | None:
-    """Sums of the weights of the labels, a few that the kernel adds up; None for few labels, of which it does all."""
+    """Partial sums of the labels' weights, for the kernel to add up; None for few labels, which it adds up itself."""
     rows, classes = batch.input.shape
     if rows <= COUNTED_BY_EACH:
         return None
@@ -101,15 +101,15 @@ def pass_over_labels(
     slopes: Tensor | None = None,
     sums: bool = False,
 ) -> Tensor | None:
-    """One pass over a batch that writes what it is given; the value () where ``sums`` is asked for.
+    """Run the kernel over a batch, and fill the given outputs. Returns the value () with ``sums``, else None.
 
     Args:
         batch: the batch.
         mean: whether sums and gradients are those of the mean.
-        upstream: gradient by the value, one number or one of each row; None for 1.
-        values: takes the value of each row.
-        slopes: takes the gradient by the logits.
-        sums: whether the value is wanted.
+        upstream: gradient by the value, a number or one per row; None means 1.
+        values: output, the value of each row.
+        slopes: output, the gradient by the logits.
+        sums: whether to compute the value.
     """
     rows, classes = batch.input.shape
     device, dtype = batch.input.device, batch.dtype
@@ -127,7 +127,7 @@ def pass_over_labels(
     tensors = (batch.input, batch.target, batch.weight, upstream, batch.kappa, counted, values, slopes, partial)
     _LABELS.launch(
         (programs, 1, 1),
-        [batch.kappa if one is None else one for one in tensors],
+        [batch.kappa if tensor is None else tensor for tensor in tensors],
         (rows, batch.ignore_index, 0 if counted is None else len(counted), programs),
         (
             classes, block_row, block_class, 0 if counted is None else COUNTERS,
@@ -157,22 +157,25 @@ def label_values(batch: Labels) -> Tensor:
 
 
 def label_slopes(batch: Labels, mean: bool, upstream: Tensor) -> Tensor:
-    """The gradient by the logits, times the upstream gradient before it is rounded."""
+    """The gradient by the logits, multiplied by the upstream gradient before rounding."""
     slopes = torch.empty_like(batch.input)
     pass_over_labels(batch, mean=mean, upstream=upstream, slopes=slopes)
     return slopes
 
 
 class LabelPass(NamedTuple):
-    """One forward pass: the loss, and the batch."""
+    """Loss and batch of a forward pass."""
 
     loss: Any
     batch: Labels
 
 
 class ReducedLabels(torch.autograd.Function):
-    """A sum or mean, whose gradient is made in the forward pass. That of float16, which a mean over many rows
-    underflows before a gradient scaler multiplies, is made in the backward pass."""
+    """A sum or mean, with the gradient computed in the forward pass.
+
+    In float16 the backward pass computes it: the gradient of a mean over many rows would underflow before a gradient
+    scaler multiplies it.
+    """
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, target: Tensor, work: LabelPass) -> Tensor:
@@ -187,14 +190,14 @@ class ReducedLabels(torch.autograd.Function):
         if torch.is_grad_enabled():
             return _by_formulas(ctx, grad), None, None
         found, ctx.found = ctx.found, None
-        if found is None:  # a second backward pass of one graph, or float16
+        if found is None:  # a second backward pass of the same graph, or float16
             return _slopes(ctx, grad), None, None
         rescale(found, None, None, grad)
         return found, None, None
 
 
 class EachLabel(torch.autograd.Function):
-    """The loss of each row. The gradient is made in the backward pass, which has to read the upstream gradient."""
+    """The loss of each row. The backward pass computes the gradient, because it needs the upstream gradient."""
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, target: Tensor, work: LabelPass) -> Tensor:
@@ -210,12 +213,12 @@ class EachLabel(torch.autograd.Function):
 
 
 def _slopes(ctx: Any, grad: Tensor) -> Tensor:
-    _ = ctx.saved_tensors  # torch refuses what was changed in place since
+    _ = ctx.saved_tensors  # torch raises if a saved tensor was changed in place
     return label_slopes(ctx.work.batch, ctx.work.loss.reduction == "mean", grad)
 
 
 def _by_formulas(ctx: Any, grad: Tensor) -> Tensor:
-    """A gradient that is a function of the logits, for a second derivative."""
+    """Differentiable gradient by the logits, for second derivatives."""
     input, target, _ = ctx.saved_tensors
     value = ctx.work.loss._computed(input, target)
     (found,) = torch.autograd.grad(value, input, grad.to(value.dtype), create_graph=True)

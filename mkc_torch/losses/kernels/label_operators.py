@@ -1,5 +1,5 @@
-"""The kernels of :class:`mkc_torch.GeneralizedCrossEntropyLoss` behind ``torch.library``, for compiled code and for
-tensors without memory."""
+"""Operators of ``torch.library`` for :class:`mkc_torch.GeneralizedCrossEntropyLoss`, for compiled code and for tensors
+without memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["operator_label_loss"]
 def reduced_label_loss(
     input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor | None, ignore_index: int, mean: bool, wanted: bool
 ) -> tuple[Tensor, Tensor]:
-    """Value, and the gradient by the logits; empty where it is not wanted, or of float16."""
+    """Value, and the gradient by the logits; empty if not needed, or in float16."""
     batch = arranged_labels(input, target, kappa, weight, ignore_index)
     value, slopes = reduce_labels(batch, mean, wanted and input.dtype != torch.float16)
     return value, input.new_empty(0) if slopes is None else slopes
@@ -40,7 +40,7 @@ def _without_gaps(input: Tensor) -> Tensor:
 def slopes_of_labels(
     input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor | None, ignore_index: int, mean: bool, grad: Tensor
 ) -> Tensor:
-    """The gradient by the logits, times the upstream gradient."""
+    """The gradient by the logits, multiplied by the upstream gradient."""
     return label_slopes(arranged_labels(input, target, kappa, weight, ignore_index), mean, grad)
 
 
@@ -86,7 +86,7 @@ values_of_labels.register_autograd(_backward, setup_context=_save)
 
 
 def operator_label_loss(loss: Any, input: Tensor, target: Tensor) -> Tensor:
-    """The forward pass of a loss through the operators."""
+    """Forward pass of a loss through the operators."""
     given = (input, target, loss.kappa, loss.weight, loss.ignore_index)
     if loss.reduction == "none":
         return values_of_labels(*given)

@@ -1,4 +1,4 @@
-"""Generalized cross-entropy of integer labels: a few rows of logits a tile, or one row in several blocks."""
+"""Generalized cross-entropy of integer labels: several rows of logits per tile, or a row in several blocks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["count_kernel", "labels_kernel"]
 
 @triton.jit
 def weight_of(target, class_weight, row, mask, ignored, like, CLASSES: tl.constexpr, HAS_WEIGHT: tl.constexpr):
-    """Labels and their weights: 0 where ignored, NaN for a label that there is none of."""
+    """Labels and their weights: 0 where ignored, NaN for a label out of range."""
     label = tl.load(target + row, mask=mask, other=0).to(tl.int64)
     counts = mask & (label != ignored)
     known = counts & (label >= 0) & (label < CLASSES)
@@ -28,7 +28,7 @@ def count_kernel(
     target, class_weight, counted, rows, ignored, programs,
     CLASSES: tl.constexpr, BLOCK: tl.constexpr, HAS_WEIGHT: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Sums of the weights of labels, one a program."""
+    """Sums of the weights of labels, one per program."""
     like = tl.float64 if WIDE else tl.float32
     sums = tl.zeros((BLOCK,), like)
     for block in range(tl.program_id(0), tl.cdiv(rows, BLOCK), programs):
@@ -47,12 +47,11 @@ def labels_kernel(
     HAS_WEIGHT: tl.constexpr, MEAN: tl.constexpr, UPSTREAM: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of rows (WRITE_VALUES), gradients by the logits (WRITE_SLOPES) and a share of the value a program (SUMS).
+    """Values of rows (WRITE_VALUES), gradients by the logits (WRITE_SLOPES), a summand of the value per program (SUMS).
 
-    The logits are (rows, CLASSES) without gaps; a tile holds BLOCK_ROW whole rows, or BLOCK_ROW is 1 and a row is
-    several tiles. The weight of a mean is the sum of ``parts`` numbers of ``counted``, at most PARTS, or for PARTS = 0
-    each program adds it up. UPSTREAM is 0 where the upstream gradient is 1, 1 where it is one number and 2 where each
-    row has its own.
+    The logits are (rows, CLASSES), contiguous. A tile holds BLOCK_ROW whole rows, or BLOCK_ROW is 1 and a row has
+    several tiles. The weight of a mean is the sum of ``parts`` numbers of ``counted``, at most PARTS; with PARTS = 0
+    each program adds it up. UPSTREAM: 0 if the upstream gradient is 1, 1 if it is a number, 2 if each row has its own.
     """
     like = tl.float64 if WIDE else tl.float32
     lane = tl.arange(0, BLOCK_CLASS)
@@ -79,7 +78,7 @@ def labels_kernel(
         row = tl.full((), BLOCK_ROW, tl.int64) * tile + tl.arange(0, BLOCK_ROW)
         mask = row < rows
         label, weight = weight_of(target, class_weight, row, mask, ignored, like, CLASSES, HAS_WEIGHT)
-        live = mask & (weight != 0)  # logits of other rows are not read
+        live = mask & (weight != 0)  # logits of masked rows are not read
         known = live & (weight == weight)
         first = row * CLASSES
         chosen = tl.load(x + first + label, mask=known, other=0.0).to(like)

@@ -1,4 +1,4 @@
-"""Launching the kernels: memory layout of a batch, block sizes, and one function for each kernel."""
+"""Kernel launches: memory layout of a batch, block sizes, and a function for each kernel."""
 
 from __future__ import annotations
 
@@ -35,35 +35,35 @@ TILE = 512
 """Elements of a tile of a large batch; of half precision where registers are few, twice as many."""
 
 MOST_COLUMNS = 64
-"""Channels of a tile, where they are last in memory."""
+"""Channels per tile, at most, if they are last in memory."""
 
 LINE_COLUMNS = 128
-"""Elements of a row of a tile where memory is one line."""
+"""Elements per row of a tile with LINE layout."""
 
 ALONE = 1 << 14
-"""Elements up to which one program finishes a batch alone."""
+"""Elements up to which a single program processes and finishes a batch."""
 
 PROGRAMS_EACH = 8
-"""Programs for each multiprocessor of a device in a pass over a large batch."""
+"""Programs per multiprocessor in a pass over a large batch."""
 
 PARTIAL_SUMS = 1 << 20
-"""Sums of programs and channels that are kept at most."""
+"""Partial sums (programs times channels), at most."""
 
 FINISHED = 4096
-"""Sums of a block that are added up at once."""
+"""Partial sums per block of the finishing kernel."""
 
 RESCALED = 4096
-"""Gradients of a block that are rescaled."""
+"""Gradients per block of the rescaling kernel."""
 
 WARPS = 4
-"""Warps of a program."""
+"""Warps per program."""
 
 _CHANNELS, _ELEMENTS = CachedKernel(channel_kernel), CachedKernel(elements_kernel)
 _FINISH, _RESCALE = CachedKernel(finish_kernel), CachedKernel(rescale_kernel)
 
 
 class Options(NamedTuple):
-    """What a loss computes, known before the values are."""
+    """Options of a loss that select the compiled form of a kernel."""
 
     follows: bool
     robust: bool
@@ -77,7 +77,7 @@ class Options(NamedTuple):
 
 
 class Running(NamedTuple):
-    """Buffers of a running scale and a schedule; None where a loss has none."""
+    """Buffers of a running scale and a schedule; None if the loss lacks them."""
 
     recent: Tensor | None = None
     position: Tensor | None = None
@@ -91,10 +91,10 @@ class Running(NamedTuple):
 
 
 class Arranged(NamedTuple):
-    """A batch seen as (outer, m, inner): its tensors, these sizes, and the strides of input and target, which agree."""
+    """A batch viewed as (outer, m, inner): tensors, sizes, and the common strides of input and target."""
 
     input: Tensor
-    """The input, or a copy whose memory has no gaps: gradients have its layout."""
+    """The input, or a contiguous copy; gradients have its layout."""
     target: Tensor
     weight: Tensor | None
     axis: int
@@ -112,7 +112,7 @@ class Arranged(NamedTuple):
 
 
 def arranged(input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Arranged:
-    """A batch as the kernels walk through it; with copies where its memory has gaps."""
+    """A batch in the kernels' memory layout; copied where it is not contiguous."""
     shape = input.shape
     m = shape[axis]
     contiguous = input.is_contiguous()
@@ -121,7 +121,7 @@ def arranged(input: Tensor, target: Tensor, weight: Tensor | None, axis: int) ->
     if not (contiguous and target.is_contiguous()) and target.stride() != input.stride():
         target = torch.empty_like(input, dtype=target.dtype).copy_(target)
     outer, inner = shape[:axis].numel(), shape[axis + 1 :].numel()
-    if not contiguous or m == 1:  # channels are last in memory; one channel is a line
+    if not contiguous or m == 1:  # channels are last in memory; a single channel is contiguous
         outer, inner = outer * inner, 1
     strides_of_weight = (0, 0, 0)
     if weight is not None:
@@ -131,13 +131,13 @@ def arranged(input: Tensor, target: Tensor, weight: Tensor | None, axis: int) ->
 
 
 def _view(values: Tensor, axis: int, size: tuple[int, int, int]) -> Tensor:
-    """A tensor of the shape of the batch as (outer, m, inner)."""
+    """A tensor of the batch's shape viewed as (outer, m, inner)."""
     return (values.movedim(axis, -1) if size[2] == 1 else values).reshape(size)
 
 
 @functools.cache
 def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The rule of the normaliser and the candidate bandwidths."""
+    """The normaliser's quadrature rule and the candidate bandwidths."""
     rule = torch.cat(head_rule_constants()).to(device, torch.float64)
     return rule, torch.tensor(BANDWIDTHS, dtype=torch.float32, device=device)
 
@@ -166,16 +166,16 @@ def make_table(
     table: bool = True,
     pace: tuple[int, float] = (0, 0.0),
 ) -> Float[Tensor, "14 m"]:
-    """Update what is asked for, and make the table of the numbers of each channel.
+    """Run the channel kernel: update the running state, and fill the table of the numbers of each channel.
 
     Args:
         batch: the batch.
-        running: buffers, changed in place where ``scale`` or ``schedule`` is asked for.
-        kappa, d: raw parameters where they are learned, else the numbers; None for a d that is the scale.
-        bound, floor: given ones, or None.
-        options: what the loss computes.
-        scale, schedule, table: what is to be done.
-        peek: whether channels without a batch so far take their scale from this one, for the table alone.
+        running: buffers, changed in place by ``scale`` and ``schedule``.
+        kappa, d: raw parameters if learned, else the numbers; None for a d that is the scale.
+        bound, floor: given values, or None.
+        options: options of the loss.
+        scale, schedule, table: whether to update the scale, update the schedule, fill the table.
+        peek: whether channels without a batch so far take their scale from this batch, for the table alone.
         pace: ``warmup_steps`` and ``anneal_step`` of the schedule.
     """
     outer, m, inner = batch.size
@@ -189,7 +189,7 @@ def make_table(
     range_rows = min(rows, RANGE_ROWS)
     _CHANNELS.launch(
         (m, 1, 1),
-        [numbers if one is None else one for one in tensors],
+        [numbers if tensor is None else tensor for tensor in tensors],
         (rows, m, inner, *batch.strides, *batch.weight_strides, range_rows, *pace),
         (
             length, max(_power(length), 16), min(max(_power(range_rows), 16), 1024),
@@ -204,7 +204,7 @@ def make_table(
 
 
 class Tiles(NamedTuple):
-    """How a pass over a batch is cut: block sizes, the layout of columns, programs along the batch and the channels."""
+    """Tiling of a pass over a batch: block sizes, the layout of columns, programs along the batch and the channels."""
 
     block_row: int
     block_col: int
@@ -215,7 +215,7 @@ class Tiles(NamedTuple):
 
 
 PLACES, CHANNELS, LINE = 0, 1, 2
-"""Columns of a tile: places within a channel, channels, or channels of several rows in one line of memory."""
+"""Layouts of a tile's columns: places within a channel; channels; channels of successive rows, contiguous."""
 
 
 def _tiles(batch: Arranged, *, robust: bool) -> Tiles:
@@ -257,18 +257,18 @@ def pass_over(
     by_d: Tensor | None = None,
     sums: bool = False,
 ) -> Tensor | None:
-    """One pass over a batch that writes what it is given; the value where ``sums`` is asked for.
+    """Run the elements kernel over a batch, and fill the given outputs. Returns the value with ``sums``, else None.
 
     Args:
         batch: the batch.
-        table: of :func:`make_table`.
-        options: what the loss computes.
-        weights, total_weight: sums of the weights of each channel, (m,), and of all; where there are weights.
-        upstream: gradient by the value, one number or one of each element, of any strides; None for 1.
-        values: takes the value of each element; laid out as the input, as ``slopes`` is.
-        slopes: takes the gradient by the input.
-        by_kappa, by_d: take the gradients by the raw parameters, (m,); with ``sums``.
-        sums: whether the sums of each channel are wanted.
+        table: result of :func:`make_table`.
+        options: options of the loss.
+        weights, total_weight: sums of the weights of each channel, (m,), and of all; None without weights.
+        upstream: gradient by the value, a number or one per element, of any strides; None means 1.
+        values: output, the value of each element; in the layout of the input, like ``slopes``.
+        slopes: output, the gradient by the input.
+        by_kappa, by_d: outputs, the gradients by the raw parameters, (m,); with ``sums``.
+        sums: whether to compute the sums of each channel.
     """
     outer, m, inner = batch.size
     device, dtype = table.device, table.dtype
@@ -290,7 +290,7 @@ def pass_over(
     )  # fmt: skip
     _ELEMENTS.launch(
         (tiles.programs, tiles.columns, 1),
-        [table if one is None else one for one in tensors],
+        [table if tensor is None else tensor for tensor in tensors],
         (tiles.outer, inner, *batch.strides, *batch.weight_strides, *strides, tiles.programs, count, elements),
         (
             m, tiles.block_row, tiles.block_col, tiles.layout,
@@ -306,7 +306,7 @@ def pass_over(
     sums_of = (partial, table, weights, total_weight, value, by_kappa, by_d)
     _FINISH.launch(
         (len(value), 1, 1),
-        [table if one is None else one for one in sums_of],
+        [table if entry is None else entry for entry in sums_of],
         (m, tiles.programs, outer * inner, count),
         (
             min(_power(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None,
@@ -318,16 +318,16 @@ def pass_over(
 
 
 def rescale(slopes: Tensor | None, by_kappa: Tensor | None, by_d: Tensor | None, upstream: Tensor) -> None:
-    """Multiply gradients by the upstream gradient, in place; where that is 1 nothing is read."""
+    """Multiply gradients by the upstream gradient, in place; nothing is read if that is 1."""
     count = 0 if slopes is None else slopes.numel()
-    m = max(0 if one is None else len(one) for one in (by_kappa, by_d))
+    m = max(0 if value is None else len(value) for value in (by_kappa, by_d))
     programs = max(1, min(-(-count // RESCALED), PROGRAMS_EACH * multiprocessors(upstream.device)))
     given = (slopes, by_kappa, by_d, upstream)
     _RESCALE.launch(
         (programs, 1, 1),
-        [upstream if one is None else one for one in given],
+        [upstream if value is None else value for value in given],
         (count, m, programs),
-        (RESCALED, *(one is not None for one in given[:3])),
+        (RESCALED, *(value is not None for value in given[:3])),
         WARPS,
     )
 

@@ -1,4 +1,4 @@
-"""What :class:`mkc_torch.MKCLoss` computes by kernels: two or three launches forward, one backward."""
+"""Forward and backward pass of :class:`mkc_torch.MKCLoss` by kernels: two or three launches, and a single launch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["gradients_of_each", "options_of", "prepared", "request_of", "updated
 
 
 class ChannelPass(NamedTuple):
-    """What one forward pass leaves for the backward pass beside the saved tensors."""
+    """State of a forward pass for its backward pass, in addition to the saved tensors."""
 
     weight: Tensor | None
     axis: int
@@ -39,7 +39,7 @@ class ChannelPass(NamedTuple):
     reduction: str
 
     def settings(self) -> LossSettings:
-        """What the differentiable formulas need, from the table."""
+        """Settings of the differentiable formulas, from the table."""
         rows = dict(zip(TABLE, self.table, strict=True))
         robust, has_scale = self.options.robust, self.options.has_scale
         state = ChannelState(
@@ -67,7 +67,7 @@ class ChannelPass(NamedTuple):
 
 
 def options_of(loss: Any) -> Options:
-    """What a loss computes in its present mode."""
+    """Options of a loss in its current mode."""
     scale, schedule = loss._running()
     robust = loss.training and schedule is not None
     buffers, parameters = loss._buffers, loss._parameters
@@ -88,7 +88,7 @@ def options_of(loss: Any) -> Options:
 def prepared(
     loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int
 ) -> tuple[Arranged, ChannelPass]:
-    """Update the running state in training, and make the table."""
+    """Update the running state in training, and fill the table."""
     options, batch = options_of(loss), arranged(input.detach(), target.detach(), weight, axis)
     request = request_of(loss, input.device)
     table = updated_table(batch, request, options, updates=request.updates and not in_backward())
@@ -98,7 +98,7 @@ def prepared(
 
 
 class KernelRequest(NamedTuple):
-    """What a loss asks the channel kernel for."""
+    """Arguments of the channel kernel from a loss."""
 
     kappa: Tensor
     d: Tensor | None
@@ -122,7 +122,7 @@ def request_of(loss: Any, device: torch.device) -> KernelRequest:
     if scale is not None:
         own = scale._buffers
         if own["log_scale"].device != device:
-            scale.to(device)  # a guide is no part of the loss, and is not moved with it
+            scale.to(device)  # a guide is not a submodule of the loss, and is not moved with it
         running = Running(*(own[name] for name in Running._fields[:6]))
         if schedule is not None:
             others = schedule._buffers
@@ -135,7 +135,7 @@ def request_of(loss: Any, device: torch.device) -> KernelRequest:
 
 
 def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, updates: bool) -> Tensor:
-    """The table of the numbers of each channel, after an update of the running state where that is asked for."""
+    """The table of the numbers of each channel, after an update of the running state if ``updates``."""
     running, numbers, pace = request.running, request[:4], request[-2:]
     scheduled = updates and running.share is not None
     if not (updates and is_distributed()):
@@ -149,7 +149,7 @@ def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, 
         own.copy_(joined)
     if scheduled:
         make_table(batch, running, *numbers, options, schedule=True, table=False, pace=pace)
-        own_schedule = [one for one in (running.log_bandwidth, running.share) if one is not None]
+        own_schedule = [value for value in (running.log_bandwidth, running.share) if value is not None]
         for own, mean in zip(own_schedule, average_over_processes(own_schedule), strict=True):
             own.copy_(mean)
     return make_table(batch, running, *numbers, options, pace=pace)
@@ -158,8 +158,8 @@ def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, 
 class ReducedFunction(torch.autograd.Function):
     """A sum or mean.
 
-    The forward pass makes the gradient by the input, but not of float16: there 1 over the number of elements underflows
-    before a gradient scaler multiplies, so the backward pass makes it.
+    The forward pass computes the gradient by the input. In float16 the backward pass does: 1 over the number of
+    elements would underflow before a gradient scaler multiplies it.
     """
 
     @staticmethod
@@ -179,7 +179,7 @@ class ReducedFunction(torch.autograd.Function):
             return (*_by_formulas(ctx, grad), None, None)
         found, ctx.found = ctx.found, None
         work, wants = ctx.work, ctx.needs_input_grad
-        if found is None:  # a second backward pass of one graph
+        if found is None:  # a second backward pass of the same graph
             found = reduce_batch(_again(ctx), work.table, work.options, wants_input=ctx.stores)[1:]
         slopes, by_kappa, by_d = found
         rescale(slopes, by_kappa, by_d, grad)
@@ -194,7 +194,7 @@ class ReducedFunction(torch.autograd.Function):
 
 
 class EachFunction(torch.autograd.Function):
-    """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
+    """The loss of each element. The backward pass computes the gradients, because it needs the upstream gradient."""
 
     @staticmethod
     def forward(
@@ -216,7 +216,7 @@ class EachFunction(torch.autograd.Function):
 
 
 def _again(ctx: Any) -> Arranged:
-    """The batch from what was saved: tensors that are not saved would not be freed with the graph."""
+    """The batch from the saved tensors; keeping it in ``ctx`` would not free it with the graph."""
     input, target, *_ = ctx.saved_tensors
     return arranged(input.detach(), target.detach(), ctx.work.weight, ctx.work.axis)
 
@@ -224,7 +224,7 @@ def _again(ctx: Any) -> Arranged:
 def gradients_of_each(
     batch: Arranged, table: Tensor, options: Options, grad: Tensor
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Gradients by the input and the raw parameters, of elements each of which has its own upstream gradient."""
+    """Gradients by the input and the raw parameters, with an upstream gradient per element."""
     slopes = torch.empty_like(batch.input)
     by_kappa = table.new_empty(batch.channels) if options.learn_kappa else None
     by_d = table.new_empty(batch.channels) if options.learn_d else None
@@ -244,9 +244,9 @@ def _handed_out(ctx: Any, slopes: Tensor | None) -> tuple[Tensor | None, Tensor 
 
 
 def _by_formulas(ctx: Any, grad: Tensor) -> list[Tensor | None]:
-    """Gradients that are functions of the inputs, for a second derivative."""
+    """Differentiable gradients, for second derivatives."""
     given = ctx.saved_tensors
     value = ctx.work.value_by_formulas(*given)
-    wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
+    wanted = [entry for entry, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
     found = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
     return [next(found) if wants else None for wants in ctx.needs_input_grad[:4]]

@@ -1,8 +1,8 @@
-"""The kernels behind ``torch.library``, for compiled code and for tensors without memory.
+"""Operators of ``torch.library`` for the kernels, for compiled code and for tensors without memory.
 
-The operators are opaque: how a batch is cut into programs depends on its size, so that code which the compiler looked
-into would be compiled anew for each size. The update of the running state is an operator that changes its arguments;
-what is differentiated is another one, which changes nothing.
+The operators are opaque to the compiler: the tiling depends on the size of the batch, and traced code would be compiled
+again for each size. The operator that updates the running state mutates its arguments; the differentiable operator is
+separate and mutates nothing.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ def reduced_loss(
     table: Tensor,
     options: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, and gradients by the input, raw_kappa and raw_d; those that are not made are empty."""
+    """Value, and gradients by the input, raw_kappa and raw_d; empty where not computed."""
     batch, stores = arranged(input, target, weight, axis), input.dtype != torch.float16
     value, *slopes = reduce_batch(batch, table, Options(*options), wants_input=stores)
-    by_input, by_kappa, by_d = (table.new_empty(0) if one is None else one for one in slopes)
+    by_input, by_kappa, by_d = (table.new_empty(0) if slope is None else slope for slope in slopes)
     return value, by_input, by_kappa, by_d
 
 
@@ -89,7 +89,7 @@ def _(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     slopes = table.new_empty(0) if input.dtype == torch.float16 else _like(input, axis)
     empty = table.new_empty
-    by_kappa, by_d = (empty(0) if one is None else table.new_empty(table.shape[1]) for one in (raw_kappa, raw_d))
+    by_kappa, by_d = (empty(0) if value is None else table.new_empty(table.shape[1]) for value in (raw_kappa, raw_d))
     return empty(()), slopes, by_kappa, by_d
 
 
@@ -115,7 +115,9 @@ def _backward(ctx: Any, grad: Tensor | None, *_: Any) -> tuple[Tensor | None, ..
     else:
         slopes = (slopes * grad).to(slopes.dtype)
     of_target = -slopes.to(ctx.target_dtype) if ctx.needs_input_grad[1] else None
-    of_kappa, of_d = (one * grad if wanted else None for one, wanted in zip((by_kappa, by_d), ctx.wanted, strict=True))
+    of_kappa, of_d = (
+        value * grad if wanted else None for value, wanted in zip((by_kappa, by_d), ctx.wanted, strict=True)
+    )
     return slopes, of_target, None, None, of_kappa, of_d, None, None
 
 
@@ -132,7 +134,7 @@ def slopes(
     grad: Tensor,
     options: Sequence[bool],
 ) -> Tensor:
-    """The gradient by the input of a reduced loss, times the upstream gradient before it is rounded."""
+    """The gradient of a reduced loss by the input, multiplied by the upstream gradient before rounding."""
     batch = arranged(input, target, weight, axis)
     found = torch.empty_like(batch.input)
     weights, total = weight_sums(batch, table.dtype)
@@ -183,9 +185,9 @@ def each_gradients(
     grad: Tensor,
     options: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients by the input, raw_kappa and raw_d of elements each with its own upstream gradient."""
+    """Gradients by the input, raw_kappa and raw_d, with an upstream gradient per element."""
     found = gradients_of_each(arranged(input, target, weight, axis), table, Options(*options), grad)
-    by_input, by_kappa, by_d = (table.new_empty(0) if one is None else one for one in found)
+    by_input, by_kappa, by_d = (table.new_empty(0) if value is None else value for value in found)
     return by_input, by_kappa, by_d
 
 
@@ -210,7 +212,7 @@ def _each_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     input, target, weight, table = ctx.saved_tensors
     found = torch.ops.mkc_torch.each_gradients(input, target, weight, ctx.axis, table, grad, ctx.options)
     of_target = -found[0].to(ctx.target_dtype) if ctx.needs_input_grad[1] else None
-    of_kappa, of_d = (one if wanted else None for one, wanted in zip(found[1:], ctx.wanted, strict=True))
+    of_kappa, of_d = (value if wanted else None for value, wanted in zip(found[1:], ctx.wanted, strict=True))
     return found[0], of_target, None, None, of_kappa, of_d, None, None
 
 
@@ -228,10 +230,10 @@ def _like(input: Tensor, axis: int, dtype: torch.dtype | None = None) -> Tensor:
 
 
 def operator_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Tensor:
-    """The forward pass of a loss through the operators."""
+    """Forward pass of a loss through the operators."""
     request, options = request_of(loss, input.device), list(options_of(loss))
     given = (input.detach(), target.detach(), weight, axis)
-    numbers = (None if one is None else one.detach() for one in request[:4])
+    numbers = (None if entry is None else entry.detach() for entry in request[:4])
     shape, dtype = (len(TABLE), loss.num_channels), _dtype(input, target, request.kappa)
     table = torch.empty(shape, dtype=dtype, device=input.device)
     channel_table(

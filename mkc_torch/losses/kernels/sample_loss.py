@@ -1,4 +1,4 @@
-"""What :class:`mkc_torch.HeteroscedasticMKCLoss` computes by kernels: one launch forward, one backward."""
+"""Forward and backward pass of :class:`mkc_torch.HeteroscedasticMKCLoss` by kernels, a single launch each."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from mkc_torch.losses.kernels.samples import rescale_samples_kernel, samples_ker
 __all__ = ["EachSample", "ReducedSamples", "SamplePass", "arranged_samples"]
 
 BLOCK = 512
-"""Elements of a block; a thread holds four, which are one load."""
+"""Elements per block; a thread holds four, a single load."""
 
 ALONE = 1 << 12
-"""Elements up to which one program makes the value alone."""
+"""Elements up to which a single program computes the value."""
 
 PROGRAMS_EACH = 32
-"""Programs for each multiprocessor, five of which run at once: so many that the last ones are a small share."""
+"""Programs per multiprocessor, of which five run at once: many, so that the last round is a small share."""
 
 SINGLE_NODES = 16
-"""Nodes of the quadrature in float32; float64 takes all 32."""
+"""Quadrature nodes in float32; float64 uses all 32."""
 
 _SAMPLES, _RESCALE = CachedKernel(samples_kernel), CachedKernel(rescale_samples_kernel)
 
 
 class Samples(NamedTuple):
-    """A batch of elements with their own sigma and d, all in the layout of the input, whose memory has no gaps."""
+    """A batch with sigma and d per element, all contiguous and in the layout of the input."""
 
     input: Tensor
     target: Tensor
@@ -43,7 +43,7 @@ class Samples(NamedTuple):
     bound: Tensor
     channels: int
     inner: int
-    """Elements from one channel to the next; for a bound of each channel."""
+    """Elements from a channel to the next; for a bound per channel."""
 
     @property
     def dtype(self) -> torch.dtype:
@@ -56,13 +56,13 @@ class Samples(NamedTuple):
 
 
 def computed_dtype(*given: Tensor) -> torch.dtype:
-    return torch.float64 if any(one.dtype == torch.float64 for one in given) else torch.float32
+    return torch.float64 if any(value.dtype == torch.float64 for value in given) else torch.float32
 
 
 def arranged_samples(
     input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, weight: Tensor | None, bound: Tensor, axis: int
 ) -> Samples:
-    """A batch as the kernel walks through it; with copies where tensors are laid out otherwise than the input."""
+    """A batch in the kernel's memory layout; tensors in another layout than the input are copied."""
     input = without_gaps(input, axis)
     weight = None if weight is None else alike(weight.expand(input.shape), input)
     channels, inner = 1, 1
@@ -73,7 +73,7 @@ def arranged_samples(
 
 
 def without_gaps(input: Tensor, axis: int) -> Tensor:
-    """The input, or a copy, with its channels last in memory or in their place."""
+    """The input, or a contiguous copy: channels last in memory, or in order."""
     return input if input.is_contiguous() or input.movedim(axis, -1).is_contiguous() else input.contiguous()
 
 
@@ -101,16 +101,16 @@ def pass_over_samples(
     slopes: Sequence[Tensor | None] = (None, None, None),
     sums: bool = False,
 ) -> Tensor | None:
-    """One pass over a batch that writes what it is given; the value () where ``sums`` is asked for.
+    """Run the kernel over a batch, and fill the given outputs. Returns the value () with ``sums``, else None.
 
     Args:
         batch: the batch.
         mean: whether sums and gradients are those of the mean.
         total_weight: sum of the weights, for a weighted mean.
-        upstream: gradient by the value, one number or one of each element; None for 1.
-        values: takes the value of each element.
-        slopes: take the gradients by input, sigma and d.
-        sums: whether the value is wanted.
+        upstream: gradient by the value, a number or one per element; None means 1.
+        values: output, the value of each element.
+        slopes: outputs, the gradients by input, sigma and d.
+        sums: whether to compute the value.
     """
     dtype, device, count = batch.dtype, batch.input.device, batch.input.numel()
     blocks = -(-count // BLOCK)
@@ -125,12 +125,12 @@ def pass_over_samples(
     )  # fmt: skip
     _SAMPLES.launch(
         (programs, 1, 1),
-        [rule if one is None else one for one in tensors],
+        [rule if tensor is None else tensor for tensor in tensors],
         (count, batch.inner, programs),
         (
             batch.channels, BLOCK, batch.bound.numel() > 1, batch.weight is not None, mean,
             0 if upstream is None else 2 if each else 1,
-            values is not None, *(one is not None for one in slopes), sums, len(rule) // 2, dtype == torch.float64,
+            values is not None, *(slope is not None for slope in slopes), sums, len(rule) // 2, dtype == torch.float64,
         ),
         WARPS,
     )  # fmt: skip
@@ -140,11 +140,11 @@ def pass_over_samples(
 
 
 def empty_slopes(batch: Samples, wanted: Sequence[bool]) -> list[Tensor | None]:
-    """Room for the gradients by input, sigma and d, in the layout of the input."""
+    """Empty tensors for the gradients by input, sigma and d, in the layout of the input."""
     given = (batch.input, batch.sigma, batch.d)
     return [
-        torch.empty_like(batch.input, dtype=one.dtype) if wants else None
-        for one, wants in zip(given, wanted, strict=True)
+        torch.empty_like(batch.input, dtype=value.dtype) if wants else None
+        for value, wants in zip(given, wanted, strict=True)
     ]
 
 
@@ -164,36 +164,36 @@ def samples_values(batch: Samples) -> Tensor:
 
 
 def samples_slopes(batch: Samples, mean: bool, wanted: Sequence[bool], upstream: Tensor) -> list[Tensor | None]:
-    """Gradients by input, sigma and d, times the upstream gradient before they are rounded."""
+    """Gradients by input, sigma and d, multiplied by the upstream gradient before rounding."""
     slopes = empty_slopes(batch, wanted)
     pass_over_samples(batch, mean=mean, total_weight=batch.total_weight, upstream=upstream, slopes=slopes)
     return slopes
 
 
 def rescale_samples(slopes: Sequence[Tensor | None], upstream: Tensor) -> None:
-    """Multiply gradients by the upstream gradient, in place; where that is 1 nothing is read."""
-    made = [one for one in slopes if one is not None]
+    """Multiply gradients by the upstream gradient, in place; nothing is read if that is 1."""
+    made = [slope for slope in slopes if slope is not None]
     if not made:
         return
     count, most = made[0].numel(), PROGRAMS_EACH * multiprocessors(upstream.device)
     programs = min(-(-count // RESCALED), most)
     _RESCALE.launch(
         (programs, 1, 1),
-        [*(upstream if one is None else one for one in slopes), upstream],
+        [*(upstream if slope is None else slope for slope in slopes), upstream],
         (count, programs),
-        (RESCALED, *(one is not None for one in slopes)),
+        (RESCALED, *(slope is not None for slope in slopes)),
         WARPS,
     )
 
 
 def has_float16(*given: Tensor) -> bool:
-    """Whether the gradients wait for the backward pass: a mean over many elements underflows float16 before a gradient
-    scaler multiplies."""
-    return any(one.dtype == torch.float16 for one in given)
+    """Whether a tensor is float16, so that the backward pass computes the gradients: those of a mean over many elements
+    would underflow before a gradient scaler multiplies them."""
+    return any(value.dtype == torch.float16 for value in given)
 
 
 class SamplePass(NamedTuple):
-    """One forward pass: the loss, the batch, and the weights as they were given."""
+    """Loss, batch and original weights of a forward pass."""
 
     loss: Any
     batch: Samples
@@ -201,7 +201,7 @@ class SamplePass(NamedTuple):
 
 
 class ReducedSamples(torch.autograd.Function):
-    """A sum or mean, whose gradients are made in the forward pass; those of float16 in the backward pass."""
+    """A sum or mean. The forward pass computes the gradients; in float16 the backward pass does."""
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: SamplePass) -> Tensor:
@@ -220,7 +220,7 @@ class ReducedSamples(torch.autograd.Function):
             return _by_formulas(ctx, grad)
         work: SamplePass = ctx.work
         found, ctx.found = ctx.found, None
-        if found is None or not ctx.stores:  # a second backward pass of one graph, or float16
+        if found is None or not ctx.stores:  # a second backward pass of the same graph, or float16
             found = samples_slopes(work.batch, work.loss.reduction == "mean", ctx.wanted, grad)
         else:
             rescale_samples(found, grad)
@@ -228,7 +228,7 @@ class ReducedSamples(torch.autograd.Function):
 
 
 class EachSample(torch.autograd.Function):
-    """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
+    """The loss of each element. The backward pass computes the gradients, because it needs the upstream gradient."""
 
     @staticmethod
     def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: SamplePass) -> Tensor:
@@ -254,9 +254,9 @@ def _handed_out(ctx: Any, slopes: Sequence[Tensor | None]) -> tuple[Tensor | Non
 
 
 def _by_formulas(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    """Gradients that are functions of the inputs, for a second derivative."""
+    """Differentiable gradients, for second derivatives."""
     given, work = ctx.saved_tensors, ctx.work
     value = work.loss._computed(*given, work.weight)
-    wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
+    wanted = [entry for entry, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
     found = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
     return *(next(found) if wants else None for wants in ctx.needs_input_grad[:4]), None

@@ -1,4 +1,4 @@
-"""The kernel of :class:`mkc_torch.HeteroscedasticMKCLoss` behind ``torch.library``, for compiled code and for tensors
+"""Operators of ``torch.library`` for :class:`mkc_torch.HeteroscedasticMKCLoss`, for compiled code and for tensors
 without memory."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def reduced_sample_loss(
     mean: bool,
     wanted: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, and gradients by input, sigma and d; those that are not wanted, or are of float16, are empty."""
+    """Value, and gradients by input, sigma and d; empty where not needed, or in float16."""
     batch = arranged_samples(input, target, sigma, d, weight, bound, axis)
     made = [wants and not has_float16(input, sigma, d) for wants in wanted]
     value, slopes = reduce_samples(batch, mean, made)
@@ -45,7 +45,7 @@ def reduced_sample_loss(
 def _without_none(batch: Samples, slopes: Sequence[Tensor | None]) -> tuple[Tensor, Tensor, Tensor]:
     own = (batch.input, batch.sigma, batch.d)
     by_input, by_sigma, by_d = (
-        like.new_empty(0) if one is None else one for one, like in zip(slopes, own, strict=True)
+        like.new_empty(0) if value is None else value for value, like in zip(slopes, own, strict=True)
     )
     return by_input, by_sigma, by_d
 
@@ -55,8 +55,8 @@ def _fake_slopes(
 ) -> tuple[Tensor, Tensor, Tensor]:
     layout = without_gaps(input, axis)
     by_input, by_sigma, by_d = (
-        torch.empty_like(layout, dtype=one.dtype) if wants else one.new_empty(0)
-        for one, wants in zip((input, sigma, d), wanted, strict=True)
+        torch.empty_like(layout, dtype=value.dtype) if wants else value.new_empty(0)
+        for value, wants in zip((input, sigma, d), wanted, strict=True)
     )
     return by_input, by_sigma, by_d
 
@@ -84,7 +84,7 @@ def sample_slopes(
     wanted: Sequence[bool],
     grad: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients by input, sigma and d, times the upstream gradient; those that are not wanted are empty."""
+    """Gradients by input, sigma and d, multiplied by the upstream gradient; empty where not needed."""
     batch = arranged_samples(input, target, sigma, d, weight, bound, axis)
     return _without_none(batch, samples_slopes(batch, mean, wanted, grad))
 
@@ -129,10 +129,10 @@ def _backward(ctx: Any, grad: Tensor | None, *_: Any) -> tuple[Tensor | None, ..
     wanted = [wants[0] or wants[1], wants[2], wants[3]]
     *batch, first, second, third = ctx.saved_tensors
     if ctx.stores:
-        slopes = [(one * grad).to(one.dtype) for one in (first, second, third)]
+        slopes = [(value * grad).to(value.dtype) for value in (first, second, third)]
     else:
         slopes = torch.ops.mkc_torch.sample_slopes(*batch, ctx.axis, ctx.mean, wanted, grad)
-    by_input, by_sigma, by_d = (one if wants else None for one, wants in zip(slopes, wanted, strict=True))
+    by_input, by_sigma, by_d = (value if wants else None for value, wants in zip(slopes, wanted, strict=True))
     by_target = -by_input.to(ctx.target_dtype) if wants[1] and by_input is not None else None
     own = (by_input if wants[0] else None, by_target, by_sigma, by_d)
     return *own, *[None] * (len(wants) - 4)
@@ -151,7 +151,7 @@ def operator_sample_loss(
     weight: Tensor | None,
     axis: int,
 ) -> Tensor:
-    """The forward pass of a loss through the operators."""
+    """Forward pass of a loss through the operators."""
     given = (input, target, sigma, d, weight, loss.bound, axis)
     if loss.reduction == "none":
         return sample_values(*given)

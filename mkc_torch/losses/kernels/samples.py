@@ -1,4 +1,4 @@
-"""One pass over a batch each of whose elements has its own bandwidth and scale, the normaliser included."""
+"""Pass over a batch with a bandwidth and a scale per element, normaliser included."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["rescale_samples_kernel", "samples_kernel"]
 def head_by_table(
     kappa, table, DEGREE: tl.constexpr = DEGREE, INTERVALS: tl.constexpr = INTERVALS, RATE: tl.constexpr = RATE
 ):  # fmt: skip
-    """Integral over the head and its derivative by kappa, in float32: mkc_torch.density.head_table has the table."""
+    """Integral over the head and its derivative by kappa, in float32, by the table of mkc_torch.density.head_table."""
     place = tl.rsqrt(1.0 + RATE * kappa)
     position = place * INTERVALS
     index = tl.minimum(tl.maximum(position, 0.0), INTERVALS - 1.0).to(tl.int32)
@@ -32,7 +32,7 @@ def head_by_table(
 def head_by_quadrature(
     kappa, inverse_kappa, tail, tail_slope, length, reach, rule, NODES: tl.constexpr, WIDE: tl.constexpr
 ):  # fmt: skip
-    """Integral over the head, its derivative by kappa, and it less ``length`` times its derivative by that."""
+    """Integral I over the head, dI/dkappa, and I - length dI/dlength."""
     end = tl.minimum(length, reach)
     integral, by_kappa = tl.zeros_like(kappa), tl.zeros_like(kappa)
     for node in range(NODES):
@@ -55,10 +55,10 @@ def samples_kernel(
     UPSTREAM: tl.constexpr, WRITE_VALUES: tl.constexpr, WRITE_INPUT: tl.constexpr, WRITE_SIGMA: tl.constexpr,
     WRITE_D: tl.constexpr, SUMS: tl.constexpr, NODES: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of elements (WRITE_VALUES), gradients by input, sigma and d, and a share of the value a program (SUMS).
+    """Values of elements (WRITE_VALUES), gradients by input, sigma and d, a summand of the value per program (SUMS).
 
-    All tensors of elements have one layout without gaps. UPSTREAM is 0 where the upstream gradient is 1, 1 where it is
-    one number and 2 where each element has its own. ``rule`` has NODES nodes of the quadrature, then as many weights.
+    All tensors of elements are contiguous in the same layout. UPSTREAM: 0 if the upstream gradient is 1, 1 if it is a
+    number, 2 if each element has its own. ``rule`` has NODES nodes of the quadrature, then their weights.
     """
     like = tl.float64 if WIDE else tl.float32
     lane = tl.arange(0, BLOCK)
@@ -81,7 +81,7 @@ def samples_kernel(
         own_sigma = tl.load(sigma + place, mask=mask, other=1.0).to(like)
         own_d = tl.load(d + place, mask=mask, other=1.0).to(like)
         if BOUND_EACH:
-            # within one round of the channels, for 32 bits divide faster
+            # within a cycle of the channels, because 32-bit division is faster
             round_of = inner * CHANNELS
             own = ((start % round_of).to(tl.int32) + lane) // inner % CHANNELS
             half_width = tl.load(bound + own).to(like)
@@ -93,13 +93,13 @@ def samples_kernel(
             counts = weight != 0
             error = tl.where(counts, error, 0.0)
             own_sigma = tl.where(counts, own_sigma, 1.0)
-        own_d = tl.where(counts, own_d, half_width * 0.015625)  # of what does not count the head ends before the domain
+        own_d = tl.where(counts, own_d, half_width * 0.015625)  # masked elements: the head ends before the domain
         inverse_sigma, inverse_d = 1.0 / own_sigma, 1.0 / own_d
         kappa, square = inverse_sigma * inverse_sigma, own_sigma * own_sigma
         inverse_kappa = tl.where(kappa > 0, square, 1.0)
         z = error * inverse_d
         value, influence, minus_x, inlier, half = energy(z, kappa, inverse_kappa, WIDE)
-        # of the normaliser
+        # the normaliser
         least = tl.minimum(square, 1000.0)
         tail = tl.exp(-square)
         tail_slope = tail * least * least
@@ -136,7 +136,7 @@ def samples_kernel(
             slope = influence * inverse_d * part
             tl.store(by_input + place, slope.to(by_input.dtype.element_ty), mask=mask)
         if WRITE_SIGMA:
-            # squares of halves are finite, so that 0 times them is 0
+            # the square of half is finite, so that 0 times it is 0
             half = tl.minimum(half, 1e150 if WIDE else 1.8e19)
             slope = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
             slope += (2.0 * half_width * tail_slope + own_d * head_slope) * inverse_partition
@@ -154,7 +154,7 @@ def rescale_samples_kernel(
     by_input, by_sigma, by_d, upstream, count, programs,
     BLOCK: tl.constexpr, HAS_INPUT: tl.constexpr, HAS_SIGMA: tl.constexpr, HAS_D: tl.constexpr,
 ):  # fmt: skip
-    """Multiply stored gradients by the upstream gradient, in place; where that is 1 nothing is read."""
+    """Multiply stored gradients by the upstream gradient, in place; nothing is read if that is 1."""
     given = tl.load(upstream)
     if given != 1.0:
         for block in range(tl.program_id(0), tl.cdiv(count, BLOCK), programs):

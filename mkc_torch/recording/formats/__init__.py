@@ -1,4 +1,4 @@
-"""File formats of recordings, one a file; a new one is a :class:`FileFormat` in ``FORMATS``."""
+"""File formats of recordings, a module each; add a :class:`FileFormat` to ``FORMATS`` for a new format."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET, ULOG, DATAFLASH, MCAP, ROSBAG1, ROSBAG2, MAT, HDF5, MDF)
-"""All formats; the ending of a file says which it is of."""
+"""All formats; the ending of a file selects the format."""
 
 _ADVICE = (
     ((".gz", ".zip", ".7z", ".bz2", ".xz", ".zst", ".tar", ".tgz", ".rar"), "unpack it first"),
@@ -43,11 +43,11 @@ _WRITTEN = "a .csv or a .parquet"
 
 
 def read_topics(path: Path) -> list[Topic]:
-    """The tables in a file, at least one; each has a column with a name.
+    """Read the tables of a file: at least one, each with at least one named column.
 
     Raises:
-        RecordingError: no file of a known kind, or a damaged or empty one.
-        FileNotFoundError: no such file.
+        RecordingError: the file is of an unknown kind, damaged or empty.
+        FileNotFoundError: there is no such file.
     """
     _check_file(path)
     topics = [topic for topic in _format_of(path).topics(path) if any(topic.table.names)]
@@ -57,17 +57,17 @@ def read_topics(path: Path) -> list[Topic]:
 
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
-    """The content of a table file of the kind that the ending of ``path`` says."""
+    """Encode columns as a table file in the format that the ending of ``path`` selects."""
     encoder = _format_of(path).encoded
     if encoder is None:
-        raise RecordingError(f"{path}: files ending in {path.suffix} are read and not written; write {_WRITTEN}.")
+        raise RecordingError(f"{path}: files ending in {path.suffix} can be read but not written; write {_WRITTEN}.")
     return encoder(path, columns)
 
 
 def check_ending(path: Path) -> None:
-    """Refuse a file whose ending says no kind of table that is written."""
+    """Raise a RecordingError if the ending does not select a format that can be written."""
     if _format_of(path).encoded is None:
-        raise RecordingError(f"{path}: files ending in {path.suffix} are read and not written; write {_WRITTEN}.")
+        raise RecordingError(f"{path}: files ending in {path.suffix} can be read but not written; write {_WRITTEN}.")
 
 
 def _format_of(path: Path) -> FileFormat:
@@ -78,17 +78,17 @@ def _format_of(path: Path) -> FileFormat:
     if path.suffix.lower() not in by_ending:
         kind = f"files ending in {path.suffix}" if path.suffix else "files without an ending"
         advice = next((what for endings, what in _ADVICE if path.suffix.lower() in endings), _RENAME)
-        raise RecordingError(f"{path}: {kind} are not known; {advice}; known are {', '.join(by_ending)}.")
+        raise RecordingError(f"{path}: {kind} are not known; {advice}; known endings: {', '.join(by_ending)}.")
     return by_ending[path.suffix.lower()]
 
 
 def _check_file(path: Path) -> None:
     markers = [file_format.marker for file_format in FORMATS if file_format.marker]
     if path.is_dir() and not any((path / marker).is_file() for marker in markers):
-        raise RecordingError(f"{path}: this is a folder; name the file in it.")
+        raise RecordingError(f"{path}: this is a folder; name a file in it.")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file.")
     if path.is_file() and path.stat().st_size == 0:
         text = path.suffix.lower() in CSV.endings
-        advice = "it must hold a header line and rows of numbers" if text else "record it anew, or copy it whole"
+        advice = "it must hold a header line and rows of numbers" if text else "record it again, or copy the whole file"
         raise RecordingError(f"{path}: the file is empty; {advice}.")

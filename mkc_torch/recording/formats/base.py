@@ -1,4 +1,4 @@
-"""What every file format has in common: a table as read, the format itself, and words about them."""
+"""Common types of all file formats: tables, topics, formats and errors; helpers for messages."""
 
 from __future__ import annotations
 
@@ -26,22 +26,29 @@ MISSING_WORDS = [
     "1.#ind",
 ]  # fmt: skip
 MISSING_SIGNS = ["-", "--", "---", "?"]
-"""What stands for a missing value among numbers; elsewhere it may be a name or a unit."""
+"""Signs that mark a missing value among numbers; elsewhere they may be a name or a unit."""
 
 MISSING = ["", "nan", "-nan", *MISSING_WORDS]
 """Cells without a value, in lower case; C's printf writes -nan."""
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be used; the sentence says which, why, and what to do."""
+    """A recording cannot be used; the message states which, why, and what to do."""
 
 
 class MissingColumnError(RecordingError):
-    """A column that a recording does not have."""
+    """A recording does not have this column."""
 
 
 class Table(NamedTuple):
-    """A file as read: column names as in the file (empty where there is none), polars Series, where rows came from."""
+    """A table as read.
+
+    Attributes:
+        names: column names of the file, empty for a column without a name.
+        series: polars series, a column each.
+        lines: for each row, its line or row number in the file.
+        line: the word for that number in messages: "line", "row" or "message".
+    """
 
     names: list[str]
     series: list[Any]
@@ -50,14 +57,14 @@ class Table(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """One of the tables of a file: a topic of a log, a group of measurements, or the whole of a CSV.
+    """A table of a file: a topic of a log, a group of measurements, or a whole CSV.
 
     Attributes:
-        name: as the file has it, such as ``sensor_mag_0`` or ``/imu/mag``; empty where a file holds one table alone.
-        table: its columns, among them the one that holds its own time.
-        units: of columns, as the format writes them, where it does: ``{"timestamp": "us", "x": "gauss"}``.
-        warnings: sentences about what was found or dropped while it was read.
-        restarts: rows, from 0, before which the file says that the logger started anew.
+        name: its name in the file, such as ``sensor_mag_0`` or ``/imu/mag``; empty if the file holds a single table.
+        table: its columns, including its time.
+        units: units that the format states, by column: ``{"timestamp": "us", "x": "gauss"}``.
+        warnings: what was found or dropped while the table was read.
+        restarts: row indices at which the logger restarted, by a repeated header.
     """
 
     name: str
@@ -68,13 +75,13 @@ class Topic(NamedTuple):
 
 
 class FileFormat(NamedTuple):
-    """A kind of file that holds tables; a new one is a file of this folder and an entry in ``FORMATS``.
+    """A file format; a new format is a module of this folder and an entry in ``FORMATS``.
 
     Attributes:
-        endings: of its files, in lower case.
-        topics: the tables in a file, at least one; raises :class:`RecordingError` where it is damaged or empty.
-        encoded: the content of a file with these columns; None of a format that is only read.
-        marker: a file that lies in a folder of this kind, where the recording is a folder.
+        endings: endings of its files, in lower case.
+        topics: reads the tables of a file, at least one; raises :class:`RecordingError` if it is damaged or empty.
+        encoded: encodes columns as the content of a file; None for a format that is only read.
+        marker: name of a file that identifies a folder of this format; empty if its recordings are files.
     """
 
     endings: tuple[str, ...]
@@ -84,6 +91,7 @@ class FileFormat(NamedTuple):
 
 
 def polars() -> Any:
+    """Import polars, or raise an ImportError that names its installation."""
     try:
         import polars as package
     except ImportError as error:
@@ -92,6 +100,7 @@ def polars() -> Any:
 
 
 def is_number(text: str) -> bool:
+    """Whether a text is a number; nan and other words for a missing value are not."""
     try:
         float(text)
     except ValueError:
@@ -100,10 +109,10 @@ def is_number(text: str) -> bool:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Column names for a sentence."""
+    """Join column names for a message."""
     return ", ".join(f"`{name}`" for name in names)
 
 
 def counted(count: int, what: str) -> str:
-    """A number of things for a sentence."""
+    """Format a count with its noun, in the singular or plural."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -1,4 +1,4 @@
-"""Columns of a table as numbers, and clear sentences about those that hold something else."""
+"""Convert the columns of a table to numbers, with errors and warnings about other cells."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["as_numbers", "missing_warning", "numbered", "renamed", "text_error"]
 def renamed(
     table: Table, columns: Mapping[str, str], path: Path | str, what: str = "file"
 ) -> tuple[dict[str, Any], list[str]]:
-    """The named columns under their new names, and sentences about those left out."""
+    """Rename columns; returns the named columns by new name, and warnings about columns left out."""
     warnings = []
     repeated = [name for name, count in Counter(table.names).items() if name and count > 1]
     if repeated:
@@ -52,7 +52,7 @@ def renamed(
 
 
 def as_numbers(series: Any) -> tuple[Any, Any]:
-    """A column as numbers, null where there is none, and where something else than a missing value stands there."""
+    """A column as numbers, null if missing, and the mask of cells that are neither numbers nor missing values."""
     package = polars()
     if series.dtype == package.String:
         text = series.str.strip_chars()
@@ -65,7 +65,7 @@ def as_numbers(series: Any) -> tuple[Any, Any]:
 
 
 def missing_warning(table: Table, name: str, series: Any) -> str | None:
-    """A sentence about words that stand for missing values, such as n/a; what is empty or nan speaks for itself."""
+    """A warning about words that were read as missing values, such as n/a; None for empty cells and nan only."""
     package = polars()
     if series.dtype != package.String:
         return None
@@ -77,12 +77,12 @@ def missing_warning(table: Table, name: str, series: Any) -> str | None:
     row = int(words.fill_null(False).arg_max())
     return (
         f'Column `{name}` holds "{cells[row]}" or the like {counted(count, "time")}, first at {table.line} '
-        f"{table.lines[row]}; it is read as no value."
+        f"{table.lines[row]}; it is read as a missing value."
     )
 
 
 def numbered(series: Any) -> tuple[Any, list[str]]:
-    """Labels as 0, 1, … in the order of appearance, and the labels."""
+    """Number labels 0, 1, … in the order of appearance; returns the numbers and the labels."""
     package = polars()
     cells = [None if cell is None else str(cell).strip() for cell in series.to_list()]
     numbers = {label: float(i) for i, label in enumerate(dict.fromkeys(cell for cell in cells if cell))}
@@ -90,11 +90,12 @@ def numbered(series: Any) -> tuple[Any, list[str]]:
 
 
 def text_error(path: Path, table: Table, name: str, series: Any, row: int, advice: str = "") -> RecordingError:
+    """The error about a cell that does not hold a number, with its line and a remedy."""
     text = str(series[row]).strip()
     kind = "text" if series.dtype == polars().String else "no number"
     if "," in text and is_number(text.replace(",", ".")):
         advice = "write decimals with a point"
-    advice = advice or "correct it, or write nan where there is no value"
+    advice = advice or "correct it, or write nan for a missing value"
     shown = text if len(text) <= 40 else text[:39] + "…"
     return RecordingError(
         f'{path}: column `{name}` holds {kind} at {table.line} {table.lines[row]}, "{shown}"; {advice}.'

@@ -1,4 +1,4 @@
-"""Compressed blocks of logs: of one that is cut off, what its beginning still says."""
+"""Decompress the blocks of logs; a block that is cut off is decompressed as far as possible."""
 
 from __future__ import annotations
 
@@ -10,25 +10,28 @@ from typing import Any
 __all__ = ["inflated"]
 
 _PIECE = 2**20
+"""Bytes decompressed at once."""
+
 _LARGEST_BLOCK = 2**30
-"""Bytes; loggers write blocks of one to a few MB. A block that unpacks to more is damage, or meant to do harm."""
+"""Largest decompressed block in bytes; loggers write blocks of a few MB, larger blocks are damaged or malicious."""
 
 
 def inflated(kind: str, data: bytes, size: int) -> bytes:
-    """The content of a block, up to where it can be read.
+    """Decompress a block as far as it can be read.
 
     Args:
-        kind: "" or "none", "bz2", "lz4" (a frame) or "zstd".
-        size: of the content in bytes, as the file says; no more is unpacked.
+        kind: compression: "" or "none", "bz2", "lz4" (a frame) or "zstd".
+        data: the compressed bytes.
+        size: size of the content in bytes according to the file, an upper bound of the result.
 
     Raises:
-        ValueError: a kind that is not known.
-        ImportError: the library for it is not installed.
+        ValueError: an unknown compression.
+        ImportError: the library for the compression is not installed.
     """
     if kind in ("", "none"):
         return data
     if kind not in _OPENED:
-        raise ValueError(f"it is compressed by {kind[:20]!r}, which is not read: write it anew without compression")
+        raise ValueError(f"it is compressed by {kind[:20]!r}, which cannot be read: write it again without compression")
     if size > _LARGEST_BLOCK:
         return b""
     parts: list[bytes] = []
@@ -40,7 +43,7 @@ def inflated(kind: str, data: bytes, size: int) -> bytes:
             left -= len(part)
     except ImportError:
         raise
-    except Exception:  # each library has errors of its own for data that are cut off: what came before them stays
+    except Exception:  # each library raises its own errors for truncated data; the parts before are kept
         return b"".join(parts)
     return b"".join(parts)
 
@@ -52,7 +55,7 @@ def _zstd(data: bytes) -> Any:
 
 
 class _Pieces:
-    """Reads from a decompressor that takes all its input at once."""
+    """A stream over a decompressor that takes all its input at once."""
 
     def __init__(self, decompressor: Any, data: bytes) -> None:
         self._decompressor, self._data = decompressor, data

@@ -1,4 +1,4 @@
-"""What is said, and kept, of files that are cut off or damaged: whole rows stay, and what was lost is told."""
+"""Errors and warnings about truncated or damaged files: complete rows are kept, and lost bytes are reported."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ __all__ = ["guarded", "lost_warning", "no_rows", "quiet_terminal", "with_warning
 
 @contextlib.contextmanager
 def guarded(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever a library raises over a damaged file into a :class:`RecordingError`, and keep it from printing.
+    """Convert any error of a library over a damaged file to a :class:`RecordingError`, and suppress its output.
 
-    The libraries raise what comes (``struct.error``, ``KeyError``, ``AssertionError``, …) where bytes are not as their
-    formats say, and warn or print on the way; none of it tells the user what to do. What is missing (a package, a file)
-    is passed on.
+    Libraries raise arbitrary errors (``struct.error``, ``KeyError``, ``AssertionError``, …) over invalid bytes, and
+    warn or print without a remedy. Errors about a missing package or file are passed on.
     """
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -28,18 +27,18 @@ def guarded(path: Path, what: str) -> Iterator[None]:
             yield
     except (RecordingError, ImportError, FileNotFoundError, IsADirectoryError, PermissionError):
         raise
-    except Exception as error:  # what each library raises over bytes that are damaged
+    except Exception as error:  # each library raises its own errors over damaged bytes
         lines = str(error).strip().splitlines()
-        said = f" ({lines[0][:120]})" if lines else ""
+        reason = f" ({lines[0][:120]})" if lines else ""
         raise RecordingError(
-            f"{path}: the {what} cannot be read: it is damaged, or of a variant that is not known{said}; "
-            "copy it anew from where it was recorded, or export it as CSV."
+            f"{path}: the {what} cannot be read: it is damaged, or of an unknown variant{reason}; "
+            "copy it again from where it was recorded, or export it as CSV."
         ) from error
 
 
 @contextlib.contextmanager
 def quiet_terminal() -> Iterator[None]:
-    """Keep compiled code, which writes past Python, from telling the terminal of damage that is told here otherwise."""
+    """Suppress the messages that compiled code writes to stderr; the damage is reported by other means."""
     try:
         kept = os.dup(2)
     except OSError:  # there is no terminal
@@ -55,7 +54,7 @@ def quiet_terminal() -> Iterator[None]:
 
 
 def lost_warning(lost: int, of: int, where: str, why: str = "hold no whole message") -> str:
-    """A sentence about bytes left out.
+    """A warning about bytes that are left out.
 
     Example:
         >>> lost_warning(12, 100, "the end")
@@ -65,11 +64,13 @@ def lost_warning(lost: int, of: int, where: str, why: str = "hold no whole messa
 
 
 def no_rows(path: Path, what: str, warnings: Sequence[str] = ()) -> RecordingError:
-    """The error about a file in which there is nothing to read."""
-    told = " ".join(["", *warnings[:3]])
-    return RecordingError(f"{path}: the {what} holds no rows of numbers; record it anew, or copy it whole.{told}")
+    """The error about a file without any rows of numbers."""
+    reasons = " ".join(["", *warnings[:3]])
+    return RecordingError(
+        f"{path}: the {what} holds no rows of numbers; record it again, or copy the whole file.{reasons}"
+    )
 
 
 def with_warnings(topics: Sequence[Topic], sentences: Sequence[str]) -> list[Topic]:
-    """The topics, each with what is to be said of the whole file."""
+    """Add the warnings of the whole file to each topic."""
     return [topic._replace(warnings=(*sentences, *topic.warnings)) for topic in topics]

@@ -1,4 +1,4 @@
-"""ArduPilot's DataFlash logs, binary (``.bin``) and text (``.log``)."""
+"""Read ArduPilot's DataFlash logs, binary (``.bin``) and text (``.log``)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ __all__ = ["DATAFLASH"]
 
 _WHAT = "ArduPilot DataFlash log"
 _HEAD = 4096
+"""Bytes at the beginning of a text log that are searched for a message definition."""
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a log, ``MAG`` or ``MAG[0]``, ``MAG[1]``, with ArduPilot's names of messages and columns.
+    """Read the topics of a log, ``MAG`` or ``MAG[0]``, ``MAG[1]``, with ArduPilot's names of messages and columns.
 
-    ``TimeUS`` is in µs, ``TimeMS`` of logs from before 2015 in ms. Units are what the log states (UNIT, MULT, FMTU);
-    where it states none, those that ArduPilot never changed: ``MAG`` in mGauss, ``IMU`` in rad/s and m/s².
+    ``TimeUS`` is in µs; ``TimeMS`` of logs from before 2015 is in ms. Units are those that the log states (UNIT, MULT,
+    FMTU), or else those that ArduPilot never changed: ``MAG`` in mGauss, ``IMU`` in rad/s and m/s².
 
     Raises:
-        RecordingError: no DataFlash log, or one without a whole message.
+        RecordingError: the file is not a DataFlash log, or has no complete message.
     """
     if begins_with(path, b"\xa3\x95"):
         reader = read_binary
     elif _is_text(path):
         reader = read_text
     else:
-        raise _no_log(path)
+        raise _not_a_log(path)
     with guarded(path, _WHAT):
         topics, warnings = reader(path)
     if not topics:
@@ -39,16 +40,16 @@ def read(path: Path) -> list[Topic]:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a line near the beginning defines a message; a header of the ground station may stand above it."""
+    """Whether a line near the beginning defines a message; a header of the ground station may precede it."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
     return b"\0" not in head and any(line.lstrip().startswith(b"FMT,") for line in head.splitlines())
 
 
-def _no_log(path: Path) -> RecordingError:
+def _not_a_log(path: Path) -> RecordingError:
     if path.suffix.lower() == ".log":
         return RecordingError(
-            f"{path}: this is no {_WHAT}: no line near its beginning defines a message (FMT, …); "
+            f"{path}: this is not an {_WHAT}: no line near its beginning defines a message (FMT, …); "
             "if it is a table, rename it to end in .csv."
         )
     return wrong_format_error(path, _WHAT)

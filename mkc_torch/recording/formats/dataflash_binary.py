@@ -1,8 +1,7 @@
-"""The messages of a binary ArduPilot DataFlash log (``.bin``).
+"""Read the messages of a binary ArduPilot DataFlash log (``.bin``).
 
-Own code, not pymavlink's: that reads message by message, drops in silence all that follows a message of a kind it does
-not know, writes a line to the terminal for each byte that it passes over, and brings 90 MB of code for telemetry. It
-is the oracle of the tests.
+This does not use pymavlink, which reads message by message, silently drops everything after a message of an unknown
+kind, prints a line for each skipped byte, and brings 90 MB of telemetry code. The tests compare with pymavlink.
 """
 
 from __future__ import annotations
@@ -24,11 +23,17 @@ __all__ = ["read_binary"]
 _MAGIC = b"\xa3\x95"
 _FMT = 0x80
 _FILLING = (b"\x00", b"\xff")
-"""What erased pages at a log's end hold."""
+"""Bytes of erased pages at the end of a log."""
 
 
 class _Messages(NamedTuple):
-    """Where the messages of each kind begin; a kind that is defined anew differently is another."""
+    """The offsets of the messages.
+
+    Attributes:
+        found: message number, format and offsets in bytes; a redefined number has a separate entry.
+        lost: number of bytes that belong to no message.
+        last_whole: offset in bytes at which the last complete message ends.
+    """
 
     found: list[tuple[int, MessageFormat, array[int]]]
     lost: int
@@ -36,9 +41,9 @@ class _Messages(NamedTuple):
 
 
 def read_binary(path: Path) -> tuple[list[Topic], list[str]]:
-    """The topics of a log that begins as one does, and what was lost of it.
+    """Read the topics of a log, and warnings about its lost parts.
 
-    The file is mapped, not read; memory is twice what its measurements take.
+    The file is memory-mapped; the memory needed is twice the size of its measurements.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         messages = _walk(content)
@@ -62,7 +67,7 @@ def read_binary(path: Path) -> tuple[list[Topic], list[str]]:
         warnings.append(lost_warning(messages.lost, size, where))
     unreadable = sorted({message.name for _, message, found in columns if not found})
     if unreadable:
-        warnings.append(f"The log does not say how {listed(unreadable)} are laid out; these messages are left out.")
+        warnings.append(f"The log does not define the layout of {listed(unreadable)}; these messages are left out.")
     return topics, warnings
 
 
@@ -77,7 +82,7 @@ def _walk(content: mmap.mmap) -> _Messages:
         kind = content[place + 2]
         length = lengths[kind]
         end = place + length
-        # after damage the two bytes of a header may stand in a measurement: what follows must be a header too
+        # after damage the two header bytes may be part of a measurement: another header must follow
         whole = length and end <= size and content[place : place + 2] == _MAGIC
         if whole and (in_step or end == size or content[end : end + 2] == _MAGIC):
             here = places[kind]
@@ -87,8 +92,8 @@ def _walk(content: mmap.mmap) -> _Messages:
                 number = content[place + 3]
                 if formats.get(number) != new and number != _FMT:
                     formats[number], lengths[number] = new, new.length
-                    places[number] = again = array("Q")
-                    found.append((number, new, again))
+                    places[number] = offsets = array("Q")
+                    found.append((number, new, offsets))
             place = last_whole = end
             in_step = True
             continue
@@ -99,11 +104,11 @@ def _walk(content: mmap.mmap) -> _Messages:
     lost += size - place
     if content[last_whole:].strip(_FILLING[0]) == b"" or content[last_whole:].strip(_FILLING[1]) == b"":
         lost -= size - last_whole
-    return _Messages([one for one in found if one[2]], lost, last_whole)
+    return _Messages([entry for entry in found if entry[2]], lost, last_whole)
 
 
 def _columns(content: mmap.mmap, message: MessageFormat, places: array[int]) -> dict[str, np.ndarray]:
-    """The columns of a kind's messages; none where its layout is not known."""
+    """The columns of the messages of a kind; empty if its layout is unknown."""
     layout = message.dtype
     if not layout.itemsize:
         return {}
@@ -114,7 +119,7 @@ def _columns(content: mmap.mmap, message: MessageFormat, places: array[int]) -> 
     for begin in range(0, len(begins), step):
         block = begins[begin : begin + step, None] + np.arange(layout.itemsize)
         rows[begin : begin + step] = body[block]
-    del body  # a map cannot be closed while it is looked at
+    del body  # the memory map cannot be closed while an array refers to it
     return message.numbers(rows.view(layout)[:, 0])
 
 

@@ -1,6 +1,6 @@
-"""Messages of ArduPilot's DataFlash logs: what their format letters mean, their units, and their topics.
+"""Message formats of ArduPilot's DataFlash logs: layouts by format letters, and units.
 
-Source: ArduPilot, libraries/AP_Logger/LogStructure.h (letters of formats, UNIT, MULT, FMTU) and README.md; so are the
+Source: ArduPilot, libraries/AP_Logger/LogStructure.h (letters of formats, UNIT, MULT, FMTU) and README.md, also for the
 units of logs from before 2018, which do not state them.
 """
 
@@ -16,13 +16,13 @@ __all__ = ["MESSAGE_FORMAT", "MessageFormat", "instance_column", "message_format
 
 
 class MessageFormat(NamedTuple):
-    """How the rows of one kind of message are laid out.
+    """The layout of a kind of message.
 
     Attributes:
-        name: of the message, such as ``MAG``.
-        letters: one for each column.
-        columns: their names.
-        length: of a message, in bytes, its three of header counted.
+        name: name of the message, such as ``MAG``.
+        letters: a format letter for each column.
+        columns: names of the columns.
+        length: length of a message in bytes, including three bytes of header.
     """
 
     name: str
@@ -32,14 +32,14 @@ class MessageFormat(NamedTuple):
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """The layout of a message's body; of no fields where letters, columns and length contradict one another."""
+        """The layout of a message's body; without fields if letters, columns and length are inconsistent."""
         fields = [(column, _LAYOUT[letter]) for letter, column in zip(self.letters, self.columns, strict=False)]
         layout = np.dtype(fields)
         fits = len(self.letters) == len(self.columns) and layout.itemsize == self.length - 3
         return layout if fits else np.dtype([])
 
     def numbers(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """The columns of rows of this layout, in the units of the log, and arrays ``name[i]`` apart."""
+        """The columns of rows of this layout, in the units of the log, with arrays split into ``name[i]``."""
         columns: dict[str, np.ndarray] = {}
         for letter, name in zip(self.letters, self.columns, strict=True):
             values = rows[name]
@@ -78,10 +78,10 @@ _LAYOUT: dict[str, object] = {
 TEXT = frozenset("nNZ")
 WHOLE = frozenset("bBhHiIMqQ")
 DIVIDED: Mapping[str, float] = {"c": 1e2, "C": 1e2, "e": 1e2, "E": 1e2, "L": 1e7}
-"""Letters of whole numbers that stand for a fraction of the unit; division gives the nearest number, 1e-7 does not."""
+"""Divisors of letters whose whole numbers are fractions of the unit; dividing rounds correctly, unlike factor 1e-7."""
 
 MESSAGE_FORMAT = MessageFormat("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"), 89)
-"""The format of the messages that tell the formats."""
+"""The format of the messages that define formats."""
 
 _PREFIXES = {1.0: "", 1e-1: "d", 1e-2: "c", 1e-3: "m", 1e-6: "µ", 1e-9: "n", 1e3: "k"}
 
@@ -93,11 +93,11 @@ _LEGACY = {
     "BAT": {"Volt": "V", "Curr": "A"},
     "BARO": {"Alt": "m", "Press": "Pa", "Temp": "degC"},
 }
-"""Units that were the same in all versions of ArduPilot, for logs that do not state theirs."""
+"""Units that are the same in all versions of ArduPilot, for logs that do not state units."""
 
 
 def message_format(kind: int, length: int, name: str, letters: str, columns: str) -> MessageFormat | None:
-    """A format from the fields of an FMT message; None where it makes no sense."""
+    """The format that the fields of an FMT message define; None if they are invalid."""
     names = tuple(column.strip() for column in columns.split(",")) if columns else ()
     if not 0 <= kind <= 255 or not 3 <= length <= 255 or not name.isprintable() or not name:
         return None
@@ -113,11 +113,12 @@ def units_of(
     units: Mapping[str, str],
     multipliers: Mapping[str, float],
 ) -> dict[str, str]:
-    """The units of a message's columns: what the log states, or what was always so.
+    """The units of a message's columns: those that the log states, or ArduPilot's constant units.
 
     Args:
-        unit_ids, multiplier_ids: of the message's FMTU, a letter for each column; empty without one.
-        units, multipliers: of the log's UNIT and MULT messages, by letter.
+        message: the format of the message.
+        unit_ids, multiplier_ids: letters of the message's FMTU, one for each column; empty without an FMTU.
+        units, multipliers: contents of the log's UNIT and MULT messages, by letter.
 
     Example:
         >>> mag = MessageFormat("MAG", "Qh", ("TimeUS", "MagX"), 13)
@@ -142,7 +143,7 @@ def units_of(
 
 
 def instance_column(message: MessageFormat, unit_ids: str) -> str | None:
-    """The column that numbers the sensor, ``#`` in FMTU; ``I`` in the logs of the years before it was said there."""
+    """The column with the sensor's index, ``#`` in FMTU, or ``I`` in older logs; None if there is no such column."""
     place = unit_ids.find("#")
     if 0 <= place < len(message.columns):
         return message.columns[place]
@@ -152,11 +153,11 @@ def instance_column(message: MessageFormat, unit_ids: str) -> str | None:
 
 
 def c_text(field: bytes | str) -> str:
-    """Text up to its first zero."""
+    """Text up to its first zero byte."""
     return (field if isinstance(field, str) else field.decode("utf-8", "replace")).partition("\0")[0]
 
 
 def definition(body: bytes) -> MessageFormat | None:
-    """The format that the body of a binary FMT message tells."""
+    """The format that the body of a binary FMT message defines."""
     kind, length, name, letters, columns = struct.unpack("<BB4s16s64s", body)
     return message_format(kind, length, c_text(name), c_text(letters), c_text(columns))

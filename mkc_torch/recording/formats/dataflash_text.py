@@ -1,4 +1,4 @@
-"""The messages of an ArduPilot DataFlash log as text (``.log``): a line a message, ``MAG, 1000, 12, …``."""
+"""Read the messages of an ArduPilot DataFlash log in text form (``.log``): a message per line, ``MAG, 1000, 12, …``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["read_text"]
 
 
 def read_text(path: Path) -> tuple[list[Topic], list[str]]:
-    """The topics of a log that begins as one does, and what was lost of it; memory is some ten times the file's size.
+    """Read the topics of a log, and warnings about its lost parts; memory is about ten times the file's size.
 
-    Numbers are those in the text: fractions are written out in it, so no format letter divides them.
+    Numbers are used as written: the text holds fractions, so format letters do not divide them.
     """
     formats: dict[str, tuple[int, MessageFormat]] = {"FMT": (0x80, MESSAGE_FORMAT)}
     rows: dict[str, list[list[str]]] = defaultdict(list)
@@ -54,7 +54,7 @@ def read_text(path: Path) -> tuple[list[Topic], list[str]]:
         if name in DEFINITIONS or not numbers:
             continue
         kind, message = formats[name]
-        told = (
+        unreadable = (
             [
                 f"{counted(bad, 'value')} of `{name}` cannot be read and is left empty."
                 if bad == 1
@@ -63,11 +63,11 @@ def read_text(path: Path) -> tuple[list[Topic], list[str]]:
             if bad
             else []
         )
-        topics += with_warnings(topics_of_message(kind, message, numbers, stated), told)
+        topics += with_warnings(topics_of_message(kind, message, numbers, stated), unreadable)
     warnings = []
     if damaged:
         what = "is" if damaged == 1 else "are"
-        warnings.append(f"{counted(damaged, 'line')} of the log {what} damaged, or of no known message, and left out.")
+        warnings.append(f"{counted(damaged, 'line')} of the log {what} damaged or of an unknown message, and left out.")
     if cut:
         warnings.append("The last line of the log has no end: it may be cut off within a number.")
     return topics, warnings
@@ -84,7 +84,7 @@ def _definition(cells: list[str]) -> tuple[int, MessageFormat] | None:
 def _columns(
     message: MessageFormat, rows: list[list[str]]
 ) -> tuple[dict[str, np.ndarray], dict[str, list[object]], int]:
-    """The columns of a message's lines as numbers, as they stand, and how many cells are no numbers."""
+    """The columns of a message's lines as numbers and as text, and the number of cells that are not numbers."""
     package = polars()
     numbers: dict[str, np.ndarray] = {}
     texts: dict[str, list[object]] = {}

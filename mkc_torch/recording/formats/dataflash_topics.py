@@ -1,4 +1,4 @@
-"""From the messages of a DataFlash log, binary or text, to its topics."""
+"""Convert the messages of a DataFlash log, binary or text, to topics."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ DEFINITIONS = frozenset({"FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG", "FILE"})
 
 
 class Statements(NamedTuple):
-    """What a log states of its units.
+    """Units and multipliers that a log states.
 
     Attributes:
-        units, multipliers: of UNIT and MULT, by letter.
-        of_messages: of FMTU, by the number of the message: a letter for each column, of its unit and of its multiplier.
+        units, multipliers: contents of UNIT and MULT, by letter.
+        of_messages: contents of FMTU by message number: the letters of the columns' units and multipliers.
     """
 
     units: Mapping[str, str]
@@ -31,7 +31,7 @@ class Statements(NamedTuple):
 
 
 def statements(messages: Mapping[str, Mapping[str, list[object]]]) -> Statements:
-    """The statements of a log's UNIT, MULT and FMTU messages, each given as columns; what is damaged is passed over."""
+    """Collect a log's UNIT, MULT and FMTU messages, given as columns; damaged messages are skipped."""
 
     def rows(name: str, *columns: str) -> list[tuple[object, ...]]:
         found = messages.get(name, {})
@@ -41,11 +41,11 @@ def statements(messages: Mapping[str, Mapping[str, list[object]]]) -> Statements
         return chr(int(str(number)) & 0xFF)
 
     return Statements(
-        {letter(one): str(label).strip() for one, label in rows("UNIT", "Id", "Label")},
-        {letter(one): float(str(factor)) for one, factor in rows("MULT", "Id", "Mult")},
+        {letter(key): str(label).strip() for key, label in rows("UNIT", "Id", "Label")},
+        {letter(key): float(str(factor)) for key, factor in rows("MULT", "Id", "Mult")},
         {
-            int(str(one)): (str(unit), str(factor))
-            for one, unit, factor in rows("FMTU", "FmtType", "UnitIds", "MultIds")
+            int(str(key)): (str(unit), str(factor))
+            for key, unit, factor in rows("FMTU", "FmtType", "UnitIds", "MultIds")
         },
     )
 
@@ -53,11 +53,13 @@ def statements(messages: Mapping[str, Mapping[str, list[object]]]) -> Statements
 def topics_of_message(
     kind: int, message: MessageFormat, columns: Mapping[str, np.ndarray], stated: Statements
 ) -> list[Topic]:
-    """The topic of a message, or one for each of its instances: ``BARO``, ``MAG[0]``, ``MAG[1]``.
+    """The topic of a message, or a topic for each of its instances: ``BARO``, ``MAG[0]``, ``MAG[1]``.
 
     Args:
-        kind: the number of the message, by which FMTU refers to it.
-        columns: of all its rows.
+        kind: the message number, by which FMTU refers to the message.
+        message: its format.
+        columns: name to values of all its rows.
+        stated: units that the log states.
     """
     unit_ids, multiplier_ids = stated.of_messages.get(kind, ("", ""))
     units = units_of(message, unit_ids, multiplier_ids, stated.units, stated.multipliers)

@@ -1,9 +1,9 @@
-"""From a tree of named arrays, a MATLAB file's structs or an HDF5 file's groups, to topics.
+"""Convert a tree of named arrays, such as MATLAB structs or HDF5 groups, to topics.
 
-Each group is a topic. Arrays (N, 3) become the columns ``name_x``, ``name_y``, ``name_z``; of another width
-``name[0]``, ``name[1]``, …; (3, N) is turned round. Arrays of a group that differ in length are topics of their own,
-each with the time that has its length. A group within a group that has the same length and no time of its own joins
-the one above it, with a dot in the names of its columns. Time comes first. Single numbers are no recordings.
+Each group is a topic. Arrays (N, 3) become the columns ``name_x``, ``name_y``, ``name_z``; arrays of another width
+become ``name[0]``, ``name[1]``, …; (3, N) is transposed. Arrays of different lengths in a group become separate topics,
+each with the time of its length. A subgroup with the length of its parent and without a time of its own is merged into
+the parent, with a dot in the names of its columns. Time comes first. Single numbers are left out.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class Group(NamedTuple):
     """A node of the tree.
 
     Attributes:
-        name: its whole path, as the format writes it; empty at the root.
-        arrays: by name; of any shape and type.
-        units: of the arrays, where the format states them.
-        groups: by name.
-        told: what was left out while it was read.
+        name: its full path in the format's notation; empty for the root.
+        arrays: arrays of any shape and type, by name.
+        units: units of the arrays if the format states them, by name.
+        groups: subgroups by name.
+        warnings: what was left out while the group was read.
     """
 
     name: str
     arrays: dict[str, np.ndarray]
     units: dict[str, str]
     groups: dict[str, Group]
-    told: list[str]
+    warnings: list[str]
 
 
 def group_topics(root: Group) -> list[Topic]:
@@ -57,8 +57,8 @@ def group_topics(root: Group) -> list[Topic]:
 
 
 def _joined(group: Group) -> Group:
-    """With the columns of groups in it that share its length, and have no time of their own."""
-    arrays, units, told, apart = dict(group.arrays), dict(group.units), list(group.told), {}
+    """Merge the columns of subgroups that share the group's length and have no time of their own."""
+    arrays, units, warnings, apart = dict(group.arrays), dict(group.units), list(group.warnings), {}
     lengths = {_rows(values) for name, values in arrays.items() if _TIME.search(name)}
     for name, inner in group.groups.items():
         inner = _joined(inner)
@@ -67,14 +67,14 @@ def _joined(group: Group) -> Group:
         if own and not timed and not inner.groups and set(own) & (lengths - {1}):
             arrays |= {f"{name}.{key}": values for key, values in inner.arrays.items()}
             units |= {f"{name}.{key}": unit for key, unit in inner.units.items()}
-            told += inner.told
+            warnings += inner.warnings
         else:
             apart[name] = inner
-    return Group(group.name, arrays, units, apart, told)
+    return Group(group.name, arrays, units, apart, warnings)
 
 
 def _own_topics(group: Group) -> list[Topic]:
-    """One topic for each length of the group's arrays, that of most columns first."""
+    """A topic for each length of the group's arrays; the length with most columns comes first."""
     times = {_rows(values) for name, values in group.arrays.items() if _TIME.search(name)}
     lengths = {name: _length(values, times | _vectors(group)) for name, values in group.arrays.items()}
     single = [name for name, length in lengths.items() if length < 2]
@@ -99,20 +99,20 @@ def _own_topics(group: Group) -> list[Topic]:
         columns = dict(sorted(columns.items(), key=lambda item: not _TIME.search(item[0])))
         if columns and (topic := topic_of(name, columns, units)):
             topics.append(topic)
-    told = list(group.told)
+    warnings = list(group.warnings)
     if single:
-        told.append(f"{listed(single[:8])}{' and others' if len(single) > 8 else ''}: single values, left out.")
+        warnings.append(f"{listed(single[:8])}{' and others' if len(single) > 8 else ''}: single values, left out.")
     if wide:
-        told.append(f"{listed(wide[:8])}: more than {MOST_ELEMENTS} numbers a row, left out.")
+        warnings.append(f"{listed(wide[:8])}: more than {MOST_ELEMENTS} numbers per row, left out.")
     if len(topics) > 1:
-        told.append(f"Columns of different lengths are {len(topics)} tables.")
-    if told and topics:
-        topics[0] = topics[0]._replace(warnings=(*told, *topics[0].warnings))
+        warnings.append(f"Columns of different lengths were split into {len(topics)} tables.")
+    if warnings and topics:
+        topics[0] = topics[0]._replace(warnings=(*warnings, *topics[0].warnings))
     return topics
 
 
 def _vectors(group: Group) -> set[int]:
-    """The lengths of the group's vectors; they say which way round its matrices are."""
+    """The lengths of the group's vectors; they determine the orientation of its matrices."""
     return {_rows(values) for values in group.arrays.values() if _is_vector(values)} - {0, 1, 3}
 
 
@@ -125,7 +125,7 @@ def _rows(values: np.ndarray) -> int:
 
 
 def _length(values: np.ndarray, known: set[int]) -> int:
-    """How many rows an array has, which lie along the axis whose length is known, or else its longest of two."""
+    """The number of rows of an array, along the axis of known length or else the longer of two axes."""
     if values.ndim == 0 or values.size == 0:
         return min(values.size, 1)
     if _is_vector(values) or values.size == 1:
@@ -137,7 +137,7 @@ def _length(values: np.ndarray, known: set[int]) -> int:
 
 
 def _upright(values: np.ndarray, length: int) -> np.ndarray:
-    """With its rows along the first axis."""
+    """Transpose an array so that its rows are along the first axis."""
     if _is_vector(values):
         return values.reshape(-1)
     return values if values.shape[0] == length else np.moveaxis(values, -1, 0)

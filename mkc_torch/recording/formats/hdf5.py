@@ -1,4 +1,4 @@
-"""HDF5 (``.h5``, ``.hdf5``), by h5py."""
+"""Read HDF5 files (``.h5``, ``.hdf5``) by h5py."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TRIAL = Path(__file__).with_name("hdf5_objects.py").read_text(encoding="utf-8")
 
 
 def h5py(extra: str) -> Any:
-    """The package h5py."""
+    """Import h5py, or raise an ImportError that names the extra to install."""
     try:
         import h5py as package
     except ImportError as error:
@@ -30,13 +30,13 @@ def h5py(extra: str) -> Any:
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a file: each group is one, and so is each dataset of named fields (a compound).
+    """Read the topics of a file: each group, and each dataset of named fields (a compound), is a topic.
 
-    Columns are named as the datasets are; see :mod:`mkc_torch.recording.formats.groups` for arrays. Units are those of
+    Columns have the names of the datasets; see :mod:`mkc_torch.recording.formats.groups` for arrays. Units come from
     the attributes ``units`` or ``unit``. All numbers of the file are read into memory, once.
 
     Raises:
-        RecordingError: no HDF5 file, a damaged one, or one without a table of two rows.
+        RecordingError: the file is not an HDF5 file, is damaged, or has no table of two rows.
         ImportError: h5py is not installed.
     """
     package = h5py("hdf5")
@@ -49,10 +49,16 @@ def read(path: Path) -> list[Topic]:
 
 
 def hdf5_root(path: Path, package: Any, what: str, *, upright: bool) -> Group:
-    """All that is in a file; ``upright`` says whether rows lie along the first axis, as MATLAB's do not.
+    """Read all groups of a file.
+
+    Args:
+        path: the file.
+        package: h5py.
+        what: name of the format for messages.
+        upright: True if rows are along the first axis; MATLAB writes them along the last axis.
 
     Raises:
-        RecordingError: a damaged file.
+        RecordingError: the file is damaged.
     """
     if not reads_without_crash(path, _TRIAL):
         raise broken(path, what)

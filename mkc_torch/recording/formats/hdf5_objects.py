@@ -1,6 +1,6 @@
-"""The groups and datasets of an HDF5 file, by h5py; run as a program, it reads a file to its end.
+"""Read the groups and datasets of an HDF5 file by h5py; as a program, this module reads a whole file.
 
-HDF5's compiled code goes round in a circle over some damaged files, and ends the process over others.
+HDF5's compiled code loops forever over some damaged files, and crashes the process over others.
 """
 
 from __future__ import annotations
@@ -18,23 +18,28 @@ Make = Callable[[str, dict[str, Any], dict[str, Any], dict[str, Any], list[str]]
 
 _UNITS = ("units", "unit", "UNITS", "Units", "Unit")
 _DEEPEST = 32
+"""Deepest nesting of groups."""
+
 _MOST_OBJECTS = 4096
+"""Most objects that are read from a file."""
+
 _MOST_EXPANSION = 1100
-"""Bytes that deflate can make of one (zlib's technical notes); what is said to hold more was never written."""
+"""Largest expansion by deflate (zlib's technical notes); a dataset that claims more was never written."""
 
 
 def hdf5_group(
     package: Any, make: Make, group: Any, name: str, *, upright: bool, count: list[int], depth: int = 0
 ) -> Any:
-    """A group and all in it.
+    """Read a group with its datasets and subgroups.
 
     Args:
         package: h5py.
-        make: makes a group of its name, arrays, units, groups and what is to be told of it.
-        group: of h5py.
-        name: of the group.
-        upright: whether rows lie along the first axis; MATLAB writes them along the last.
-        count: of the objects so far; a file can link to itself.
+        make: constructs a group from its name, arrays, units, groups and warnings.
+        group: a group of h5py.
+        name: path of the group.
+        upright: True if rows are along the first axis; MATLAB writes them along the last axis.
+        count: number of objects read so far, in a list of length 1; a file can link to itself.
+        depth: nesting depth of the group.
     """
     found = make(name, {}, {}, {}, [])
     for key in group:
@@ -43,29 +48,31 @@ def hdf5_group(
             continue
         link = group.get(key, getlink=True)
         if not isinstance(link, package.HardLink):
-            found.told.append(f"`{key}` is a link to elsewhere, left out.")
+            found.warnings.append(f"`{key}` is a link to elsewhere, left out.")
             continue
         path = f"{name}/{key}" if name else key
         try:
-            one = group[key]
-            if isinstance(one, package.Group):
-                found.groups[key] = hdf5_group(package, make, one, path, upright=upright, count=count, depth=depth + 1)
-            elif isinstance(one, package.Dataset):
-                _add(package, make, found, key, path, one, upright)
-        except Exception as error:  # the library raises what comes over a damaged object; the others stay
-            found.told.append(f"`{path}` cannot be read and is left out ({str(error).splitlines()[0][:80]}).")
+            member = group[key]
+            if isinstance(member, package.Group):
+                found.groups[key] = hdf5_group(
+                    package, make, member, path, upright=upright, count=count, depth=depth + 1
+                )
+            elif isinstance(member, package.Dataset):
+                _add(package, make, found, key, path, member, upright)
+        except Exception as error:  # h5py raises arbitrary errors over a damaged object; the other objects are kept
+            found.warnings.append(f"`{path}` cannot be read and is left out ({str(error).splitlines()[0][:80]}).")
     return found
 
 
 def _add(package: Any, make: Make, group: Any, key: str, path: str, dataset: Any, upright: bool) -> None:
-    """A dataset's values; one with named fields is a group of its own."""
+    """Add a dataset's values to a group; a dataset with named fields becomes a subgroup."""
     size = dataset.file.id.get_filesize()
     if dataset.shape is None or (dataset.dtype.hasobject and not package.check_string_dtype(dataset.dtype)):
-        group.told.append(f"`{path}` holds references and is left out.")
+        group.warnings.append(f"`{path}` holds references and is left out.")
         return
     if dataset.nbytes > _MOST_EXPANSION * size + 10**6:
-        group.told.append(
-            f"`{path}` is said to hold {dataset.nbytes:,} bytes, more than the file can, and is left out."
+        group.warnings.append(
+            f"`{path}` claims {dataset.nbytes:,} bytes, more than the file can hold, and is left out."
         )
         return
     unit = next((_text(dataset.attrs[name]) for name in _UNITS if name in dataset.attrs), "")
@@ -85,7 +92,7 @@ def _add(package: Any, make: Make, group: Any, key: str, path: str, dataset: Any
 
 
 def _text(value: Any) -> str:
-    """An attribute as text, which it is, or an array of one, or of one a column that are all the same."""
+    """An attribute as text; an array counts if all its elements are equal, else the result is empty."""
     cells = {
         cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell) for cell in np.ravel(value).tolist()
     }
@@ -93,9 +100,9 @@ def _text(value: Any) -> str:
 
 
 def _plain(
-    name: str, arrays: dict[str, Any], units: dict[str, Any], groups: dict[str, Any], told: list[str]
+    name: str, arrays: dict[str, Any], units: dict[str, Any], groups: dict[str, Any], warnings: list[str]
 ) -> SimpleNamespace:
-    return SimpleNamespace(name=name, arrays=arrays, units=units, groups=groups, told=told)
+    return SimpleNamespace(name=name, arrays=arrays, units=units, groups=groups, warnings=warnings)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How files of each kind begin: a file that is of another kind than its ending says is named, not guessed at."""
+"""Magic numbers of file formats, to report a file whose format differs from its ending."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ _BEGINS: tuple[tuple[bytes, str, str], ...] = (
     (b"\x1f\x8b", "a gzip archive", ""),
     (b"\x28\xb5\x2f\xfd", "a file compressed by zstd", ""),
 )
-"""Magic numbers, from each format's specification: what they say, and the ending that such a file has."""
+"""Magic number from each format's specification, name of the format with its article, and ending of its files."""
 
 
 def begins_with(path: Path, *magic: bytes) -> bool:
-    """Whether a file begins with one of these."""
+    """Whether a file begins with any of the given magic numbers."""
     with path.open("rb") as file:
         begin = file.read(max(map(len, magic)))
     return begin.startswith(magic)
 
 
 def check_begins(path: Path, what: str, *magic: bytes) -> None:
-    """Refuse a file that does not begin with one of these.
+    """Check that a file begins with any of the given magic numbers.
 
     Raises:
-        RecordingError: it does not, or it is shorter; the sentence says what it seems to be.
+        RecordingError: it does not, or it is shorter; the message names the format that it seems to have.
     """
     if not begins_with(path, *magic):
         raise wrong_format_error(path, what)
 
 
 def is_of_another_kind(data: bytes) -> bool:
-    """Whether what should be text begins as one of these, and is no text that only has the same letters.
+    """Whether data begins with a known magic number and is binary, not text with the same letters.
 
     Example:
         >>> is_of_another_kind(b"\\x1f\\x8b\\x08\\x00"), is_of_another_kind(b"MATLAB export\\ntime,mag_x")
@@ -55,16 +55,16 @@ def is_of_another_kind(data: bytes) -> bool:
 
 
 def wrong_format_error(path: Path, what: str) -> RecordingError:
-    """The error about a file that is not of the kind that its ending says."""
+    """The error about a file that does not have the format of its ending."""
     with path.open("rb") as file:
         begin = file.read(16)
     for magic, found, ending in _BEGINS:
         if begin.startswith(magic):
             advice = f"rename it to end in {ending}" if ending else "unpack it first"
-            return RecordingError(f"{path}: this is no {what}; it begins as {found} does; {advice}.")
+            return RecordingError(f"{path}: this is not a valid {what}; it begins like {found}; {advice}.")
     text = begin.decode("ascii", "replace")
     if text.isprintable() and "\ufffd" not in text:
-        found = f'begins as text, "{text}"; if it is a table, rename it to end in .csv'
+        found = f'begins with the text "{text}"; if it is a table, rename it to end in .csv'
     else:
-        found = f"begins with the bytes {begin[:8].hex(' ')}; copy it anew, or export it as CSV"
-    return RecordingError(f"{path}: this is no {what}, or its beginning is damaged; it {found}.")
+        found = f"begins with the bytes {begin[:8].hex(' ')}; copy it again, or export it as CSV"
+    return RecordingError(f"{path}: this is not a valid {what}, or its beginning is damaged; it {found}.")

@@ -1,4 +1,4 @@
-"""MATLAB files (``.mat``): up to version 7 by scipy, version 7.3, which is HDF5, by h5py."""
+"""Read MATLAB files (``.mat``): up to version 7 by scipy, version 7.3 (HDF5) by h5py."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ _TABLES = (
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a file: its variables are one, and each struct is one, named ``log.mag``; a struct array ``S[0]``,
-    ….
+    """Read the topics of a file: the variables, each struct (``log.mag``), each element of a struct array (``S[0]``).
 
-    Columns are named as the variables are; see :mod:`mkc_torch.recording.formats.groups` for arrays. MATLAB knows no
-    units. All numbers of the file are read into memory, once; of version 7, which is compressed, twice for a moment.
+    Columns have the names of the variables; see :mod:`mkc_torch.recording.formats.groups` for arrays. MATLAB files have
+    no units. All numbers are read into memory once; for the compressed version 7, twice for a moment.
 
     Raises:
-        RecordingError: no MATLAB file, a damaged one, or one without a table of two rows.
+        RecordingError: the file is not a MATLAB file, is damaged, or has no table of two rows.
         ImportError: scipy, or h5py for version 7.3, is not installed.
     """
     root = _of_hdf5(path) if _is_hdf5(path) else _of_scipy(path)
     topics = group_topics(root)
     if not topics:
-        raise no_rows(path, "MATLAB file", _told(root))
+        raise no_rows(path, "MATLAB file", _all_warnings(root))
     return topics
 
 
@@ -45,8 +44,8 @@ def _is_hdf5(path: Path) -> bool:
     return head[512:520] == b"\x89HDF\r\n\x1a\n" or begins_with(path, b"\x89HDF")
 
 
-def _told(group: Group) -> list[str]:
-    return group.told + [sentence for inner in group.groups.values() for sentence in _told(inner)]
+def _all_warnings(group: Group) -> list[str]:
+    return group.warnings + [sentence for inner in group.groups.values() for sentence in _all_warnings(inner)]
 
 
 def _of_hdf5(path: Path) -> Group:
@@ -59,7 +58,10 @@ def _dotted(group: Group) -> Group:
         group.arrays,
         group.units,
         {name: _dotted(inner) for name, inner in group.groups.items()},
-        [sentence.replace("holds references", f"is a cell array or an object ({_TABLES})") for sentence in group.told],
+        [
+            sentence.replace("holds references", f"is a cell array or an object ({_TABLES})")
+            for sentence in group.warnings
+        ],
     )
 
 
@@ -85,7 +87,7 @@ def _of_scipy(path: Path) -> Group:
 
 
 def _is_version_4(head: bytes) -> bool:
-    """Version 4 has no magic number; it begins with a variable's header, whose first number is MOPT, below 5000."""
+    """Whether a head is of version 4, which has no magic number but begins with a number MOPT below 5000."""
     numbers = {int.from_bytes(head[:4], order) for order in ("little", "big")}
     return len(head) > 20 and any(number < 5000 and number % 10 < 3 for number in numbers)
 
@@ -100,13 +102,13 @@ def _group(name: str, variables: dict[str, Any], depth: int) -> Group:
             or type(value) is not np.ndarray
             or (value.dtype.kind == "V" and not fields)
         ):
-            group.told.append(f"`{path}` is an object; {_TABLES}.")
+            group.warnings.append(f"`{path}` is an object; {_TABLES}.")
         elif fields:
             _add_struct(group, key, path, value, depth)
         elif value.dtype == object:
             texts = _texts(value)
             if texts is None:
-                group.told.append(f"`{path}` is a cell array and is left out.")
+                group.warnings.append(f"`{path}` is a cell array and is left out.")
             else:
                 group.arrays[key] = texts
         else:
@@ -123,7 +125,7 @@ def _add_struct(group: Group, key: str, path: str, value: np.ndarray, depth: int
 
 
 def _texts(cells: np.ndarray) -> np.ndarray | None:
-    """A cell array of texts, as many of time stamps are; None of other things."""
+    """The texts of a cell array, such as time stamps; None if a cell holds anything else."""
     texts = []
     for cell in cells.reshape(-1):
         if not isinstance(cell, np.ndarray) or cell.dtype.kind != "U" or cell.size > 1:

@@ -1,4 +1,4 @@
-"""MCAP (``.mcap``): its records by the package mcap; messages of ROS 1, ROS 2, JSON and Protocol Buffers.
+"""Read MCAP files (``.mcap``) by the package mcap, with messages of ROS 1, ROS 2, JSON and Protocol Buffers.
 
 Source: mcap.dev/spec, and its registry of well-known encodings.
 """
@@ -35,26 +35,26 @@ class _State(NamedTuple):
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a file: nested fields with dots, arrays ``[i]``, times in ns (``header.stamp``, ``log_time``).
+    """Read the topics of a file: nested fields with dots, arrays ``[i]``, times in ns (``header.stamp``, ``log_time``).
 
-    The file is read record by record. Memory is eight bytes a number, and twice a chunk of the file; messages of more
-    than 64 KiB, such as pictures, are passed over. Of a file that is cut off all whole messages are read, also those
-    in its last, broken chunk.
+    The file is read record by record. Memory is eight bytes per number plus two chunks of the file. Messages larger
+    than 64 KiB, such as images, are skipped. All complete messages of a truncated file are read, also those in its
+    last, incomplete chunk.
 
     Raises:
-        RecordingError: no MCAP file, or one without a message that is understood.
+        RecordingError: the file is not an MCAP file, or has no readable message.
         ImportError: mcap or rosbags is not installed.
     """
     log = MessageLog()
     warnings = gather_mcap(path, log)
-    topics, told = log.topics()
+    topics, left_out = log.topics()
     if not topics:
-        raise no_rows(path, "MCAP file", [*warnings, *told])
-    return with_warnings(topics, [*warnings, *told])
+        raise no_rows(path, "MCAP file", [*warnings, *left_out])
+    return with_warnings(topics, [*warnings, *left_out])
 
 
 def gather_mcap(path: Path, log: MessageLog) -> list[str]:
-    """Add the messages of a file to a log, and say what of it is lost."""
+    """Add the messages of a file to a log; returns warnings about lost parts."""
     check_begins(path, "MCAP file", _MAGIC)
     try:
         import mcap.stream_reader  # noqa: F401
@@ -81,13 +81,13 @@ def gather_mcap(path: Path, log: MessageLog) -> list[str]:
         warnings.append(f"The file is damaged or cut off: {broken} of its chunks could be read only in part.")
     if wrong:
         warnings.append(
-            f"The file is damaged: the checksum of {wrong} of its chunks is wrong, and so may be numbers there."
+            f"The file is damaged: the checksum of {wrong} of its chunks is wrong; numbers there may be wrong too."
         )
     return warnings
 
 
 def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[Any, int]]:
-    """Records and where they end, up to the footer or to where they cannot be read."""
+    """Yield each record and the offset of its end, up to the footer or the first unreadable record."""
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
     from mcap.records import Chunk
@@ -100,7 +100,7 @@ def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[Any, int]]:
             place = size if type(record).__name__ == "Footer" else file.tell()
             yield record, place
         return
-    except Exception:  # of a file that is cut off, whatever its half record leads to; what came before stays
+    except Exception:  # the truncated record of a damaged file; records before it are kept
         file.seek(place)
     head = file.read(9)
     if head[:1] == bytes([Opcode.CHUNK]):
@@ -110,7 +110,7 @@ def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[Any, int]]:
 
 
 def _chunk(data: bytes, size: int, state: _State) -> bool:
-    """Take the records of a chunk, which should have this size; whether all of them could be read."""
+    """Add the records of a chunk of ``size`` bytes to the log; returns whether all records were readable."""
     from mcap.stream_reader import StreamReader
 
     stream = io.BytesIO(data)
@@ -119,7 +119,7 @@ def _chunk(data: bytes, size: int, state: _State) -> bool:
         for record in StreamReader(stream, skip_magic=True, record_size_limit=len(data)).records:
             _take(record, state)
             end = stream.tell()
-    except Exception:  # at the end of the chunk, too: this reader has no other way to say so
+    except Exception:  # also raised at the regular end of the chunk
         return end == len(data) == size
     return end == len(data) == size
 
@@ -143,11 +143,9 @@ def _open(channel: Any, state: _State) -> None:
         read, units = _reader(channel.message_encoding, schema)
     except ImportError as error:
         state.log.leave_out(channel.topic, str(error).rstrip("."))
-    except Exception as error:  # what parsers raise over a damaged definition
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        state.log.leave_out(
-            channel.topic, f"its messages, of {name or 'no type'}, are not understood ({said[0][:100]})"
-        )
+    except Exception as error:  # parsers raise arbitrary errors over a damaged definition
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        state.log.leave_out(channel.topic, f"its messages, of {name or 'no type'}, cannot be read ({reason[0][:100]})")
     else:
         state.log.open((state.source, channel.id), channel.topic, name, read, units)
 
@@ -170,7 +168,7 @@ def _reader(encoding: str, schema: Any) -> tuple[Callable[[bytes], Mapping[str, 
         ros1 = encoding == "ros1"
         reader = RosReader(schema.name, found if ros1 else {**known_definitions(), **found}, ros1)
         return reader.read, reader.units
-    raise RecordingError(f"they are encoded as {encoding}, which is not read")
+    raise RecordingError(f"they are encoded as {encoding}, which is not supported")
 
 
 MCAP = FileFormat((".mcap",), read)

@@ -1,7 +1,7 @@
-"""ASAM MDF (``.mf4``, ``.mdf``), versions 2 to 4, by asammdf, which runs in a process of its own.
+"""Read ASAM MDF files (``.mf4``, ``.mdf``), versions 2 to 4, by asammdf in a separate process.
 
-asammdf is large: it brings pandas and canmatrix, and takes two seconds to import. There is nothing as complete beside
-it: mdfreader is no longer kept.
+asammdf is large: it brings pandas and canmatrix, and takes two seconds to import. No other library is as complete:
+mdfreader is no longer maintained.
 
 Source: ASAM MDF 4.2.
 """
@@ -34,51 +34,51 @@ _WHAT = "ASAM MDF file"
 _BEGINS = b"MDF     ", b"UnFinMF "
 _SCRIPT = Path(__file__).with_name("mdf_process.py")
 _PATIENCE = 60.0, 2.0
-"""Seconds, and seconds for each MB of the file: a damaged file can lead asammdf round in a circle."""
+"""Time limit: seconds, plus seconds per MB of the file; asammdf can loop forever over a damaged file."""
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a file: each group of channels is one, named by its acquisition or source, or else ``group_0``.
+    """Read the topics of a file: each channel group is a topic, named by its acquisition, its source, or ``group_0``.
 
-    Values are physical, converted as the file says, and numbers where it has words for them. Units are the channels';
-    the master channel, mostly ``time`` in s, comes first. A value that the file marks as invalid is NaN. Memory is that
-    of all channels, twice for a moment.
+    Values are physical, by the conversions of the file; labelled values stay numbers. Units are those of the channels.
+    The master channel, usually ``time`` in s, comes first. Values that the file marks as invalid are NaN. Memory is
+    that of all channels, twice for a moment.
 
-    A channel whose conversion is a formula in words is left out: it would be executed.
+    A channel whose conversion is a text formula is left out, because the formula would be executed.
 
     Raises:
-        RecordingError: no MDF file, a damaged one, or one without rows.
+        RecordingError: the file is not an MDF file, is damaged, or has no rows.
         ImportError: asammdf is not installed.
     """
     check_begins(path, _WHAT, *_BEGINS)
     if importlib.util.find_spec("asammdf") is None:
         raise ImportError('MDF files are read with asammdf; install it with `pip install "mkc-torch[mdf]"`.')
-    found, told = _READER.groups(path)
+    found, warnings = _READER.groups(path)
     if begins_with(path, _BEGINS[1]):
-        told.append("The file was not closed by its recorder; its last rows may be missing.")
+        warnings.append("The file was not closed by its recorder; its last rows may be missing.")
     topics = [topic for group in found if (topic := _topic(group)) is not None]
     if not topics:
-        raise no_rows(path, _WHAT, told)
-    return with_warnings(topics, told)
+        raise no_rows(path, _WHAT, warnings)
+    return with_warnings(topics, warnings)
 
 
 def _topic(group: dict[str, Any]) -> Topic | None:
     columns: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
-    told = list(group["told"])
+    warnings = list(group["warnings"])
     for name, values in group["columns"].items():
         if math.prod(values.shape[1:]) > MOST_ELEMENTS:
-            told.append(f"`{name}`: more than {MOST_ELEMENTS} numbers a row, left out.")
+            warnings.append(f"`{name}`: more than {MOST_ELEMENTS} numbers per row, left out.")
             continue
         parts = spread(name, values)
         columns |= parts
         units |= dict.fromkeys(parts, group["units"].get(name, ""))
     rows = {len(values) for values in columns.values()}
-    return topic_of(group["name"], columns, units, told) if len(rows) == 1 and rows != {0} else None
+    return topic_of(group["name"], columns, units, warnings) if len(rows) == 1 and rows != {0} else None
 
 
 class _Reader:
-    """The process, started with the first file and again after one that ended it; it ends with this one."""
+    """The reader process: started for the first file, restarted after a crash, ended with this process."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -86,10 +86,10 @@ class _Reader:
         self._lock = threading.Lock()
 
     def groups(self, path: Path) -> tuple[list[dict[str, Any]], list[str]]:
-        """The groups of a file, and what is to be told of it.
+        """Read the groups of a file, and warnings about it.
 
         Raises:
-            RecordingError: a damaged file.
+            RecordingError: the file is damaged.
         """
         with self._lock:
             process = self._process
@@ -106,16 +106,16 @@ class _Reader:
                 header, found = _received(process.stdout)
             except (EOFError, OSError) as error:
                 self.end()
-                raise _damaged(path, "the library that reads it broke down over it") from error
+                raise _damaged(path, "the library that reads it crashed") from error
             finally:
                 timer.cancel()
         if "error" in header:
             raise _damaged(path, header["error"])
-        return found, header["told"]
+        return found, header["warnings"]
 
     def _started(self) -> subprocess.Popen[bytes]:
         self.end()
-        # by sys.path as it is here, and not by the script's folder, whose csv.py is not Python's
+        # use this process's sys.path, not the script's folder, whose csv.py would shadow Python's
         start = "import json, runpy, sys; sys.path[:] = json.loads(sys.argv[1]); "
         start += "runpy.run_path(sys.argv[2], run_name='__main__')"
         self._owner = os.getpid()
@@ -128,7 +128,7 @@ class _Reader:
         return self._process
 
     def end(self) -> None:
-        """Let the process end, if it is ours: after a fork it is that of the process above."""
+        """End the reader process if this process started it; after a fork it belongs to the parent."""
         if self._process is None or self._owner != os.getpid():
             return
         self._process.kill()
@@ -141,7 +141,7 @@ class _Reader:
 
 
 def _received(pipe: IO[bytes]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The header and the groups of an answer."""
+    """Receive the header and the groups of a reply."""
     (length,) = struct.unpack("<Q", _exactly(pipe, 8))
     header = json.loads(_exactly(pipe, length))
     groups = header.get("groups", [])
@@ -162,9 +162,9 @@ def _exactly(pipe: IO[bytes], count: int) -> bytes:
     return data
 
 
-def _damaged(path: Path, said: str) -> RecordingError:
+def _damaged(path: Path, reason: str) -> RecordingError:
     return RecordingError(
-        f"{path}: the {_WHAT} cannot be read: it is damaged ({said}); copy it anew from where it was recorded."
+        f"{path}: the {_WHAT} cannot be read: it is damaged ({reason}); copy it again from where it was recorded."
     )
 
 

@@ -1,9 +1,9 @@
-"""The channels of ASAM MDF files, by asammdf, in a process of its own: run there, this file imports nothing of ours.
+"""Read the channels of ASAM MDF files by asammdf in a separate process; this module imports nothing of mkc_torch.
 
-asammdf's compiled code takes what a file says of itself on trust, and ends the process over damaged files.
+asammdf's compiled code does not validate a file's own statements, and crashes the process over damaged files.
 
-The process reads paths, a line each, and answers each with a header (its length in eight bytes, then JSON) and the
-bytes of the columns that it names.
+The process reads paths from stdin, a line each. It replies to each with a header (its length in eight bytes, then JSON)
+and the bytes of the columns that the header lists.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ import numpy as np
 __all__ = ["Group", "groups"]
 
 Group = dict[str, Any]
-"""``name``, ``columns`` (name to values, rows along the first axis), ``units``, and ``told``, sentences."""
+"""Keys: ``name``, ``columns`` (name to values, rows along the first axis), ``units`` and ``warnings``."""
 
 _SYNC_UNITS = {1: "s", 2: "rad", 3: "m"}
-"""What a master channel counts, by its type of synchronisation, and the unit that the specification gives it."""
+"""Units of master channels by synchronisation type, from the specification."""
 
 _MOST_CHANNELS = 4096
 
 
 def groups(path: str) -> tuple[list[Group], list[str]]:
-    """The groups of channels of a file that have rows, and what is to be told of the file.
+    """Read the channel groups of a file that have rows, and warnings about the file.
 
     Raises:
-        Exception: as asammdf does over damaged files.
+        Exception: any error of asammdf over a damaged file.
     """
     import asammdf
 
     found: list[Group] = []
-    told: list[str] = []
-    with open(path, "rb") as stream:  # noqa: PTH123 - as bytes: a path would be copied where the file was not closed
+    warnings: list[str] = []
+    with open(path, "rb") as stream:  # noqa: PTH123 - a stream, because asammdf copies an unclosed file given by path
         closed = stream.read(8) != b"UnFinMF "
         stream.seek(0)
-        # asammdf writes what is missing into a file that was not closed: it gets the content in memory
+        # asammdf repairs an unclosed file in place: give it a copy in memory
         with asammdf.MDF(stream if closed else io.BytesIO(stream.read())) as file:
             names = _names(file)
             for place in file.virtual_groups:
-                group, said = _group_or_why(file, place, names[place])
+                group, reason = _group_or_why(file, place, names[place])
                 found += [group] if group else []
-                told += [said] if said else []
-    return found, told
+                warnings += [reason] if reason else []
+    return found, warnings
 
 
 def _names(file: Any) -> dict[int, str]:
-    """A name for each group, each once."""
+    """A unique name for each group."""
     found = {}
     seen: Counter[str] = Counter()
     for place in file.virtual_groups:
@@ -66,16 +66,16 @@ def _names(file: Any) -> dict[int, str]:
 
 
 def _group_or_why(file: Any, place: int, name: str) -> tuple[Group | None, str]:
-    """A group; where its blocks are damaged, a sentence that says so, and the other groups stay."""
+    """Read a group; if its blocks are damaged, return None and a warning."""
     try:
         return _group(file, place, name), ""
-    except Exception as error:  # the library raises what comes
+    except Exception as error:  # the library raises arbitrary errors
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return None, f"Group {name} cannot be read and is left out ({lines[0][:100]})."
 
 
 def _group(file: Any, place: int, name: str) -> Group | None:
-    chosen, told, formulas, rows = [], [], [], 0
+    chosen, warnings, formulas, rows = [], [], [], 0
     for number in file.virtual_groups[place].groups:
         channels = file.groups[number].channels
         if not file.groups[number].channel_group.cycles_nr:
@@ -89,8 +89,8 @@ def _group(file: Any, place: int, name: str) -> Group | None:
             else:
                 chosen.append((None, number, index))
     if formulas:
-        names = ", ".join(f"`{one}`" for one in formulas[:8])
-        told.append(f"{names}: converted by a formula in words, which is not executed, left out.")
+        names = ", ".join(f"`{formula}`" for formula in formulas[:8])
+        warnings.append(f"{names}: converted by a formula in text, which is not executed; left out.")
     if not chosen:
         return None
     signals = file.select(chosen, ignore_value2text_conversions=True, validate=False)
@@ -99,21 +99,21 @@ def _group(file: Any, place: int, name: str) -> Group | None:
     columns: dict[str, np.ndarray] = {master: times} if master else {}
     units = {master: unit}
     if len(times) < rows:
-        told.append(
+        warnings.append(
             f"The file is damaged or cut off: {rows - len(times):,} of the {rows:,} rows of {name} are missing."
         )
     for signal in signals:
         if signal.name in columns or len(signal.samples) != len(times):
-            told.append(f"Channel `{signal.name}` stands twice, or has another length, and is left out.")
+            warnings.append(f"Channel `{signal.name}` is a duplicate or has another length, and is left out.")
             continue
         parts = _parts(signal)
         columns |= parts
         units |= dict.fromkeys(parts, str(signal.unit or ""))
-    return {"name": name, "columns": columns, "units": units, "told": told}
+    return {"name": name, "columns": columns, "units": units, "warnings": warnings}
 
 
 def _parts(signal: Any) -> dict[str, np.ndarray]:
-    """The columns of a channel: one, or those of its structure; invalid values are NaN."""
+    """The columns of a channel: its values, or a column for each field of a structure; invalid values are NaN."""
     samples = np.asarray(signal.samples)
     parts = {signal.name: samples}
     if samples.dtype.names:
@@ -132,31 +132,31 @@ def _parts(signal: Any) -> dict[str, np.ndarray]:
 
 
 def _master(file: Any, place: int) -> tuple[str, str]:
-    """The name of a group's master channel and its unit; of a group without one, none."""
+    """The name and unit of a group's master channel; empty without a master channel."""
     for number in file.virtual_groups[place].groups:
         index = file.masters_db.get(number)
         if index is not None:
             channel = file.groups[number].channels[index]
-            kind: Any = getattr(channel, "sync_type", None)  # versions 2 and 3 count time alone
+            kind: Any = getattr(channel, "sync_type", None)  # versions 2 and 3 support only time
             return str(channel.name), str(channel.unit or "") or _SYNC_UNITS.get(kind or 1, "")
     return "", ""
 
 
 def _has_formula(conversion: Any, depth: int) -> bool:
-    """Whether a conversion, or one that it refers to, is a text that would be executed."""
+    """Whether a conversion, or a conversion that it refers to, is a text formula that would be executed."""
     if conversion is None:
         return False
     formula: Any = getattr(conversion, "formula", "")
     if depth > 8 or formula:
         return True
     inner: Any = getattr(conversion, "referenced_blocks", None)
-    return any(_has_formula(one, depth + 1) for one in (inner or {}).values() if not isinstance(one, str | bytes))
+    return any(_has_formula(block, depth + 1) for block in (inner or {}).values() if not isinstance(block, str | bytes))
 
 
-def _answer(path: str) -> bytes:
+def _reply(path: str) -> bytes:
     try:
-        found, told = groups(path)
-    except Exception as error:  # the library raises what comes
+        found, warnings = groups(path)
+    except Exception as error:  # the library raises arbitrary errors
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return _framed({"error": lines[0][:120]}, [])
     blocks = []
@@ -167,7 +167,7 @@ def _answer(path: str) -> bytes:
             blocks.append(plain.tobytes())
             described.append([name, plain.dtype.str, plain.shape])
         group["columns"] = described
-    return _framed({"groups": found, "told": told}, blocks)
+    return _framed({"groups": found, "warnings": warnings}, blocks)
 
 
 def _framed(header: dict[str, Any], blocks: list[bytes]) -> bytes:
@@ -176,11 +176,11 @@ def _framed(header: dict[str, Any], blocks: list[bytes]) -> bytes:
 
 
 def _serve() -> None:
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what the library prints is no answer
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # keep the library's output out of the replies
     for line in sys.stdin:
-        answers.write(_answer(json.loads(line)))
-        answers.flush()
+        replies.write(_reply(json.loads(line)))
+        replies.flush()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Decoders of messages that are not ROS's own: JSON and Protocol Buffers, as MCAP files hold them."""
+"""Decoders of JSON and Protocol Buffers messages in MCAP files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 
 def json_values(data: bytes) -> dict[str, Cell]:
-    """The numbers and texts of a JSON object, with dots between the names of nested ones.
+    """The numbers and texts of a JSON object, with dots between the names of nested fields.
 
-    Times of Foxglove's schemas, ``{"sec": …, "nsec": …}``, become one number in ns.
+    Times of Foxglove's schemas, ``{"sec": …, "nsec": …}``, become a number in ns.
 
     Raises:
-        ValueError: no JSON object.
+        ValueError: the data is not a JSON object.
 
     Example:
         >>> json_values(b'{"t": {"sec": 1, "nsec": 5}, "field": {"x": 0.5}, "q": [1, 2]}')
@@ -39,28 +39,30 @@ def _flatten(found: Mapping[str, Any], prefix: str, values: dict[str, Cell], dep
     for name, value in found.items():
         key = f"{prefix}{name}"
         if isinstance(value, dict):
-            if set(value) in ({"sec", "nsec"}, {"sec", "nanosec"}) and all(type(one) is int for one in value.values()):
+            if set(value) in ({"sec", "nsec"}, {"sec", "nanosec"}) and all(
+                type(item) is int for item in value.values()
+            ):
                 values[key] = 1_000_000_000 * value["sec"] + value.get("nsec", value.get("nanosec", 0))
             elif depth < _DEEPEST:
                 _flatten(value, f"{key}.", values, depth + 1)
         elif isinstance(value, list):
-            if all(isinstance(one, int | float) for one in value):
+            if all(isinstance(item, int | float) for item in value):
                 values[key] = tuple(value[: MOST_ELEMENTS + 1])
         elif isinstance(value, int | float | str):
             values[key] = value
 
 
 def protobuf_reader(schema: Any) -> Callable[[bytes], Mapping[str, Cell]]:
-    """A reader of the messages that an MCAP schema describes.
+    """Make a reader of the messages that an MCAP schema describes.
 
     Raises:
-        Exception: as the libraries do, where the schema is damaged.
+        Exception: any error of the libraries over a damaged schema.
     """
     from mcap_protobuf.decoder import DecoderFactory
 
     decode = DecoderFactory().decoder_for("protobuf", schema)
     if decode is None:
-        raise ValueError(f"{schema.name} is no message of Protocol Buffers")
+        raise ValueError(f"{schema.name} is not a Protocol Buffers message")
 
     def read(data: bytes) -> Mapping[str, Cell]:
         values: dict[str, Cell] = {}
@@ -77,7 +79,7 @@ def _fields(message: Any, prefix: str, values: dict[str, Cell], depth: int) -> N
         if field.message_type is None:
             if field.is_repeated:
                 cells = tuple(value[: MOST_ELEMENTS + 1])
-                if all(isinstance(one, int | float) for one in cells):
+                if all(isinstance(item, int | float) for item in cells):
                     values[key] = cells
             elif isinstance(value, int | float | str):
                 values[key] = value

@@ -1,4 +1,4 @@
-"""Logs of messages, ROS's bags and MCAP: from messages of many topics to tables."""
+"""Collect the messages of ROS bags and MCAP files into a table for each topic."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _STAMP = "header.stamp"
 
 
 class MessageLog:
-    """Gathers messages; a topic that several wrote to is one table, in the order of ``log_time``.
+    """Collects messages by topic; a topic of several publishers is a single table in the order of ``log_time``.
 
-    Times are in ns. ``header.stamp`` is the sensor's own, where it has one; ``log_time`` when the logger wrote the
-    message down; ``publish_time`` when it was sent, where that differs.
+    Times are in ns. ``header.stamp`` is the sensor's own time if the message has a header; ``log_time`` is when the
+    logger received the message; ``publish_time`` is when it was sent, if that differs.
     """
 
     def __init__(self) -> None:
@@ -40,17 +40,17 @@ class MessageLog:
         read: Callable[[bytes], Mapping[str, Cell]],
         units: Mapping[str, str],
     ) -> None:
-        """Messages under ``key`` are of this topic and type, and read like this."""
+        """Register the topic, type, reader and units of the messages under ``key``."""
         known = {**units, LOG_TIME: "ns", _PUBLISH_TIME: "ns"}
         rows = self._rows.setdefault((topic, kind), MessageRows(topic, known))
         self._readers[key] = topic, read, rows
 
     def leave_out(self, topic: str, why: str) -> None:
-        """A topic cannot be read: the end of a sentence that says why."""
+        """Note that a topic cannot be read; ``why`` completes the sentence "Topic … is left out: …"."""
         self._left_out[topic] = why
 
     def add(self, key: object, data: bytes, log_time: int, publish_time: int | None = None) -> None:
-        """One message more; of topics that were not opened none is kept."""
+        """Add a message; messages of topics that were not opened are ignored."""
         if key not in self._readers:
             return
         topic, read, rows = self._readers[key]
@@ -59,7 +59,7 @@ class MessageLog:
             return
         try:
             values = dict(read(data))
-        except Exception:  # decoders raise what comes over bytes that are none of their messages
+        except Exception:  # decoders raise arbitrary errors over invalid bytes
             self._failed[topic] += 1
             return
         times = {LOG_TIME: log_time}
@@ -68,21 +68,21 @@ class MessageLog:
         rows.add({**values, **times})
 
     def topics(self) -> tuple[list[Topic], list[str]]:
-        """All tables, and what is to be said of the file."""
+        """Return all tables, and warnings about the file."""
         topics = []
         names = Counter(name for name, _ in self._rows)
         for (name, kind), rows in self._rows.items():
-            told = []
+            left_out = []
             if failed := self._failed[name]:
-                told.append(f"{counted(failed, 'message')} could not be read and {_are(failed)} left out.")
+                left_out.append(f"{counted(failed, 'message')} could not be read and {_are(failed)} left out.")
             if large := self._large[name]:
-                told.append(f"{counted(large, 'message')} of more than 64 KiB {_are(large)} left out.")
-            topic = rows.topic((_STAMP, LOG_TIME, _PUBLISH_TIME), LOG_TIME, told)
+                left_out.append(f"{counted(large, 'message')} of more than 64 KiB {_are(large)} left out.")
+            topic = rows.topic((_STAMP, LOG_TIME, _PUBLISH_TIME), LOG_TIME, left_out)
             if topic is not None and set(topic.table.names) - {LOG_TIME, _PUBLISH_TIME}:
                 topics.append(topic if names[name] == 1 else topic._replace(name=f"{name} ({kind})"))
-            elif told:
-                self._left_out[name] = told[0][0].lower() + told[0][1:-1]
-        # names of a damaged file may hold line ends
+            elif left_out:
+                self._left_out[name] = left_out[0][0].lower() + left_out[0][1:-1]
+        # names in a damaged file may contain line breaks
         warnings = [" ".join(f"Topic {name} is left out: {why}.".split()) for name, why in self._left_out.items()]
         return topics, warnings
 

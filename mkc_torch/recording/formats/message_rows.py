@@ -1,4 +1,4 @@
-"""Columns that grow message by message, for logs whose messages are decoded one at a time."""
+"""Columns that grow by a message at a time, for logs whose messages are decoded individually."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ Cell = float | int | str | tuple[float | int, ...]
 """A value of a message: a number, a text, or the numbers of an array."""
 
 LARGEST_MESSAGE = 65536
-"""Bytes; a larger message holds a picture, a map or a scan. What a person calibrates is a few hundred bytes."""
+"""Largest message in bytes; a larger message holds an image, a map or a scan, sensor messages have a few hundred."""
 
 _MOST_COLUMNS = 4096
 _WHOLE = range(-(2**63), 2**63)
 
 
 class MessageRows:
-    """The messages of one topic.
+    """The messages of a topic.
 
-    Memory is eight bytes a number. A column that a message lacks has NaN there; one whose array changes its length, or
-    has more than 64 elements, is left out in the end, and so is text.
+    Memory is eight bytes per number. A column is NaN in messages that lack it. Text, and arrays whose length changes or
+    exceeds 64 elements, are left out.
 
     Args:
-        name: of the topic.
-        units: of its columns.
+        name: name of the topic.
+        units: units of its columns.
     """
 
     def __init__(self, name: str, units: Mapping[str, str]) -> None:
@@ -43,7 +43,7 @@ class MessageRows:
         self._rows = 0
 
     def add(self, message: Mapping[str, Cell]) -> None:
-        """One message more."""
+        """Add a message."""
         for key, value in message.items():
             if isinstance(value, str):
                 self._text[key] = None
@@ -51,14 +51,14 @@ class MessageRows:
                 if self._lengths.setdefault(key, len(value)) != len(value) or len(value) > MOST_ELEMENTS:
                     self._uneven[key] = None
                 elif key not in self._uneven:
-                    for place, one in enumerate(value):
-                        self._put(f"{key}[{place}]", one)
+                    for place, element in enumerate(value):
+                        self._put(f"{key}[{place}]", element)
             else:
                 self._put(key, value)
         self._rows += 1
 
     def topic(self, first: Sequence[str], order_by: str, warnings: Sequence[str]) -> Topic | None:
-        """The topic, with the columns ``first`` in front, in the order of one of them; None where it has no numbers."""
+        """The topic, with the columns ``first`` in front, sorted by ``order_by``; None if it has no numbers."""
         uneven = tuple(f"{key}[" for key in self._uneven)
         columns = {key: self._whole(values) for key, values in self._columns.items() if not key.startswith(uneven)}
         first = [key for key in first if key in columns]
@@ -67,16 +67,16 @@ class MessageRows:
         if by is not None and (np.diff(by) < 0).any():
             places = np.argsort(by, kind="stable")
             ordered = {key: values[places] for key, values in ordered.items()}
-        told = list(warnings)
+        messages = list(warnings)
         if self._uneven:
             names = ", ".join(f"`{key}`" for key in list(self._uneven)[:8])
             what = "an array of changing length or of" if len(self._uneven) == 1 else "arrays of changing length or of"
-            told.append(f"{names}: {what} more than {MOST_ELEMENTS} elements, left out.")
+            messages.append(f"{names}: {what} more than {MOST_ELEMENTS} elements, left out.")
         text = [key for key in self._text if key not in self._columns]
         if text:
             verb = "holds text and is" if len(text) == 1 else "hold text and are"
-            told.append(f"{', '.join(f'`{key}`' for key in text[:8])} {verb} left out.")
-        return topic_of(self.name, ordered, self._units, told, line="message")
+            messages.append(f"{', '.join(f'`{key}`' for key in text[:8])} {verb} left out.")
+        return topic_of(self.name, ordered, self._units, messages, line="message")
 
     def _put(self, key: str, value: float | int) -> None:
         column = self._columns.get(key)
@@ -86,7 +86,7 @@ class MessageRows:
                 return
             whole = isinstance(value, int) and not self._rows
             column = self._columns[key] = array("q") if whole else array("d")
-        if len(column) > self._rows:  # a name that stands twice in one message
+        if len(column) > self._rows:  # a repeated name in a message
             return
         if column.typecode == "q" and (not isinstance(value, int) or value not in _WHOLE or len(column) < self._rows):
             column = self._columns[key] = array("d", map(_real, column))
@@ -102,7 +102,7 @@ class MessageRows:
 
 
 def _real(value: float) -> float:
-    """As float64; infinite where a whole number, as JSON can hold, is larger than any."""
+    """Convert to float64; infinite for a whole number beyond its range, as JSON can hold."""
     try:
         return float(value)
     except OverflowError:

@@ -1,6 +1,7 @@
-"""Parquet, by polars, which ends the process over files whose damage has it ask for more memory than there is.
+"""Read and write Parquet by polars.
 
-So a file is read in a process of its own first: what survives that is read here.
+polars can crash the process over a damaged file, by requesting too much memory. A file is therefore read in a separate
+process first.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _TRIAL = "import io, sys, polars; polars.read_parquet(io.BytesIO(open(sys.argv[1
 
 
 def read(path: Path) -> Table:
-    """The table in a Parquet file."""
+    """Read the table of a Parquet file."""
     package = polars()
     if not begins_with(path, b"PAR1"):
         raise wrong_format_error(path, "Parquet file")
@@ -30,12 +31,12 @@ def read(path: Path) -> Table:
         raise broken(path, "Parquet file")
     try:
         with quiet_terminal():
-            frame = package.read_parquet(io.BytesIO(path.read_bytes()))  # a path would be a pattern
+            frame = package.read_parquet(io.BytesIO(path.read_bytes()))  # polars would treat a path as a glob pattern
     except package.exceptions.PolarsError as error:
         raise RecordingError(
-            f"{path}: this is no Parquet file, or a damaged one: {str(error).splitlines()[0]}"
+            f"{path}: this is not a valid Parquet file, or it is damaged: {str(error).splitlines()[0]}"
         ) from error
-    except package.exceptions.PanicException as error:  # polars breaks off over some damaged files
+    except package.exceptions.PanicException as error:  # polars panics over some damaged files
         raise broken(path, "Parquet file") from error
     if not len(frame):
         raise RecordingError(f"{path}: the table has no rows.")
@@ -43,7 +44,7 @@ def read(path: Path) -> Table:
 
 
 def encoded(_path: Path, columns: Mapping[str, np.ndarray]) -> bytes:
-    """The content of a file with these columns."""
+    """Encode columns as the content of a Parquet file."""
     buffer = io.BytesIO()
     polars().DataFrame(dict(columns)).write_parquet(buffer)
     return buffer.getvalue()

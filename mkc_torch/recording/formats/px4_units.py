@@ -1,6 +1,6 @@
-"""Units of PX4's topics, where its message definitions state them.
+"""Units of PX4's topics, as stated in its message definitions.
 
-Source: PX4-Autopilot, msg/*.msg (main, and unchanged since 1.8 for those here); suffixes are its naming rule for
+Source: PX4-Autopilot, msg/*.msg (main; these messages are unchanged since 1.8); suffixes follow its naming rule for
 fields.
 """
 
@@ -47,11 +47,11 @@ _SUFFIXES = {
 
 
 def px4_units(topic: str, columns: Iterable[str]) -> dict[str, str]:
-    """The units of a topic's columns that are certain.
+    """The known units of a topic's columns.
 
     Args:
-        topic: its name in PX4, without the number of the instance.
-        columns: its fields, arrays as ``q[0]``.
+        topic: PX4 name of the topic, without the instance number.
+        columns: names of its fields; arrays as ``q[0]``.
 
     Example:
         >>> px4_units("sensor_mag", ["timestamp", "x", "error_count"])

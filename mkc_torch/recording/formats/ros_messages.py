@@ -1,7 +1,7 @@
-"""Messages of ROS 1 and ROS 2 as numbers, by the definition that their file holds.
+"""Decode messages of ROS 1 and ROS 2 to numbers, by the definitions in their file.
 
-rosbags parses the definitions. The messages are read here, and not by its deserialiser, because that executes code
-which it writes from the definition: nothing of a file that somebody sent is executed.
+rosbags parses the definitions. Messages are decoded here, because the deserialiser of rosbags executes code generated
+from the definition, and nothing from a received file may be executed.
 
 Sources: wiki.ros.org/msg (ROS 1 serialisation), OMG DDS-XTypes 1.3, 7.4.1 (plain CDR, XCDR1, as ROS 2 writes it).
 """
@@ -20,7 +20,7 @@ from mkc_torch.recording.formats.topics import MOST_ELEMENTS
 __all__ = ["Definitions", "RosReader", "known_definitions", "parsed_definitions"]
 
 Definitions = Mapping[str, Any]
-"""Names of message types to their constants and fields, as rosbags has them."""
+"""Message type to its constants and fields, in the form of rosbags."""
 
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"
@@ -42,11 +42,18 @@ _SIZES = {
 }
 _DEEPEST = 32
 _MOST_STEPS = 4096
-"""Messages within a message; definitions can nest so that a few bytes stand for any number of them."""
+"""Most values and nested messages in a message; nested definitions can expand a few bytes without limit."""
 
 
 class _Field(NamedTuple):
-    """A field: a primitive's name, "string", or a type's name; ``many`` None of one value, 0 of a sequence."""
+    """A field of a message.
+
+    Attributes:
+        name: name of the field.
+        kind: a primitive, "string", or the name of a message type.
+        nested: True if ``kind`` is a message type.
+        many: None for a single value, 0 for a sequence, else the length of the array.
+    """
 
     name: str
     kind: str
@@ -55,10 +62,10 @@ class _Field(NamedTuple):
 
 
 def parsed_definitions(text: str, name: str, idl: bool = False) -> Definitions:
-    """The definitions in a text, of ``.msg`` or ``.idl``, that of ``name`` among them.
+    """Parse the definitions in a ``.msg`` or ``.idl`` text, including the definition of ``name``.
 
     Raises:
-        Exception: as rosbags does, where the text is none.
+        Exception: any error of rosbags over an invalid text.
     """
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
@@ -67,28 +74,28 @@ def parsed_definitions(text: str, name: str, idl: bool = False) -> Definitions:
 
 @cache
 def known_definitions() -> Definitions:
-    """The definitions of the message types that come with ROS 2, for files that hold none."""
+    """The definitions of ROS 2's standard message types, for files without definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     return dict(get_typestore(Stores.LATEST).fielddefs)
 
 
 def type_name(name: str) -> str:
-    """The name of a type with its ``msg``: ``sensor_msgs/Imu`` is ``sensor_msgs/msg/Imu``."""
+    """The full name of a type: ``sensor_msgs/Imu`` becomes ``sensor_msgs/msg/Imu``."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 class RosReader:
-    """Reads messages of one type.
+    """Decoder of messages of a type.
 
     Args:
-        name: of the type.
-        definitions: that of the type, and of those in it.
-        ros1: the serialisation: that of ROS 1, or CDR.
+        name: name of the type.
+        definitions: definitions of the type and of its nested types.
+        ros1: True for the serialisation of ROS 1, False for CDR.
 
     Raises:
-        ValueError: a type without a definition, or one that contains itself.
+        ValueError: a type has no definition, or contains itself.
     """
 
     def __init__(self, name: str, definitions: Definitions, ros1: bool = False) -> None:
@@ -99,10 +106,10 @@ class RosReader:
         self.units = self._units()
 
     def read(self, data: bytes) -> dict[str, Cell]:
-        """The values of a message; times in ns, one number each; sequences of messages are left out.
+        """Decode a message; each time is a number in ns; sequences of messages are left out.
 
         Raises:
-            struct.error, ValueError: the bytes are none of a message of this type.
+            struct.error, ValueError: the bytes are not a message of this type.
         """
         if self._ros1:
             cursor = _Cursor(data, 0, "<", False)
@@ -121,7 +128,7 @@ class RosReader:
             return
         if name not in definitions:
             raise ValueError(f"There is no definition of the message type {name}.")
-        self._types[name] = [_field(one, description) for one, description in definitions[name][1]]
+        self._types[name] = [_field(key, description) for key, description in definitions[name][1]]
         for field in self._types[name]:
             if field.nested:
                 self._define(field.kind, definitions, (*above, name))
@@ -132,12 +139,12 @@ class RosReader:
             key = prefix + field.name
             count = cursor.number("I") if field.many == 0 else field.many
             if count is None:
-                self._read_one(field, key, cursor, values)
+                self._read_value(field, key, cursor, values)
             elif field.nested or field.kind == "string":
-                # those of a sequence are passed over: their number changes from message to message
+                # sequences are skipped: their length changes from message to message
                 into = values if field.many and field.nested and count <= MOST_ELEMENTS else None
                 for place in range(count):
-                    self._read_one(field, f"{key}[{place}]", cursor, into)
+                    self._read_value(field, f"{key}[{place}]", cursor, into)
                 if field.kind == "string" and values is not None:
                     values[key] = ""
             else:
@@ -145,7 +152,7 @@ class RosReader:
                 if values is not None:
                     values[key] = found
 
-    def _read_one(self, field: _Field, key: str, cursor: _Cursor, values: dict[str, Cell] | None) -> None:
+    def _read_value(self, field: _Field, key: str, cursor: _Cursor, values: dict[str, Cell] | None) -> None:
         found: Cell
         cursor.step()
         if field.kind in (TIME, DURATION):
@@ -175,7 +182,7 @@ class RosReader:
 
 
 def _field(name: str, description: Any) -> _Field:
-    """A field from rosbags' description of it: (kind of node, (name, bound)) or (kind, (description, length))."""
+    """Convert rosbags' description of a field: (node kind, (name, bound)) or (node kind, (description, length))."""
     node, value = int(description[0]), description[1]
     count: int | None = None
     if node in (3, 4):  # an array of a known length, a sequence
@@ -189,7 +196,7 @@ def _field(name: str, description: Any) -> _Field:
 
 
 class _Cursor:
-    """A place in a message's bytes; CDR aligns each number to its size, from behind its four bytes of header."""
+    """A position in a message's bytes; CDR aligns each number to its size, counted after its four-byte header."""
 
     __slots__ = ("_aligned", "_begin", "_data", "_order", "_place", "_steps")
 
@@ -198,16 +205,16 @@ class _Cursor:
         self._steps = 0
 
     def step(self) -> None:
-        """One message within the message more."""
+        """Count a nested value or message, and check the limit."""
         self._steps += 1
         if self._steps > _MOST_STEPS:
-            raise ValueError(f"More than {_MOST_STEPS} messages within one.")
+            raise ValueError(f"More than {_MOST_STEPS} values and messages within a message.")
 
     def number(self, code: str) -> Any:
         return self._take(1, code)[0]
 
     def numbers(self, code: str, count: int) -> tuple[Any, ...]:
-        """That many numbers; of more than a row can have, their places alone are passed over."""
+        """Read ``count`` numbers; more than a row can hold are skipped and returned as zeros."""
         if count <= MOST_ELEMENTS:
             return self._take(count, code) if count else ()
         self._align(code)

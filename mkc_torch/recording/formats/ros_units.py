@@ -1,4 +1,4 @@
-"""Units of ROS messages, where their definitions state them (REP 103, and the comments in the .msg files)."""
+"""Units of ROS messages, as stated in REP 103 and in the comments of the .msg files."""
 
 from __future__ import annotations
 
@@ -26,4 +26,4 @@ ROS_UNITS: Mapping[str, Mapping[str, str]] = {
     "geometry_msgs/msg/Wrench": _axes("force", "N") | _axes("torque", "N·m"),
     "geometry_msgs/msg/PointStamped": _axes("point", "m"),
 }
-"""By type, the units of its fields; they hold wherever a message contains one of that type."""
+"""Message type to the units of its fields, also for nested messages of that type."""

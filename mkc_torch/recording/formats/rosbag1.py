@@ -1,7 +1,7 @@
-"""ROS 1 bags (``.bag``), format 2.0.
+"""Read ROS 1 bags (``.bag``), format 2.0.
 
-The records are walked here and not by rosbags, which refuses a bag that was not closed: a recorder that loses its power
-writes no index, and its messages are whole all the same.
+The records are read here, because rosbags rejects a bag that was not closed. A recorder that loses its power writes no
+index, but its messages are complete.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """
@@ -36,14 +36,14 @@ class _Record(NamedTuple):
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a bag: nested fields with dots, arrays ``[i]``, times in ns (``header.stamp``, ``log_time``).
+    """Read the topics of a bag: nested fields with dots, arrays ``[i]``, times in ns (``header.stamp``, ``log_time``).
 
-    The file is mapped, and read chunk by chunk. Memory is eight bytes a number, and a chunk of the file; messages of
-    more than 64 KiB, such as pictures, are passed over. A bag that was not closed, or is cut off, is read as far as it
-    goes.
+    The file is memory-mapped and read chunk by chunk. Memory is eight bytes per number plus a chunk of the file.
+    Messages larger than 64 KiB, such as images, are skipped. A bag that was not closed, or is cut off, is read as far
+    as possible.
 
     Raises:
-        RecordingError: no ROS 1 bag, one of another version, or one without a message that is understood.
+        RecordingError: the file is not a ROS 1 bag, is of another version, or has no readable message.
         ImportError: rosbags is not installed.
     """
     check_begins(path, "ROS 1 bag of version 2.0", _MAGIC)
@@ -76,14 +76,14 @@ def read(path: Path) -> list[Topic]:
         warnings.append(lost_warning(size - read_to, size, where, "cannot be read"))
     if broken:
         warnings.append(f"The bag is damaged or cut off: {broken} of its chunks could be read only in part.")
-    topics, told = log.topics()
+    topics, left_out = log.topics()
     if not topics:
-        raise no_rows(path, "ROS 1 bag", [*warnings, *told])
-    return with_warnings(topics, [*warnings, *told])
+        raise no_rows(path, "ROS 1 bag", [*warnings, *left_out])
+    return with_warnings(topics, [*warnings, *left_out])
 
 
 def _records(content: mmap.mmap | bytes, place: int) -> Iterator[_Record]:
-    """The records of a bag or a chunk, the last one perhaps not whole; they end where the bytes make no sense."""
+    """Yield the records of a bag or a chunk up to invalid bytes; the last record may be incomplete."""
     size = len(content)
     while place + 8 <= size:
         (length,) = _LENGTH.unpack_from(content, place)
@@ -101,7 +101,7 @@ def _records(content: mmap.mmap | bytes, place: int) -> Iterator[_Record]:
 
 
 def _header(data: bytes) -> dict[bytes, bytes] | None:
-    """The fields ``name=value`` of a header; None where there are none."""
+    """The fields ``name=value`` of a header; None if the header is invalid."""
     fields: dict[bytes, bytes] = {}
     place = 0
     while place + 4 <= len(data):
@@ -115,7 +115,7 @@ def _header(data: bytes) -> dict[bytes, bytes] | None:
 
 
 def _chunk(chunk: _Record, log: MessageLog) -> bool:
-    """Take the records of a chunk; whether all of them could be read."""
+    """Add the records of a chunk to the log; returns whether all records were readable."""
     size = chunk.header.get(b"size", b"")
     if len(size) != 4:
         return False
@@ -139,15 +139,15 @@ def _take(record: _Record, log: MessageLog) -> None:
 
 
 def _open(record: _Record, log: MessageLog) -> None:
-    said = _header_of_connection(record.data)
+    fields = _header_of_connection(record.data)
     topic = record.header.get(b"topic", b"").decode("utf-8", "replace")
-    kind = said.get(b"type", b"").decode("utf-8", "replace")
-    text = said.get(b"message_definition", b"").decode("utf-8", "replace")
+    kind = fields.get(b"type", b"").decode("utf-8", "replace")
+    text = fields.get(b"message_definition", b"").decode("utf-8", "replace")
     try:
         reader = RosReader(kind, parsed_definitions(text, type_name(kind)), ros1=True)
-    except Exception as error:  # what the parser raises over a damaged definition
+    except Exception as error:  # the parser raises arbitrary errors over a damaged definition
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        log.leave_out(topic, f"its messages, of {kind or 'no type'}, are not understood ({lines[0][:100]})")
+        log.leave_out(topic, f"its messages, of {kind or 'no type'}, cannot be read ({lines[0][:100]})")
     else:
         log.open(record.header.get(b"conn"), topic, kind, reader.read, reader.units)
 

@@ -1,7 +1,7 @@
-"""Bags of ROS 2: a folder with ``metadata.yaml``, or its ``.db3`` alone.
+"""Read ROS 2 bags: a folder with ``metadata.yaml``, or a single ``.db3`` file.
 
-The database is read by the sqlite3 of Python: rosbags reads no bag whose ``metadata.yaml`` is missing, as after a loss
-of power, and nothing of a database that is damaged.
+The database is read by Python's sqlite3: rosbags cannot read a bag without ``metadata.yaml``, as after a loss of power,
+or a damaged database.
 
 Source: github.com/ros2/rosbag2, rosbag2_storage_sqlite3 and docs/message_definition_encoding.md.
 """
@@ -31,15 +31,15 @@ _METADATA = "metadata.yaml"
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a bag, all of its files together: nested fields with dots, arrays ``[i]``, times in ns.
+    """Read the topics of a bag, from all of its files: nested fields with dots, arrays ``[i]``, times in ns.
 
-    ``header.stamp`` is the sensor's own time, ``log_time`` when the message was written down. Message types that the
-    bag does not define are those of ROS 2's own packages. The database is opened for reading only; memory is eight
-    bytes a number, and messages of more than 64 KiB, such as pictures, are passed over.
+    ``header.stamp`` is the sensor's own time; ``log_time`` is when the message was logged. Message types that the bag
+    does not define are taken from ROS 2's own packages. The database is opened read-only. Memory is eight bytes per
+    number; messages larger than 64 KiB, such as images, are skipped.
 
     Raises:
-        RecordingError: no such bag, one compressed as a whole, or one without a message that is understood.
-        ImportError: rosbags, or mcap for a bag that holds such files, is not installed.
+        RecordingError: not a ROS 2 bag, a bag compressed as a whole, or a bag without a readable message.
+        ImportError: rosbags is not installed, or mcap for a bag of MCAP files.
     """
     try:
         import rosbags.typesys  # noqa: F401
@@ -55,14 +55,14 @@ def read(path: Path) -> list[Topic]:
             warnings += gather_mcap(file, log)
         else:
             warnings += _gather_database(file, log)
-    topics, told = log.topics()
+    topics, left_out = log.topics()
     if not topics:
-        raise no_rows(path, "ROS 2 bag", [*warnings, *told])
-    return with_warnings(topics, [*warnings, *told])
+        raise no_rows(path, "ROS 2 bag", [*warnings, *left_out])
+    return with_warnings(topics, [*warnings, *left_out])
 
 
 def _files(folder: Path, warnings: list[str]) -> list[Path]:
-    """The files of a bag that metadata.yaml names, or those that lie there if it is damaged."""
+    """The files of a bag that metadata.yaml names, or all files of its folder if metadata.yaml is damaged."""
     there = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
     named = _named(folder / _METADATA)
     files = [folder / name for name in named]
@@ -70,7 +70,7 @@ def _files(folder: Path, warnings: list[str]) -> list[Path]:
     if any(name.endswith(".zstd") for name in named):
         raise RecordingError(f"{folder}: the bag is compressed file by file; unpack it: `unzstd {folder}/*.zstd`.")
     if not named:
-        warnings.append(f"{_METADATA} is damaged or names no file; all files beside it are read.")
+        warnings.append(f"{_METADATA} is damaged or names no file; all files in its folder are read.")
     if missing:
         warnings.append(f"{_METADATA} names {listed(missing)}, but there is no such file.")
     found = [path for path in files if path.is_file()] or there
@@ -80,36 +80,36 @@ def _files(folder: Path, warnings: list[str]) -> list[Path]:
 
 
 def _named(metadata: Path) -> list[str]:
-    """The names of the bag's files; none where they are not to be read."""
+    """The names of the bag's files; empty if metadata.yaml cannot be read."""
     from ruamel.yaml import YAML
 
     try:
         found: Any = YAML(typ="safe", pure=True).load(metadata.read_text(encoding="utf-8"))
         paths = found["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(name)).name for name in paths]
-    except Exception:  # a damaged text leads the parser to errors of many kinds; the files speak for themselves
+    except Exception:  # the parser raises arbitrary errors over a damaged text; the files of the folder are used
         return []
 
 
 def _gather_database(path: Path, log: MessageLog) -> list[str]:
-    """Add the messages of a database to a log, and say what of it is lost."""
+    """Add the messages of a database to a log; returns warnings about lost parts."""
     if path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty; record it anew, or copy it whole.")
+        raise RecordingError(f"{path}: the file is empty; record it again, or copy the whole file.")
     if begins_with(path, _ZSTD):
         raise RecordingError(f"{path}: the file is compressed; unpack it: `unzstd {path}`.")
     check_begins(path, "database of a ROS 2 bag", _MAGIC)
     warnings = []
-    beside = [f"{path.name}{end}" for end in ("-wal", "-journal") if path.with_name(path.name + end).exists()]
-    if beside:
+    pending = [f"{path.name}{end}" for end in ("-wal", "-journal") if path.with_name(path.name + end).exists()]
+    if pending:
         warnings.append(
-            f"Beside the bag lies {listed(beside)}, rows not yet written into it; open the bag once with `sqlite3`."
+            f"{listed(pending)} holds rows that are not yet written into the bag; open the bag once with `sqlite3`."
         )
-    # immutable: neither a lock nor a journal is made beside the user's file
+    # immutable: sqlite creates no lock or journal in the user's folder
     address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
     with guarded(path, "ROS 2 bag"), contextlib.closing(sqlite3.connect(address, uri=True)) as base:
         base.execute("PRAGMA trusted_schema = OFF")
         base.execute("PRAGMA cell_size_check = ON")
-        # a view can stand for rows without end
+        # only tables: a view can generate rows without end
         tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             raise RecordingError(f"{path}: the database holds no ROS 2 bag (the tables `topics` and `messages`).")
@@ -127,15 +127,15 @@ def _open_topics(path: Path, base: sqlite3.Connection, log: MessageLog) -> None:
                 raise ValueError(f"encoded as {encoding}, not cdr")
             own = parsed_definitions(text, type_name(str(kind)), idl=form == "ros2idl") if text else {}
             reader = RosReader(str(kind), {**known_definitions(), **own})
-        except Exception as error:  # what the parser raises over a damaged definition
+        except Exception as error:  # the parser raises arbitrary errors over a damaged definition
             lines = str(error).strip().splitlines() or [type(error).__name__]
-            log.leave_out(str(name), f"its messages, of {kind}, are not understood ({lines[0][:100]})")
+            log.leave_out(str(name), f"its messages, of {kind}, cannot be read ({lines[0][:100]})")
         else:
             log.open((path, number), str(name), str(kind), reader.read, reader.units)
 
 
 def _definitions(base: sqlite3.Connection) -> dict[str, tuple[str, str]]:
-    """By type, its definition and how that is written; bags from before 2023 have none."""
+    """Message type to its definition and the encoding of that; bags from before 2023 have no definitions."""
     try:
         rows = base.execute("SELECT topic_type, encoded_message_definition, encoding FROM message_definitions")
         return {str(kind): (str(text or ""), str(form)) for kind, text, form in rows}
@@ -150,7 +150,7 @@ def _add_messages(path: Path, base: sqlite3.Connection, log: MessageLog) -> list
                 plain = inflated("zstd", data, LARGEST_MESSAGE + 1) if data.startswith(_ZSTD) else data
                 log.add((path, number), plain, time)
     except sqlite3.DatabaseError as error:
-        return [f"The database is damaged or cut off ({error}); its messages up to there are read."]
+        return [f"The database is damaged or cut off ({error}); its messages before the damage are read."]
     return []
 
 

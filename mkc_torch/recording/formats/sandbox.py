@@ -1,4 +1,4 @@
-"""A file read in a process of its own first, where the library that reads it may end or never end over damaged ones."""
+"""Read a file in a separate process first, because its library may crash or hang over a damaged file."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from mkc_torch.recording.formats.base import RecordingError
 __all__ = ["broken", "reads_without_crash"]
 
 _PATIENCE = 20.0, 0.5
-"""Seconds, and seconds for each MB of the file."""
+"""Time limit: seconds, plus seconds per MB of the file."""
 
 
 def reads_without_crash(path: Path, program: str) -> bool:
-    """Whether a process that reads a file comes to its end, with an error or without.
+    """Whether a separate process that reads a file ends normally, with or without a Python error.
 
     Args:
-        path: of the file, the program's one argument.
-        program: in Python.
+        path: path of the file, the program's only argument.
+        program: Python source of the program.
     """
     patience = _PATIENCE[0] + _PATIENCE[1] * path.stat().st_size / 1e6
     command = [sys.executable, "-c", program, str(path)]
@@ -27,10 +27,10 @@ def reads_without_crash(path: Path, program: str) -> bool:
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=patience)
     except subprocess.TimeoutExpired:
         return False
-    # Python itself ends with 0 or 1; what a library ends by is a signal here, and another code on Windows
+    # Python exits with 0 or 1; a crash is a signal, or another exit code on Windows
     return done.returncode in (0, 1)
 
 
 def broken(path: Path, what: str) -> RecordingError:
-    """The error over a file that its library does not survive."""
-    return RecordingError(f"{path}: the {what} is damaged; copy it anew from where it was written.")
+    """The error about a file over which its library crashes."""
+    return RecordingError(f"{path}: the {what} is damaged; copy it again from where it was written.")

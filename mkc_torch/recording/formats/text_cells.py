@@ -1,4 +1,4 @@
-"""Cells of a line of text: where they are cut, and which of them are values."""
+"""Split lines of text into cells, and classify the cells."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ WHITE = " "
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", WHITE: "space"}
 
 _ORDER = ("\t", ";", "|", ",", WHITE)
-"""Of separators that explain a table equally well the first is it."""
+"""Precedence of separators that explain a table equally well."""
 
 _BLANKS = 0.9
-"""What blanks explain counts less: a stamp of date and time has one within it."""
+"""Score factor of blanks as separators; a stamp of date and time contains a blank."""
 
 _LOOKED_AT = 120
-"""Lines at the beginning and in the middle by which the separator is found."""
+"""Number of lines at the beginning, and in the middle, from which the separator is detected."""
 
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
 _DATE = r"\d{4}-\d\d-\d\d|\d{4}([/.]\d{1,2}){2}|(\d{1,2}[/.]){2}\d{4}|\d{1,2}-[A-Za-z]{3}-\d{4}"
 _OF_DAY = r"(\d{1,2}:\d\d(:\d\d([.,]\d+)?)?(\s?[AaPp]\.?[Mm]\.?)?|\d{1,3}:\d\d[.,]\d+)"
 _STAMP = re.compile(rf"({_DATE})(,?[T ]\s*\d{{1,2}}.*)?|\d{{8}}T\d\d.*|{_OF_DAY}")
 _WHITE_WORDS = re.compile(r'"[^"]*"|[^\s"]+(?:\s*[\[(][^\])]*[\])])?')
-"""Between blanks; a unit in brackets belongs to the word before it."""
+"""Words between blanks; a unit in brackets belongs to the word before it."""
 
 
 def cells_of(line: str, separator: str) -> list[str]:
@@ -52,7 +52,7 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 
 def count_of(line: str, separator: str) -> int:
-    """How many cells a line has."""
+    """The number of cells of a line."""
     if separator == WHITE or '"' in line:
         return len(cells_of(line, separator))
     return line.count(separator) + 1
@@ -75,22 +75,22 @@ def is_value(cell: str) -> bool:
 
 
 def is_stamp(cell: str) -> bool:
-    """Whether a cell holds a date, or a time of the day."""
+    """Whether a cell holds a date, a time of the day, or both."""
     return _STAMP.fullmatch(cell.strip()) is not None
 
 
 def is_date(cell: str) -> bool:
-    """Whether a cell holds a date alone."""
+    """Whether a cell holds only a date."""
     return re.fullmatch(_DATE, cell.strip()) is not None
 
 
 def is_time_of_day(cell: str) -> bool:
-    """Whether a cell holds a time of the day alone."""
+    """Whether a cell holds only a time of the day."""
     return re.fullmatch(_OF_DAY, cell.strip()) is not None
 
 
 def separator_of(lines: Sequence[str]) -> tuple[str, int]:
-    """The separator by which most lines fall into equally many cells that hold values, and how many that is.
+    """The separator that splits most lines into equally many cells with values, and that number of cells.
 
     Example:
         >>> separator_of(["time;mag", "0,1;2,5", "0,2;2,6"])
@@ -113,5 +113,5 @@ def separator_of(lines: Sequence[str]) -> tuple[str, int]:
             best, found = score, (separator, count)
     if found is not None:
         return found
-    separator = max((one for one in SEPARATORS if one != WHITE), key=re.sub('"[^"]*"', "", seen[0]).count)
+    separator = max((sign for sign in SEPARATORS if sign != WHITE), key=re.sub('"[^"]*"', "", seen[0]).count)
     return separator, count_of(seen[0], separator)

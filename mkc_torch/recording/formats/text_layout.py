@@ -1,4 +1,4 @@
-"""What each line of a text table is: a comment, text above the header, the header, its units, a row, or cut short."""
+"""Classify the lines of a text table: comments, text above the header, header, units, rows, and truncated lines."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ __all__ = ["Layout", "layout_of"]
 _MARKS = ("#", "%", "//", ";")
 _DIGITS = frozenset("0123456789+-.")
 _CUT_NUMBER = re.compile(r"[+-]?(\d*[.,]?\d*([eE][+-]?)?|na?|in?)")
-"""What is left of a number that ended anywhere."""
+"""Pattern of a truncated number."""
 
 _MANY = 10
-"""Lines from which it is the header that is wrong."""
+"""Fewest lines with another number of cells than the header if the header is wrong."""
 
-_FIXED, _MOST = 20, 300
-"""Rows from which as many decimals everywhere are the format's, and how many are looked at."""
+_FIXED = 20
+"""Fewest rows with equally many decimals if the number of decimals is fixed."""
+
+_MOST = 300
+"""Most rows whose decimals are counted."""
 
 
 class Layout(NamedTuple):
-    """A text table taken apart.
+    """The parts of a text table.
 
     Attributes:
-        separator: between cells.
-        names: the header's cells.
-        units: the cells of a row of units below it; empty where there is none.
-        rows: its rows.
-        restarts: rows, from 0, before which the header stands again.
+        separator: the sign between cells.
+        names: the cells of the header.
+        units: the cells of the row of units; empty without such a row.
+        rows: the rows of values.
+        restarts: row indices at which the header is repeated.
         warnings: what was skipped.
     """
 
@@ -47,10 +50,10 @@ class Layout(NamedTuple):
 
 
 def layout_of(path: Path, lines: list[Line]) -> Layout:
-    """Take a text table apart.
+    """Find the parts of a text table.
 
     Raises:
-        RecordingError: there is no header, there are no rows, or a line between rows is none of them.
+        RecordingError: no header, no rows, or a line between rows that is not a row.
     """
     comments = [line for line in lines if _is_marked(line.text)]
     separator, count = separator_of([line.text for line in lines if not _is_marked(line.text)] or [lines[0].text])
@@ -64,9 +67,10 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
     head = _head(path, plain, comments, separator, count)
     body = [line for line in plain if line.number not in head.lines]
     rows, restarts, skipped = _rows(path, head, body)
-    told = [line for line in comments if line.number not in head.lines]
-    if told:
-        warnings.append(f"{counted(len(told), 'comment line')} skipped, the first {_shown(told[0])}.")
+    skipped_comments = [line for line in comments if line.number not in head.lines]
+    if skipped_comments:
+        number = counted(len(skipped_comments), "comment line")
+        warnings.append(f"{number} skipped, the first {_shown(skipped_comments[0])}.")
     if head.above:
         warnings.append(
             f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
@@ -74,13 +78,24 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
     if not rows:
         why = f" {' '.join(skipped)}" if skipped else ""
         raise RecordingError(
-            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew.{why}"
+            f"{path}: the file has a header line but no rows of numbers; copy the whole file, or export it again.{why}"
         )
     return Layout(separator, head.names, head.units, rows, restarts, warnings + skipped)
 
 
 class _Head(NamedTuple):
-    """The header: its cells and text, units below it, the numbers of its lines, what stands above; if it is by rows."""
+    """The header of a text table.
+
+    Attributes:
+        separator: the sign between cells.
+        names: its cells.
+        text: its line, stripped.
+        units: the cells of the row of units; empty without such a row.
+        units_text: the line of units, stripped; empty without such a row.
+        lines: line numbers of the header, the units and the lines above.
+        above: the lines above the first row that are neither header nor units.
+        has_rows: False if the table has no row of numbers.
+    """
 
     separator: str
     names: list[str]
@@ -97,10 +112,10 @@ def _is_marked(text: str) -> bool:
 
 
 def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, count: int) -> _Head:
-    """Find the header: the last line of names above the first row, or a comment there, or names further down."""
+    """Find the header: the last line of names above the first row, a comment above it, or names further down."""
     if not plain:
         raise RecordingError(
-            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew."
+            f"{path}: the file has a header line but no rows of numbers; copy the whole file, or export it again."
         )
 
     def split(line: Line) -> list[str]:
@@ -130,37 +145,37 @@ def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, c
 
 
 def _of_text(plain: list[Line], split: Callable[[Line], list[str]], separator: str) -> _Head:
-    """A table without a row of numbers: its first line is the header."""
+    """The header of a table without a row of numbers: its first line."""
     header, units = plain[0], plain[1] if len(plain) > 1 and _are_units(split(plain[1])) else None
     used = {header.number} | ({units.number} if units else set())
     return _Head(separator, split(header), header.text.strip(), [], "", used, [], has_rows=False)
 
 
 def _unusual_head(path: Path, plain: list[Line], comments: list[Line], first: int, separator: str, count: int) -> _Head:
-    """A header that has numbers among its names, is a comment, stands between rows, or has another number of cells."""
+    """A header with numbers as names, in a comment, between rows, or with another number of cells than the rows."""
     row = cells_of(plain[first].text, separator)
     if _names_among_numbers(row, plain[first + 1 :], separator):
         line = plain[first]
         above = plain[:first]
-        return _Head(separator, row, line.text.strip(), [], "", {one.number for one in [*above, line]}, above)
-    for comment in reversed([one for one in comments if one.number < plain[first].number]):
+        return _Head(separator, row, line.text.strip(), [], "", {other.number for other in [*above, line]}, above)
+    for comment in reversed([other for other in comments if other.number < plain[first].number]):
         cells = cells_of(re.sub(r"^\s*(#|%|//|;)+\s?", "", comment.text), separator)
         if len(cells) == count and not any(map(is_value, cells)) and any(cell.strip() for cell in cells):
             above = plain[:first]
-            used = {one.number for one in above} | {comment.number}
+            used = {other.number for other in above} | {comment.number}
             return _Head(separator, cells, comment.text.strip(), [], "", used, above)
     for line in plain[first + 1 :]:
         cells = cells_of(line.text, separator)
         if len(cells) == count and all(cell.strip() and not is_value(cell) for cell in cells):
             above = plain[:first]
-            return _Head(separator, cells, line.text.strip(), [], "", {one.number for one in above}, above)
+            return _Head(separator, cells, line.text.strip(), [], "", {other.number for other in above}, above)
     if first == 0:
         raise RecordingError(
             f"{path}: the first line holds numbers; it must hold the column names: add a first line such as "
             "time,mag_x,mag_y,mag_z."
         )
     line = plain[first - 1]
-    used = {one.number for one in plain[:first]}
+    used = {other.number for other in plain[:first]}
     return _Head(separator, cells_of(line.text, separator), line.text.strip(), [], "", used, plain[: first - 1])
 
 
@@ -169,12 +184,12 @@ def _is_row(cells: Sequence[str], count: int) -> bool:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    told = [cell.strip() for cell in cells if cell.strip(" -")]
-    return bool(told) and all(is_unit(cell) for cell in told)
+    units = [cell.strip() for cell in cells if cell.strip(" -")]
+    return bool(units) and all(is_unit(cell) for cell in units)
 
 
 def _last_unique(lines: list[Line], split: Callable[[Line], list[str]]) -> Line | None:
-    """The last line whose cells differ; the last of all, where none has such."""
+    """The last line with distinct cells, or else the last line; None without lines."""
     for line in reversed(lines):
         names = [cell.strip() for cell in split(line) if cell.strip()]
         if len(set(names)) == len(names) and names:
@@ -183,7 +198,7 @@ def _last_unique(lines: list[Line], split: Callable[[Line], list[str]]) -> Line 
 
 
 def _names_among_numbers(cells: list[str], after: list[Line], separator: str) -> bool:
-    """Whether a line is a header some of whose names are numbers: there is text where the next row has a number."""
+    """Whether a line is a header with numbers as names: it holds text above a number of the next row."""
     if all(is_value(cell) for cell in cells) or not after:
         return False
     below = cells_of(after[0].text, separator)
@@ -192,10 +207,10 @@ def _names_among_numbers(cells: list[str], after: list[Line], separator: str) ->
 
 
 def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[list[Line], int, list[str]]:
-    """Rows that all end with a separator more than the header has lose it.
+    """Remove a trailing separator from the rows if all rows have it and the header does not.
 
     Returns:
-        The lines, how many cells a row has then, and a sentence.
+        The lines, the number of cells of a row, and warnings.
     """
     if separator == WHITE or count < 2:
         return lines, count, []
@@ -208,15 +223,15 @@ def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[li
     rows = [end for end, n in zip(ends, counts, strict=True) if n == count]
     if not all(rows) or count in names or count - 1 not in names:
         return lines, count, []
-    told = [
+    trimmed = [
         Line(line.number, line.text.rstrip(" ").removesuffix(separator)) if end and n == count else line
         for line, end, n in zip(lines, ends, counts, strict=True)
     ]
-    return told, count - 1, [f"Every row ends with a {SEPARATORS[separator]} too many."]
+    return trimmed, count - 1, [f"Every row ends with an extra {SEPARATORS[separator]}."]
 
 
 def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[int, ...], list[str]]:
-    """The rows of a table, where the header stands again, and what was skipped."""
+    """The rows of a table, the row indices of repeated headers, and warnings about skipped lines."""
     rows: list[Line] = []
     restarts: list[Line] = []
     at: list[int] = []
@@ -233,8 +248,8 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
         if text == head.text or (len(head.text) > 2 and text.endswith(head.text)):
             if text != head.text:
                 pending.append(Line(line.number, text.removesuffix(head.text)))
-            for one in pending:
-                (cut if _is_cut(one.text, head.separator, count) else between).append(one)
+            for other in pending:
+                (cut if _is_cut(other.text, head.separator, count) else between).append(other)
             pending = []
             restarts.append(line)
             if rows:
@@ -244,7 +259,7 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
             continue
         if line.text.count('"') % 2:
             if line is not body[-1]:
-                raise RecordingError(f"{path}: line {line.number} has a quotation mark that does not end; correct it.")
+                raise RecordingError(f"{path}: line {line.number} has an unclosed quotation mark; correct it.")
             pending.append(line)
             continue
         names = head.has_rows and text[0] not in _DIGITS and _is_names(line.text, head.separator)
@@ -260,43 +275,47 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
     if last is not None and last not in pending:
         rows.remove(last)
     begins = tuple(row for row in dict.fromkeys(at) if row < len(rows))
-    told = _told(restarts, at, cut, between, last)
+    warnings = _skip_warnings(restarts, at, cut, between, last)
     if broken:
-        told.append(f"{counted(len(broken), 'line')} cut short by zero bytes left out, the first {_shown(broken[0])}.")
-    return rows, begins, told
+        warnings.append(
+            f"{counted(len(broken), 'line')} cut short by zero bytes left out, the first {_shown(broken[0])}."
+        )
+    return rows, begins, warnings
 
 
-def _told(restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None) -> list[str]:
-    told = []
+def _skip_warnings(
+    restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None
+) -> list[str]:
+    warnings = []
     if restarts and at:
         numbers = ", ".join(str(line.number) for line in restarts[:5]) + (", …" if len(restarts) > 5 else "")
-        told.append(
-            f"The header stands again in line{'s' if len(restarts) > 1 else ''} {numbers}, as after a restart of the "
+        warnings.append(
+            f"The header is repeated in line{'s' if len(restarts) > 1 else ''} {numbers}, as after a restart of the "
             "logger."
         )
     if cut:
-        told.append(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}.")
+        warnings.append(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}.")
     if between:
-        told.append(f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}.")
+        warnings.append(f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}.")
     if last is not None:
-        told.append(f"The last line is cut short and left out, {_shown(last)}.")
-    return told
+        warnings.append(f"The last line is cut short and left out, {_shown(last)}.")
+    return warnings
 
 
 def _is_names(text: str, separator: str) -> bool:
-    """Whether a line holds words alone, as another header would."""
+    """Whether a line holds only words, like a header."""
     cells = [cell for cell in cells_of(text, separator) if cell.strip()]
     return len(cells) > 1 and not any(is_value(cell) or _CUT_NUMBER.fullmatch(cell.strip()) for cell in cells)
 
 
 def _is_cut(text: str, separator: str, count: int) -> bool:
-    """Whether a line is the beginning of a row."""
+    """Whether a line is a truncated row."""
     cells = cells_of(text, separator)
     return len(cells) <= count and all(is_value(cell) for cell in cells[:-1]) and any(map(is_value, cells))
 
 
 def _last_cut(head: _Head, rows: list[Line], pending: list[Line]) -> Line | None:
-    """The last line, where it ends before its row does."""
+    """The last line if it is a truncated row, else None."""
     if len(pending) == 1:
         text = pending[0].text
         short = count_of(text, head.separator) < len(head.names) or bool(text.count('"') % 2)
@@ -315,7 +334,7 @@ def _last_cut(head: _Head, rows: list[Line], pending: list[Line]) -> Line | None
 
 
 def _decimals(cell: str) -> int:
-    """Digits after the point of a plain number; many where it is none, so that it never counts as shorter."""
+    """Number of digits after the decimal point; 99 for other cells, so that they never count as shorter."""
     found = re.fullmatch(r"[+-]?\d+(?:[.,](\d*))?", cell.strip())
     return 99 if found is None else len(found[1] or "")
 
@@ -323,20 +342,20 @@ def _decimals(cell: str) -> int:
 def _strange(path: Path, head: _Head, line: Line, alike: int = 1) -> RecordingError:
     if count_of(line.text, head.separator) == len(head.names):
         return RecordingError(
-            f"{path}: line {line.number} holds words and no numbers, {_quoted(line)}: another header, or text; split "
+            f"{path}: line {line.number} holds words and no numbers, {_quoted(line)}: a second header, or text; split "
             "the file there, or remove the line."
         )
     count = count_of(line.text, head.separator)
-    mend = "correct or remove that line" if alike < _MANY else "other lines are like it, so correct the header"
+    remedy = "correct or remove that line" if alike < _MANY else "other lines are the same, so correct the header"
     return RecordingError(
         f"{path}: line {line.number} has {counted(count, 'value')} but the header names "
-        f"{counted(len(head.names), 'column')} (the separator is the {SEPARATORS[head.separator]}); {mend}."
+        f"{counted(len(head.names), 'column')} (the separator is the {SEPARATORS[head.separator]}); {remedy}."
         f"{_comma_advice(head, line)}"
     )
 
 
 def _comma_advice(head: _Head, line: Line) -> str:
-    """Where decimals and cells are separated by one sign, nobody can tell them apart."""
+    """Advice if commas may separate both decimals and cells; else empty."""
     count = count_of(line.text, head.separator)
     if head.separator == "," and count > len(head.names) and "." not in line.text:
         return " If the decimals are written with a comma, export the table with semicolons."

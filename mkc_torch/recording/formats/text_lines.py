@@ -1,4 +1,4 @@
-"""A text file as numbered lines: its encoding, and what a power-off leaves at its end."""
+"""Read a text file as numbered lines: detect its encoding, and skip the zero bytes of a power loss."""
 
 from __future__ import annotations
 
@@ -13,16 +13,25 @@ from mkc_torch.recording.formats.magic_numbers import is_of_another_kind, wrong_
 __all__ = ["Line", "lines_of"]
 
 _SAMPLE = 4096
+"""Bytes or characters at the beginning that are examined."""
+
 _UTF_16 = 0.4
-"""Share of zero bytes at the even, or at the odd, places from which text without a mark is UTF-16: ASCII has 1."""
+"""Smallest share of zero bytes at even or odd offsets of UTF-16 without a byte order mark; for ASCII text it is 1."""
 
 _FEW_CUTS = 3
+"""Most lines with zero bytes, if these are a sign of power losses; with more, they are the line ends of a program."""
 
 _PLAIN = {"\t", "\n", "\r", "\f", "\0", "\x1a"}
 
 
 class Line(NamedTuple):
-    """A line that is not blank, its number in the file, from 1, and whether zero bytes took its end."""
+    """A line that is not blank.
+
+    Attributes:
+        number: line number in the file, from 1.
+        text: the line.
+        cut: True if zero bytes replaced its end.
+    """
 
     number: int
     text: str
@@ -30,17 +39,18 @@ class Line(NamedTuple):
 
 
 def lines_of(path: Path) -> tuple[list[Line], list[str]]:
-    """The lines of a file that are not blank, and sentences about what had to be done to read them.
+    """Read the lines of a file that are not blank, and warnings about its encoding.
 
-    UTF-8, UTF-16 (by its mark, or by its zero bytes), and Latin-1 where everything outside ASCII is printable there,
-    such as µ and °. Zero bytes, which a file system leaves where power went off, are skipped.
+    Encodings: UTF-8, UTF-16 (by its byte order mark or its zero bytes), Windows-1252, and Latin-1 if all characters
+    outside ASCII are printable, such as µ and °. Zero bytes, which a file system leaves after a power loss, are
+    skipped.
 
     Raises:
-        RecordingError: the file is no text, or holds none.
+        RecordingError: the file is not text, or is empty.
     """
     data = path.read_bytes()
     if is_of_another_kind(data):
-        raise wrong_format_error(path, "text")
+        raise wrong_format_error(path, "text file")
     text, warnings = _decoded(path, data)
     if "\u2212" in text:
         text = text.replace("\u2212", "-")
@@ -56,12 +66,11 @@ def lines_of(path: Path) -> tuple[list[Line], list[str]]:
             lines += [Line(number, part, cut) for part, cut in zip(parts, ends, strict=True) if part.strip()]
         elif line.strip():
             lines.append(Line(number, line))
-    if sum(line.cut for line in lines) > max(_FEW_CUTS, len(lines) // 100):  # a program's way of ending lines
+    if sum(line.cut for line in lines) > max(_FEW_CUTS, len(lines) // 100):  # the line ends of a program
         lines = [line._replace(cut=False) for line in lines]
     if zeros:
         warnings.append(
-            f"Zero bytes, as a power-off leaves them, are skipped in {counted(len(zeros), 'line')}, the first "
-            f"{zeros[0]}."
+            f"Zero bytes, as left by a power loss, are skipped in {counted(len(zeros), 'line')}, the first {zeros[0]}."
         )
     if not lines:
         raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
@@ -75,7 +84,7 @@ def _decoded(path: Path, data: bytes) -> tuple[str, list[str]]:
     if unmarked := _without_mark(data[:_SAMPLE]):
         return _utf_16(path, data, unmarked)
     try:
-        # what is cut within a letter at the end is left out
+        # an incomplete character at the end is left out
         text = codecs.getincrementaldecoder("utf-8-sig")().decode(data, final=False)
     except UnicodeDecodeError as error:
         return _latin_1(path, data, error.start)
@@ -88,15 +97,14 @@ def _utf_16(path: Path, data: bytes, name: str) -> tuple[str, list[str]]:
         text = codecs.getincrementaldecoder(name)().decode(data, final=False)
     except UnicodeDecodeError as error:
         raise RecordingError(
-            f"{path}: the file begins as UTF-16 does, but is no such text from byte {error.start} on; export it as CSV "
-            "in UTF-8."
+            f"{path}: the file begins as UTF-16 but is not valid from byte {error.start} on; export it as CSV in UTF-8."
         ) from None
     _refuse_binary(path, text)
     return text, []
 
 
 def _without_mark(head: bytes) -> str | None:
-    """UTF-16 by every other byte being zero."""
+    """The UTF-16 encoding of text without a byte order mark, by its zero bytes; None for other text."""
     half = len(head) // 2
     if half < 4 or head.strip(b"\0") == b"":
         return None
@@ -114,7 +122,7 @@ def _latin_1(path: Path, data: bytes, start: int) -> tuple[str, list[str]]:
             text = data.decode("cp1252")
         except UnicodeDecodeError:
             text = ""
-        if text and all(one.isprintable() or one in _PLAIN for one in text):
+        if text and all(letter.isprintable() or letter in _PLAIN for letter in text):
             return text, [f"The file is not UTF-8 and was read as Windows-1252, first in line {line}."]
         raise RecordingError(
             f"{path}: the file is not UTF-8 text: line {line} holds the byte 0x{data[start]:02x}; export it as CSV in "
@@ -128,6 +136,6 @@ def _latin_1(path: Path, data: bytes, start: int) -> tuple[str, list[str]]:
 
 def _refuse_binary(path: Path, text: str) -> None:
     head = text[:_SAMPLE]
-    strange = [one for one in head if (one < " " and one not in _PLAIN) or one == "\ufffe"]
+    strange = [letter for letter in head if (letter < " " and letter not in _PLAIN) or letter == "\ufffe"]
     if len(strange) > 0.02 * len(head):
         raise RecordingError(f"{path}: the file is not text but binary data; export it as CSV in UTF-8.")

@@ -1,4 +1,4 @@
-"""Numbers in cells as people write them: signs between thousands, and a unit behind each of a column."""
+"""Numbers in cells as people write them: thousands separators, and a unit after each number."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _COMMAS = r"^\s*[+-]?\d{1,3}(?:,\d{3})+\.\d+\s*$"
 _OTHERS = r"^\s*[+-]?\d{1,3}(?:['’\u00a0\u202f\u2009 ]\d{3})+(?:[.,]\d+)?\s*$"
 _GROUPED = {".": r"^\s*[+-]?\d{1,3}(?:\.\d{3})+(?:,\d+)?\s*$", ",": r"^\s*[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?\s*$"}
 _PLAIN = {".": r"^\s*[+-]?\d*\.(?:\d{1,2}|\d{4,})\s*$", ",": r"^\s*[+-]?\d*,(?:\d{1,2}|\d{4,})\s*$"}
-"""What a sign is no sign between thousands in."""
+"""Numbers in which the sign is the decimal separator, not a thousands separator."""
 
 _WRITTEN = re.compile("|".join((_POINTS, _COMMAS, _OTHERS)))
 _WITH_UNIT = r"^\s*([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-zµμ°%][A-Za-zµμ°%/²^0-9]*)\s*$"
@@ -23,7 +23,7 @@ _UNIT = re.compile(_WITH_UNIT)
 
 
 def is_written_number(cell: str) -> bool:
-    """Whether a cell is a number with signs between thousands that nothing else can be, or one with its unit.
+    """Whether a cell is a number with unambiguous thousands separators, or a number with a unit.
 
     Example:
         >>> [is_written_number(cell) for cell in ("1.234,5", "-33,558.60", "33'558", "24.1 uT", "1,234", "12 apples")]
@@ -36,31 +36,31 @@ def is_written_number(cell: str) -> bool:
 
 
 def without_thousands(series: Sequence[Any]) -> tuple[list[Any], bool]:
-    """Columns of text without the signs between thousands, and whether there were any.
+    """Remove thousands separators from columns of text; returns the columns, and whether there were any.
 
-    A point is one where a cell of the file has points before a comma, and none has a point that ends a number
-    otherwise; a comma likewise. Apostrophes and blanks before three digits are nothing else.
+    A point is a thousands separator if a cell has points before a comma and no cell has a decimal point; a comma
+    likewise. Apostrophes and blanks before three digits are always thousands separators.
     """
     found, done = list(series), False
-    for sign, both in ((".", _POINTS), (",", _COMMAS)):
-        if any(bool(one.str.contains(both).any()) for one in found) and not any(
-            bool(one.str.contains(_PLAIN[sign]).any()) for one in found
+    for separator, both in ((".", _POINTS), (",", _COMMAS)):
+        if any(bool(column.str.contains(both).any()) for column in found) and not any(
+            bool(column.str.contains(_PLAIN[separator]).any()) for column in found
         ):
-            found = [_without(one, _GROUPED[sign], re.escape(sign)) for one in found]
+            found = [_without(column, _GROUPED[separator], re.escape(separator)) for column in found]
             done = True
-    if any(bool(one.str.contains(_OTHERS).any()) for one in found):
-        found = [_without(one, _OTHERS, r"['’\u00a0\u202f\u2009 ]") for one in found]
+    if any(bool(column.str.contains(_OTHERS).any()) for column in found):
+        found = [_without(column, _OTHERS, r"['’\u00a0\u202f\u2009 ]") for column in found]
         done = True
     return found, done
 
 
-def _without(series: Any, cells: str, sign: str) -> Any:
+def _without(series: Any, cells: str, separator: str) -> Any:
     has = series.str.contains(cells).fill_null(False)
-    return series.str.replace_all(sign, "").zip_with(has, series) if bool(has.any()) else series
+    return series.str.replace_all(separator, "").zip_with(has, series) if bool(has.any()) else series
 
 
 def without_units(series: Any) -> tuple[Any, str]:
-    """A column without the unit that stands behind each of its numbers, and the unit; empty where none does."""
+    """Remove a unit that follows each number of a column; returns the column and the unit, empty if there is none."""
     known = series.drop_nulls()
     known = known.filter(known.str.strip_chars() != "")
     first = _UNIT.fullmatch(known[0]) if len(known) else None

@@ -1,4 +1,4 @@
-"""A topic from NumPy arrays: numbers become columns, and what is none is left out and told."""
+"""Make a topic of NumPy arrays: numbers become columns; other arrays are left out with a warning."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 __all__ = ["MOST_ELEMENTS", "spread", "topic_of"]
 
 MOST_ELEMENTS = 64
-"""An array of more elements a row is a picture, a spectrum or a map, and no set of channels."""
+"""Most elements of an array per row; larger arrays are images, spectra or maps, not sets of channels."""
 
 _STAMP = re.compile(r"\s*\d{4}-\d\d-\d\d([T ]\d\d:\d\d|\s*$)")
 _LABELS = "experiment"
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of an array (N, …): ``name_x``, ``name_y``, ``name_z`` of three, ``name[0]``, … of another number.
+    """Split an array (N, …) into columns: ``name_x``, ``name_y``, ``name_z`` for (N, 3), else ``name[0]``, ….
 
     Example:
         >>> list(spread("mag", np.zeros((5, 3)))), list(spread("q", np.zeros((5, 2)))), list(spread("t", np.zeros(5)))
@@ -45,15 +45,16 @@ def topic_of(
     warnings: Sequence[str] = (),
     line: str = "row",
 ) -> Topic | None:
-    """A topic of columns of one length; None where none of them holds numbers.
+    """Make a topic of columns of equal length; None if no column holds numbers.
 
-    Text is left out, unless it begins as a time stamp of ISO 8601 does or is the column ``experiment``.
+    Text is left out unless it begins like an ISO 8601 time stamp or is the column ``experiment``.
 
     Args:
+        name: name of the topic.
         columns: name to values (N,), of any type.
-        units: of columns; those left out are passed over.
-        warnings: what was found before.
-        line: what a row is called in messages.
+        units: column to unit; columns that are left out are ignored.
+        warnings: warnings to keep.
+        line: the word for a row in messages.
     """
     package = polars()
     kept: dict[str, Any] = {}
@@ -73,27 +74,27 @@ def topic_of(
                 text.append(key)
         else:
             other.append(key)
-    told = list(warnings)
+    found = list(warnings)
     for names, what in ((text, "text"), (other, "no plain numbers")):
         if names:
-            told.append(f"{_columns(names)} {'holds' if len(names) == 1 else 'hold'} {what} and {_left(names)}.")
+            found.append(f"{_columns(names)} {'holds' if len(names) == 1 else 'hold'} {what} and {_left(names)}.")
     if not any(series.dtype != package.String for series in kept.values()):
         return None
     rows = len(next(iter(kept.values())))
     table = Table(list(kept), list(kept.values()), range(1, rows + 1), line)
     known = {key: unit for key, unit in {**more_units, **(units or {})}.items() if key in kept and unit}
-    return Topic(name, table, known, tuple(told))
+    return Topic(name, table, known, tuple(found))
 
 
 def _native(values: np.ndarray) -> np.ndarray:
-    """In one block, in the machine's order of bytes, and of a width that tables have."""
+    """Convert an array to contiguous memory, native byte order, and 32 or 64 bits for floats."""
     if values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
         return values.astype(np.float32 if values.dtype.itemsize < 4 else np.float64)
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
 
 
 def _texts(values: np.ndarray) -> list[str] | None:
-    """The cells as text; None where they are something else."""
+    """The cells as text; None if a cell is not text."""
     cells = values.tolist()
     if not all(cell is None or isinstance(cell, str | bytes) for cell in cells):
         return None

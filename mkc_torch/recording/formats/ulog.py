@@ -1,4 +1,4 @@
-"""PX4 ULog (``.ulg``), by pyulog.
+"""Read PX4 ULog files (``.ulg``) by pyulog.
 
 Source: docs.px4.io, "ULog File Format".
 """
@@ -25,23 +25,25 @@ _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
 _MOST_FIELDS = 65536
 _DEEPEST = 8
-_LOOK, _MOST_READS = 4096, 4
-"""Reads after which, and reads a byte from which, it is known that a file is read in a circle: a message is two reads,
-and a step of one byte over damage is two."""
+_LOOK = 4096
+"""Reads between two checks for an endless loop."""
+
+_MOST_READS = 4
+"""Most reads per byte of the file; a message is two reads, and a step of one byte over damage is two."""
 
 _FIELD = re.compile(r"(?P<kind>\w+)(\[(?P<count>\d{1,9})\])? ")
 _KINDS = frozenset(b"BFIMPQAARDLCSO")
-"""Kinds of messages of the specification; all others are damage, or a version to come."""
+"""Message types of the specification; other types are damage or a later version."""
 
 
 def read(path: Path) -> list[Topic]:
-    """The topics of a log, named ``sensor_mag_0`` by instance, with the fields' names in PX4.
+    """Read the topics of a log, named ``sensor_mag_0`` by instance, with PX4's names of fields.
 
-    Fields of nested messages have dots in their names and arrays ``[i]``; ``timestamp`` is in µs. Memory is twice the
+    Fields of nested messages have dots in their names, arrays ``[i]``; ``timestamp`` is in µs. Memory is twice the
     file's size.
 
     Raises:
-        RecordingError: no ULog, or one without a whole row.
+        RecordingError: the file is not a ULog, or has no complete row.
         ImportError: pyulog is not installed.
     """
     check_begins(path, "PX4 ULog", _MAGIC)
@@ -51,25 +53,25 @@ def read(path: Path) -> list[Topic]:
         raise ImportError(
             'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
         ) from error
-    with guarded(path, "PX4 ULog"), _GoingOn(path.open("rb", buffering=0)) as file:
+    with guarded(path, "PX4 ULog"), _LoopGuard(path.open("rb", buffering=0)) as file:
         walk = _walk(path)
         log = pyulog.ULog(file)
         warnings = _losses(log, walk)
         topics = [topic for data in log.data_list if (topic := _topic(data)) is not None]
     if not topics:
         raise no_rows(path, "PX4 ULog", warnings)
-    return with_warnings(_named_once(topics), warnings)
+    return with_warnings(_with_unique_names(topics), warnings)
 
 
-class _GoingOn(io.BufferedReader):
-    """A file that is read to its end in a while: pyulog steps back from damage, over some again and again."""
+class _LoopGuard(io.BufferedReader):
+    """A file that raises an error after too many reads: pyulog can step back over damage without end."""
 
     _reads = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
         self._reads += 1
         if self._reads % _LOOK == 0 and self._reads > _MOST_READS * os.fstat(self.fileno()).st_size:
-            raise RuntimeError("its messages lead round in a circle")
+            raise RuntimeError("its messages form an endless loop")
         return super().read(size)
 
 
@@ -80,12 +82,12 @@ def _topic(data: Any) -> Topic | None:
     columns = {name: values for name, values in columns.items() if kinds.get(name) != "char"}
     first = [name for name in ("timestamp",) if name in columns]
     columns = {name: columns[name] for name in [*first, *columns]}
-    told = [f"Column `{name}` holds text and is left out." for name in text]
-    return topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), told)
+    warnings = [f"Column `{name}` holds text and is left out." for name in text]
+    return topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), warnings)
 
 
-def _named_once(topics: list[Topic]) -> list[Topic]:
-    """A topic that was logged anew after it had ended keeps its rows, under a name of its own."""
+def _with_unique_names(topics: list[Topic]) -> list[Topic]:
+    """Give a topic that was logged again after it had ended a name of its own."""
     seen: Counter[str] = Counter()
     named = []
     for topic in topics:
@@ -96,7 +98,7 @@ def _named_once(topics: list[Topic]) -> list[Topic]:
 
 
 def _losses(log: Any, walk: tuple[int, int, int]) -> list[str]:
-    """What the logger did not write, and what of the file cannot be read."""
+    """Warnings about data that the logger lost, and parts of the file that cannot be read."""
     warnings = []
     if log.dropouts:
         seconds = sum(dropout.duration for dropout in log.dropouts) / 1000.0
@@ -108,18 +110,18 @@ def _losses(log: Any, walk: tuple[int, int, int]) -> list[str]:
     if read_rows < rows:
         warnings.append(f"The file is damaged: {rows - read_rows:,} of its {rows:,} rows cannot be read.")
     elif log.file_corruption and whole == size:
-        warnings.append("The file is damaged in places; what could not be read there is left out.")
+        warnings.append("The file is damaged in places; the unreadable parts are left out.")
     return warnings
 
 
 def _walk(path: Path) -> tuple[int, int, int]:
-    """Where the whole messages end, how many of them are rows, and the file's size.
+    """The offset in bytes at which the complete messages end, their number of rows, and the file's size in bytes.
 
-    pyulog stops in silence where the file ends; this walks from header to header, without looking at what they hold.
+    pyulog stops silently at the end of a truncated file; this function walks over the headers of all messages.
     """
     size = path.stat().st_size
     if size < _HEADER:
-        raise RecordingError(f"{path}: the PX4 ULog ends within its header; record it anew, or copy it whole.")
+        raise RecordingError(f"{path}: the PX4 ULog ends within its header; record it again, or copy the whole file.")
     place, rows = _HEADER, 0
     formats: dict[str, list[tuple[str, int]]] = {}
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -134,12 +136,12 @@ def _walk(path: Path) -> tuple[int, int, int]:
             place += 3 + length
     known: dict[str, int] = {}
     if any(_width(name, formats, known, 0) > _MOST_FIELDS for name in formats):
-        raise RecordingError(f"{path}: the PX4 ULog is damaged: a message of it has more than {_MOST_FIELDS:,} fields.")
+        raise RecordingError(f"{path}: the PX4 ULog is damaged: a message has more than {_MOST_FIELDS:,} fields.")
     return place, rows, size
 
 
 def _define(text: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
-    """Note the kinds of fields of a message, ``name:type[count] field;…``, and how many there are of each."""
+    """Store the types and counts of the fields of a message format ``name:type[count] field;…``."""
     name, _, fields = text.decode("utf-8", "replace").partition(":")
     formats[name] = [
         (found["kind"], int(found["count"] or 1)) for field in fields.split(";") if (found := _FIELD.match(field))
@@ -147,7 +149,7 @@ def _define(text: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
 
 
 def _width(name: str, formats: dict[str, list[tuple[str, int]]], known: dict[str, int], depth: int) -> int:
-    """How many numbers a message has; pyulog makes an object of each, though formats can nest in one another."""
+    """The number of values of a message; nested formats can have very many, and pyulog makes an object of each."""
     if name not in formats:
         return 1
     if depth > _DEEPEST:

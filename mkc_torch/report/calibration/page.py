@@ -1,4 +1,4 @@
-"""The calibration report: what was found, how far to trust it, and what to do next, as one self-contained page."""
+"""The calibration report as a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Comparison", "calibration_report", "refusal_report"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A row of a table that sets results side by side: its name, centre and semi-axes in the recording's unit."""
+    """A row of the comparison table: name, centre and semi-axes in the recording's unit."""
 
     name: str
     center: Vector
@@ -38,17 +38,17 @@ def calibration_report(
     comparison: Sequence[Comparison] = (),
     against: Differences | None = None,
 ) -> str:
-    """The page for a calibration and the recording it was made from.
+    """Return the page of a calibration and its recording.
 
     Args:
         calibration: of ``mkc_torch.calibration.calibrate.calibrate``.
-        recording: the one it came from.
-        note: a sentence at the top of the page, such as that the data are simulated.
-        comparison: other results, or the truth, to set beside this one.
-        against: what differs from an older calibration.
+        recording: the calibrated recording.
+        note: a sentence for the top of the page, for example that the data are simulated.
+        comparison: other results, or the truth, for comparison.
+        against: differences from an older calibration.
 
     Returns:
-        HTML with its pictures in it.
+        HTML with inline figures.
 
     Example:
         >>> from mkc_torch.calibration.calibrate import calibrate
@@ -65,7 +65,7 @@ def calibration_report(
     return render(
         "calibration.html.j2",
         c=calibration,
-        # what is said of the file, such as a gap in time, is no doubt about the result
+        # warnings on the file, such as a gap in time, do not question the result
         doubtful=len(calibration.warnings) > len(usable.warnings),
         enough=ENOUGH_INFORMATION,
         rejects_many=calibration.rejected_share > MAX_REJECTED,
@@ -85,10 +85,10 @@ def calibration_report(
 
 
 def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
-    """The page for a recording that determines no calibration: which directions are missing, and how to record them.
+    """Return the page of a recording that determines no calibration, with the missing directions.
 
     Args:
-        recording: the one that was refused.
+        recording: the refused recording.
         error: the refusal.
 
     Example:

@@ -1,4 +1,4 @@
-"""What the tests of evidence say, as lines and tables of a page and of the terminal."""
+"""Rows and tables of the tests of evidence, for the page and the terminal."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ __all__ = ["of_driver", "rows", "tables"]
 
 
 _DRIVEN_BY = "driven by"
-"""What is said of a driver stands where the driver is named."""
+"""Label of rows that are shown with the driver's name."""
 
 
 def of_driver(evidence: Sequence[EvidenceResult]) -> list[str]:
-    """What is said of a finding's driver."""
+    """Return the rows on a finding's driver."""
     return [typeset(row.text) for row in _rows(evidence) if row.label == _DRIVEN_BY]
 
 
 def rows(evidence: Sequence[EvidenceResult], *, terminal: bool = False) -> list[tuple[str, str]]:
-    """Lines of their own, with their labels.
+    """Return the other rows, with their labels.
 
     Example:
-        >>> said = [
+        >>> results = [
         ...     EvidenceResult(
-        ...         "my_test", rows=(Row("left over", "-0.5 nats"), Row("in print", "more", in_terminal=False))
+        ...         "my_test", rows=(Row("residual", "-0.5 nats"), Row("in print", "more", in_terminal=False))
         ...     )
         ... ]
-        >>> rows(said), rows(said, terminal=True)
-        ([('left over', '−0.5 nats'), ('in print', 'more')], [('left over', '−0.5 nats')])
+        >>> rows(results), rows(results, terminal=True)
+        ([('residual', '−0.5 nats'), ('in print', 'more')], [('residual', '−0.5 nats')])
     """
     return [
         (typeset(row.label), typeset(row.text))
@@ -39,9 +39,9 @@ def rows(evidence: Sequence[EvidenceResult], *, terminal: bool = False) -> list[
 
 
 def tables(evidence: Sequence[EvidenceResult]) -> list[Table]:
-    """Tables of a page."""
-    return [said.table for said in evidence if said.table is not None]
+    """Return the tables of a page."""
+    return [result.table for result in evidence if result.table is not None]
 
 
 def _rows(evidence: Sequence[EvidenceResult]) -> list[Row]:
-    return [row for said in evidence for row in said.rows]
+    return [row for result in evidence for row in result.rows]

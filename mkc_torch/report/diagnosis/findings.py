@@ -1,4 +1,4 @@
-"""A finding of a diagnosis in words: what it is, where it acts, what drives it, and what it could be instead."""
+"""Texts of a finding: name, place, driver, grade and alternatives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
     "acts_on",
-    "counted_from",
+    "references_of",
     "driven_by",
     "finding_name",
     "grade",
@@ -38,13 +38,13 @@ __all__ = [
 _MOST_RUNS = 6
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "finding.acts_on_axes",
-    ("east", "north", "up"): "finding.acts_on_world",
+    ("east", "north", "up"): "finding.acts_on_level_axes",
 }
 _GRADES: dict[Grade, str] = {
-    "left out": "grade.left_out",
-    "real but small": "grade.small",
-    "not confirmed": "grade.not_confirmed",
-    "nearest in the catalogue": "grade.nearest",
+    "left_out": "grade.left_out",
+    "small": "grade.small",
+    "unconfirmed": "grade.unconfirmed",
+    "nearest": "grade.nearest",
 }
 _BOUNDS = {
     "below": "where.below",
@@ -55,7 +55,7 @@ _BOUNDS = {
 
 
 def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = "") -> str:
-    """An effect with what drives it, and where it acts; by the name that it has for a kind of quantity.
+    """Return the name of an effect with its drivers and its port; the name depends on the kind of quantity.
 
     Example:
         >>> with_drivers("current_field", ["battery_A"]), with_drivers("offset_drift", [])
@@ -77,17 +77,17 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = 
 
 
 def _together(names: Sequence[str]) -> str:
-    """Names one after the other; the three of a vector by what they have in common."""
+    """Join names; the three components of a vector by their common prefix."""
     whole = names[0].removesuffix("_x")
     return plain(whole) if list(names) == [f"{whole}_{axis}" for axis in "xyz"] else several(names, 3)
 
 
 def finding_name(finding: Finding) -> str:
-    """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
+    """Return the name of a finding with its drivers."""
     if unrecorded(finding):
         return term("finding.unrecorded")
-    told = with_drivers(finding.effect, finding.drivers, kind=finding.kind)
-    return term("finding.comes_and_goes", finding=told) if finding.comes_and_goes else told
+    text = with_drivers(finding.effect, finding.drivers, kind=finding.kind)
+    return term("finding.comes_and_goes", finding=text) if finding.comes_and_goes else text
 
 
 def unrecorded(finding: Finding) -> bool:
@@ -95,7 +95,7 @@ def unrecorded(finding: Finding) -> bool:
 
 
 def label_name(label: str) -> str:
-    """The label of a candidate, an id and what drives it, in words.
+    """Return the label of a candidate with the name of its effect.
 
     Example:
         >>> label_name("current_field (battery_A)")
@@ -105,8 +105,8 @@ def label_name(label: str) -> str:
     return words_of(plain(effect)) + space + plain(rest)
 
 
-def counted_from(finding: Finding) -> str:
-    """What the equation counts its drivers from; empty where there is none.
+def references_of(finding: Finding) -> str:
+    """Return the reference values of the drivers in the equation; empty if there are none.
 
     Example:
         >>> from mkc_torch.diagnosis.result import Reference
@@ -125,42 +125,42 @@ def counted_from(finding: Finding) -> str:
         ...     "",
         ...     references=(Reference("current", 10.934, "A"),),
         ... )
-        >>> counted_from(finding)
+        >>> references_of(finding)
         'Ī: the mean of current over this recording, 10.9 A.'
     """
     if not finding.references:
         return ""
     marked = re.search("[A-Za-z]\u0304", unicodedata.normalize("NFD", finding.equation))
-    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.counted_from")
-    names = several([one.column for one in finding.references])
-    values = ", ".join(f"{size(one.value)} {plain(one.unit)}".rstrip() for one in finding.references)
+    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.references_of")
+    names = several([item.column for item in finding.references])
+    values = ", ".join(f"{size(reference.value)} {plain(reference.unit)}".rstrip() for reference in finding.references)
     key = "finding.means" if len(finding.references) > 1 else "finding.mean"
     return term(key, symbol=symbol, columns=names, values=values)
 
 
 def where(finding: Finding, clock: TimeFormat) -> str:
-    """When the finding acts.
+    """Return when the finding acts.
 
     Example:
         >>> from dataclasses import replace
-        >>> from mkc_torch.diagnosis.result import Told
+        >>> from mkc_torch.diagnosis.result import EvidenceResult
         >>> finding = Finding("offset_drift", (), ("mag_x",), (), None, "", "", (), 0.01, (), True, "")
         >>> clock = TimeFormat(1, has_time=True)
         >>> where(finding, clock), where(replace(finding, onset=41.32), clock)
         ('throughout the recording', 'from 41.3 s on')
-        >>> where(replace(finding, onset=41.32, evidence=(Told("onset", (41.24, 41.5)),)), clock)
+        >>> where(replace(finding, onset=41.32, evidence=(EvidenceResult("onset", (41.24, 41.5)),)), clock)
         'from 41.3 s on (95 %: 41.2 to 41.5 s)'
         >>> where(replace(finding, intervals=((1.0, 2.0), (7.0, 9.5))), clock)
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
-        >>> where(replace(finding, onset=61.1, moments=(61.1, 77.8)), clock)
-        'anew at 61.1 s and 77.8 s'
-        >>> switched = replace(finding, intervals=((8.0, 9.0), (34.0, 37.3)), evidence=(Told("switched", True),))
+        >>> where(replace(finding, onset=61.1, event_times=(61.1, 77.8)), clock)
+        'at 61.1 s and 77.8 s'
+        >>> switched = replace(finding, intervals=((8.0, 9.0), (34.0, 37.3)), evidence=(EvidenceResult("switched", True),))
         >>> where(replace(switched, onset=6.2), clock)
-        'first at 6.2 s, then it comes and goes, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
+        'first at 6.2 s, then intermittent, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
     """
     begins = ""
-    if finding.moments:
-        begins = term("where.anew", moments=_and([clock.moment(moment) for moment in finding.moments]))
+    if finding.event_times:
+        begins = term("where.event_times", moments=_and([clock.moment(moment) for moment in finding.event_times]))
     elif finding.onset is not None:
         key = "where.first" if finding.comes_and_goes else "where.from_on"
         begins = term(key, moment=clock.moment(finding.onset))
@@ -178,7 +178,7 @@ def where(finding: Finding, clock: TimeFormat) -> str:
 
 
 def acts_on(finding: Finding) -> str:
-    """The channels that a finding acts on, and whose axes they are; empty where it has none.
+    """Return the channels that a finding acts on, and the frame of the axes; empty without channels.
 
     Example:
         >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, (), True, "")
@@ -195,22 +195,22 @@ def _and(each: Sequence[str]) -> str:
 
 
 def region(found: Region) -> str:
-    """In which states most of the gain arises.
+    """Return the part of a state's range with most of the gain.
 
     Example:
         >>> region(Region("speed", "rad/s", "near zero", 0.3, 0.824, 0.2))
-        '82 % of the gain where speed is within ±0.300 rad/s, 20 % of the time'
+        '82 % of the gain, in 20 % of the time: speed within ±0.300 rad/s'
         >>> region(Region("level", "cm", "above", 14.23, 0.91, 0.1))
-        '91 % of the gain where level is above 14.2 cm, 10 % of the time'
+        '91 % of the gain, in 10 % of the time: level above 14.2 cm'
     """
     unit = f" {found.unit}" if found.unit else ""
     bounds = term(_BOUNDS[found.kind], bound=f"{size(found.bound)}{unit}")
-    gain, time = (f"{100.0 * one:.0f} %" for one in (found.share_of_gain, found.share_of_time))
+    gain, time = (f"{100.0 * item:.0f} %" for item in (found.share_of_gain, found.share_of_time))
     return term("where.region", gain=gain, state=plain(found.state), bounds=bounds, time=time)
 
 
 def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
-    """Each run's share of the gain, the largest first.
+    """Return each run's share of the gain, the largest first.
 
     Example:
         >>> shares_of_runs((0.1, 0.7, 0.2))
@@ -220,14 +220,14 @@ def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
     """
     known = runs if len(runs) == len(shares) else [Run(0, "", k + 1) for k in range(len(shares))]
     order = sorted(range(len(shares)), key=lambda k: -shares[k])
-    told = [term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]]
-    more = len(shares) - len(told)
-    each = ", ".join(told)
+    sentences = [term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]]
+    more = len(shares) - len(sentences)
+    each = ", ".join(sentences)
     return term("where.more_runs", runs=each, count=more) if more else each
 
 
 def _run(run: Run) -> str:
-    """A run by its recording and its number in it, as far as there are others.
+    """Return the name of a run; its number is omitted if it is the only run of its recording.
 
     Example:
         >>> _run(Run(2, "b.csv", 3)), _run(Run(0, "", 3))
@@ -240,23 +240,23 @@ def _run(run: Run) -> str:
 
 
 def grade(finding: Finding) -> str:
-    """What a finding is worth, in words.
+    """Return the grade in words.
 
     Example:
-        >>> grade(Finding("offset_drift", (), (), (), None, "", "", (), 0.01, (), True, "", grade="real but small"))
-        'real, but small beside the noise'
+        >>> grade(Finding("offset_drift", (), (), (), None, "", "", (), 0.01, (), True, "", grade="small"))
+        'real, but small compared with the noise'
     """
-    if finding.grade == "not confirmed" and finding.cannot_be:
+    if finding.grade == "unconfirmed" and finding.cannot_be:
         return term("grade.cannot_be")
     return term(_GRADES[finding.grade])
 
 
 def shape(finding: Finding) -> str:
-    """Whether the shape that a name claims is the recording's; empty where that was not asked.
+    """Return the test of the finding's shape against a free curve; empty if it was not tested.
 
     Example:
-        >>> from mkc_torch.diagnosis.environment import Shape
-        >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=Shape(1.2, 0.4))
+        >>> from mkc_torch.diagnosis.environment import ShapeCheck
+        >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=ShapeCheck(1.2, 0.4))
         >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
     """
@@ -264,61 +264,61 @@ def shape(finding: Finding) -> str:
     if found is None:
         return ""
     p = probability(found.p_value)
-    if finding.grade != "nearest in the catalogue":
+    if finding.grade != "nearest":
         return term("evidence.as_good", p=p)
     return term("evidence.free_curve", nats=size(found.free_curve_gain), p=p)
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:
-    """The candidates that the recording cannot tell from a finding."""
+    """Return the alternatives that the recording cannot distinguish from a finding."""
     return tuple(a for a in finding.alternatives if not a.separable)
 
 
 def rivals(finding: Finding, most: int = 3) -> str:
-    """The names of those, one after the other; empty where there are none."""
+    """Return the names of the inseparable alternatives; empty if there are none."""
     each = list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding)))
-    told = ", ".join(each[:most])
-    return term("number.and_more", first=told, count=len(each) - most) if len(each) > most else told
+    text = ", ".join(each[:most])
+    return term("number.and_more", first=text, count=len(each) - most) if len(each) > most else text
 
 
 def _rival(alternative: Alternative, finding: Finding) -> str:
-    """The name of an alternative; by the kind of quantity that the finding acts on, where it acts there too."""
+    """Return the name of an alternative; at the finding's port, the name depends on the kind of quantity."""
     at = _elsewhere(alternative, finding)
     return with_drivers(alternative.effect, alternative.drivers, at, "" if at else finding.kind)
 
 
 def _elsewhere(alternative: Alternative, finding: Finding) -> str:
-    """Where an alternative acts, if that is not where the finding does."""
-    return "" if _at(alternative.at, finding) else alternative.at
+    """Return the port of an alternative if it differs from the finding's."""
+    return "" if _at(alternative.port, finding) else alternative.port
 
 
 def _at(place: str, finding: Finding) -> bool:
-    """Whether a place of a simulation is where a finding acts."""
+    """Whether a finding acts at a port."""
     own = place.removeprefix("loaded ").removeprefix("output ")
     both = tuple(f"rate of {name}" for name in own.removeprefix("exchange of ").split(" and "))
     return not place or own in finding.channels or both == finding.channels
 
 
 def role(candidate: CandidateScore, findings: Sequence[Finding]) -> str:
-    """What became of a candidate: the number of its finding, or whether it can be told from one."""
+    """Return the number of a candidate's finding, or whether it is distinguished from a finding."""
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):
-        if own == (finding.effect, finding.drivers) and _at(candidate.at, finding):
+        if own == (finding.effect, finding.drivers) and _at(candidate.port, finding):
             return term("evidence.is_finding", number=i)
     for i, finding in enumerate(findings, 1):
         for a in finding.alternatives:
-            if (*own, candidate.at) == (a.effect, a.drivers, a.at):
-                return term("evidence.told_apart" if a.separable else "evidence.not_told_apart", number=i)
+            if (*own, candidate.port) == (a.effect, a.drivers, a.port):
+                return term("evidence.distinguished" if a.separable else "evidence.not_distinguished", number=i)
     return ""
 
 
 def with_names(sentence: str, ids: Collection[str], kinds: Mapping[str, str] | None = None) -> str:
-    """A sentence with effects by their names instead of their ids, its numbers as they are printed.
+    """Replace effect ids in a sentence by names, and typeset its numbers.
 
     Args:
-        sentence: to be told.
+        sentence: with effect ids.
         ids: of effects.
-        kinds: of the quantity that each acts on, where that is known.
+        kinds: kind of quantity that each effect acts on, if known.
 
     Example:
         >>> with_names("hard_iron_step: p = 4e-05, by -6.1 µT.", {"hard_iron_step"})
@@ -332,7 +332,7 @@ def with_names(sentence: str, ids: Collection[str], kinds: Mapping[str, str] | N
 
 
 def driven_by(finding: Finding) -> str:
-    """The driver, and what tests say of it."""
+    """Return the driver and the tests of it."""
     if not finding.drivers:
         return term("finding.no_driver")
     return "; ".join([several(finding.drivers), *of_driver(finding.evidence)])

@@ -1,4 +1,4 @@
-"""The pictures of what has no name: the course of a forcing with what it depends on, and free curves beside names."""
+"""Figures of disturbances with their dependences, and of free curves with the named shape."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ _MOST_CURVES = 9
 
 
 def of_forcing(diagnosis: Diagnosis, index: int) -> str:
-    """The course of a forcing with its band, and below its mean over each state and input."""
-    forcing, has_time = diagnosis.world.forcing[index], diagnosis.traces.has_time
-    curves = forcing.curves[:_MOST_CURVES]
+    """Draw a disturbance with its band, and its mean over each state and input."""
+    estimate, has_time = diagnosis.environment.disturbance[index], diagnosis.traces.has_time
+    curves = estimate.curves[:_MOST_CURVES]
     rows = 1 + -(-len(curves) // _IN_A_ROW)
     grid = PanelGrid(rows, _IN_A_ROW, top=0.35, below=0.72, own_axes=True)
     with style():
         figure = grid.figure()
-        draw_course(grid.axes(figure, 0, 0, wide=True), forcing, has_time)
+        draw_course(grid.axes(figure, 0, 0, wide=True), estimate, has_time)
         for number, curve in enumerate(curves):
             ax = grid.axes(figure, 1 + number // _IN_A_ROW, number % _IN_A_ROW)
             draw_curve(ax, curve, has_time)
             ax.set_ylabel(short(tidy(curve.value_unit)))
             title(ax, term("picture.over", name=short(curve.driver)))
         _same_height(list(figure.axes[1:]))
-        return svg(figure, f"forcing{index + 1}", term("picture.about_forcing"))
+        return svg(figure, f"forcing{index + 1}", term("picture.about_disturbance"))
 
 
 def _same_height(axes: list[Any]) -> None:
-    """One scale for all curves, so that what matters looks large."""
+    """Use the same y scale for all curves."""
     if axes:
         low, high = (pick(ax.get_ylim()[end] for ax in axes) for end, pick in ((0, min), (1, max)))
         for ax in axes:
@@ -46,7 +46,7 @@ def _same_height(axes: list[Any]) -> None:
 
 
 def of_shape(diagnosis: Diagnosis, index: int) -> str | None:
-    """The free curve that is better than a finding's name, with the form of that name; None where none is."""
+    """Draw the free curve that is better than a finding's shape, with that shape; None without such a curve."""
     finding = diagnosis.findings[index]
     free = finding.shape.curve if finding.shape is not None else None
     if free is None:

@@ -1,4 +1,4 @@
-"""The noise of a diagnosis in words: its model, how well its density fits, and what smooth curves reach beside it."""
+"""Texts of the noise model, of the scores on held-out blocks, and of the smooth correction."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ __all__ = [
     "smooth_fit",
 ]
 
-_CLEARLY = 0.99  # of a residual, below which another one is smaller
+_CLEARLY = 0.99
+"""Ratio of residuals below which the smaller is reported."""
+
 _KINDS = {"white": "noise.white", "ar": "noise.autoregressive", "random_walk": "noise.random_walk"}
 _NOISE = {
-    "wander": "noise.wander",
-    "wander_period": "noise.wander_period",
+    "drift": "noise.drift",
+    "drift_period": "noise.drift_cutoff",
 }
 _CHANNELS = {
     "norm": "noise.norm",
@@ -32,7 +34,7 @@ _CHANNELS = {
 
 
 def noise_model(noise: NoiseSummary) -> str:
-    """The noise in words."""
+    """Return the noise model in words."""
     kind = term(_KINDS[noise.model])
     described = noise.description.strip()
     return (
@@ -43,15 +45,15 @@ def noise_model(noise: NoiseSummary) -> str:
 
 
 def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple[str, str]]:
-    """The numbers of the noise model in words, those of the density once a channel."""
+    """Return the parameters of the noise model, and those of the density per channel."""
     rows: list[tuple[str, str]] = []
     for name, value in noise.parameters.items():
         unit = noise.units.get(name, "")
         if name == "autoregression":
             rows += _memory(value, channels)
         elif name in _NOISE:
-            told = " ".join(measured(value, None, unit))
-            rows.append((term(_NOISE[name]), _of_wander(name, told)))
+            text = " ".join(measured(value, None, unit))
+            rows.append((term(_NOISE[name]), _drift_text(name, text)))
         else:
             rows.append((plain(name), " ".join(measured(value, None, unit))))
     unit = f" {plain(noise.unit)}" if noise.unit else ""
@@ -66,31 +68,31 @@ def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple
     return rows
 
 
-def _of_wander(name: str, told: str) -> str:
-    if name == "wander":
-        return term("noise.wander_size", size=told)
-    return term("noise.wander_below", period=told)
+def _drift_text(name: str, text: str) -> str:
+    if name == "drift":
+        return term("noise.drift_size", size=text)
+    return term("noise.drift_below", period=text)
 
 
 def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Autoregression coefficients, a row a channel that has some."""
+    """Return one row per channel with autoregression coefficients."""
     each = list(value) if isinstance(value, Sequence) else [value]
-    for i, one in enumerate(each):
-        if not isinstance(one, Sequence) or one:
+    for i, item in enumerate(each):
+        if not isinstance(item, Sequence) or item:
             name = term("noise.memory")
             if len(each) > 1 and i < len(channels):
                 name = term("noise.of_channel", name=name, channel=plain(channels[i]))
-            told = measured(one, None, "")[0].removeprefix("(").removesuffix(")")
-            yield name, term("noise.coefficients", coefficients=told)
+            text = measured(item, None, "")[0].removeprefix("(").removesuffix(")")
+            yield name, term("noise.coefficients", coefficients=text)
 
 
 def channel_notes(channels: Sequence[str]) -> str:
-    """What a magnetometer's channels are called; empty for others."""
+    """Return the meaning of a magnetometer's channels; empty for other simulations."""
     return "; ".join(term(note) for name, note in _CHANNELS.items() if name in channels)
 
 
 def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
-    """The models compared on held-out blocks: root mean square, log-likelihood, and σ and d of each channel."""
+    """Return RMSE, log-likelihood, σ and d of each model on held-out blocks."""
     rows = [(term("table.as_it_is"), diagnosis.baseline)]
     if diagnosis.findings:
         rows.append((term("table.with_findings"), diagnosis.corrected))
@@ -111,7 +113,7 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
 
 
 def smooth_fit(diagnosis: Diagnosis) -> str:
-    """How far a smooth correction by all columns comes, beside the residual; empty where that is not farther."""
+    """Return the residual of a smooth correction by all columns; empty if it is not smaller."""
     d = diagnosis
     if d.ceiling is None or not d.ceiling.rmse < _CLEARLY * d.corrected.rmse or not _one_unit(d):
         return ""
@@ -122,11 +124,11 @@ def smooth_fit(diagnosis: Diagnosis) -> str:
 
 
 def _shown(diagnosis: Diagnosis) -> bool:
-    """Whether the smooth correction says something that the findings do not."""
+    """Whether the smooth correction is clearly better than the findings."""
     d = diagnosis
     return d.ceiling is not None and (not d.findings or d.ceiling.rmse < _CLEARLY * d.corrected.rmse)
 
 
 def _one_unit(diagnosis: Diagnosis) -> bool:
-    """Whether one number can hold the residuals of all channels."""
+    """Whether the residuals of all channels share a unit."""
     return len(diagnosis.traces.channels) == 1 or bool(diagnosis.traces.unit)

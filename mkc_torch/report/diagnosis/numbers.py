@@ -1,4 +1,4 @@
-"""Numbers of a diagnosis as a reader sees them: moments, parameters with standard errors, p-values and gains."""
+"""Format times, parameters with standard errors, p-values and gains."""
 
 from __future__ import annotations
 
@@ -27,20 +27,26 @@ __all__ = [
     "probability",
 ]
 
-_FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
+_FEWEST_LARGE = 1e6
+"""Smallest size that is written with a power of ten."""
+
+_MOST_SMALL = 1e-3
+"""Size below which a number is written with a power of ten."""
+
 _MOST_NUMBERS = 12
-_LONG = 4  # numbers from which a list is told by its largest
+_LONG = 4
+"""Length from which only the largest number of a list is shown."""
 
 
 @dataclass(frozen=True)
 class TimeFormat:
-    """How moments are written: to so many decimals, in s, or as numbers of samples."""
+    """Format of times: in s with ``places`` decimals, or as sample numbers."""
 
     places: int
     has_time: bool
 
     def moment(self, value: float) -> str:
-        """One moment.
+        """Format a time.
 
         Example:
             >>> TimeFormat(1, has_time=True).moment(41.32), TimeFormat(0, has_time=False).moment(812.0)
@@ -51,7 +57,7 @@ class TimeFormat:
         return term("where.moment_of_samples", moment=number(value, 0))
 
     def interval(self, start: float, end: float) -> str:
-        """From one moment to another.
+        """Format an interval.
 
         Example:
             >>> TimeFormat(1, has_time=True).interval(12.0, 18.44), TimeFormat(0, has_time=False).interval(3.0, 9.0)
@@ -63,7 +69,7 @@ class TimeFormat:
 
 
 def clock_of(traces: Traces) -> TimeFormat:
-    """A clock that tells moments apart to about a thousandth of the recording."""
+    """Return a format with a resolution of about a thousandth of the recording."""
     known = traces.time[traces.time.isfinite()]
     span = float(known.max() - known.min()) if traces.has_time and len(known) else 0.0
     digits = max(2 - math.floor(math.log10(span)), int(span < 1000.0)) if span > 0 else 1
@@ -71,7 +77,7 @@ def clock_of(traces: Traces) -> TimeFormat:
 
 
 def measured(value: Number, error: Number | None, unit: str) -> list[str]:
-    """A parameter with its standard error, to the digits that the error leaves, one line a row of a matrix.
+    """Format a parameter with its standard error, to two digits of the error, one line per row of a matrix.
 
     Example:
         >>> measured((-0.1702, 0.33), (0.0123, 0.0119), "µT/A")
@@ -84,8 +90,8 @@ def measured(value: Number, error: Number | None, unit: str) -> list[str]:
     digits = _Digits.of(rows, errors)
     lines = []
     for i, row in enumerate(rows[:_MOST_NUMBERS]):
-        beside = errors[i] if i < len(errors) and len(errors[i]) == len(row) else [math.nan] * len(row)
-        cells = [digits.cell(v, e) for v, e in zip(row, beside, strict=True)]
+        row_errors = errors[i] if i < len(errors) and len(errors[i]) == len(row) else [math.nan] * len(row)
+        cells = [digits.cell(v, e) for v, e in zip(row, row_errors, strict=True)]
         rest = len(cells) - _MOST_NUMBERS
         text = ", ".join(cells[:_MOST_NUMBERS])
         if rest > 0:
@@ -98,7 +104,7 @@ def measured(value: Number, error: Number | None, unit: str) -> list[str]:
 
 @dataclass(frozen=True)
 class _Digits:
-    """How numbers of one list are written: the power of ten that they share, and the decimals that errors leave."""
+    """Common power of ten of a list, and the decimals after it."""
 
     power: int
     places: int
@@ -117,11 +123,11 @@ class _Digits:
         return f" × 10{superscript(self.power)}" if self.power else ""
 
     def cell(self, value: float, error: float) -> str:
-        """A number with its error, without the power of ten."""
+        """Format a number with its error, without the power of ten."""
         if not math.isfinite(value):
             return term("number.not_known")
-        told, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
-        return f"{told} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else told
+        text, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
+        return f"{text} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else text
 
 
 def _three_digits(value: float) -> int:
@@ -129,7 +135,7 @@ def _three_digits(value: float) -> int:
 
 
 def _rows(value: Number | None) -> Iterator[list[float]]:
-    """Rows of numbers: of a vector one, of a matrix its own; None is a number that is not known."""
+    """Yield the rows of a scalar, vector or matrix; None is NaN."""
     if value is None:
         yield [math.nan]
     elif isinstance(value, (int, float)):
@@ -142,7 +148,7 @@ def _rows(value: Number | None) -> Iterator[list[float]]:
 
 
 def parameter_name(parameter: EffectParameter) -> str:
-    """A parameter's name in words.
+    """Return a parameter's name in words.
 
     Example:
         >>> parameter_name(EffectParameter("field_per_ampere", 1.0, None, "µT/A"))
@@ -158,7 +164,7 @@ def _lowered(digits: str) -> str:
 
 
 def parameter_lines(parameter: EffectParameter, channels: Sequence[str]) -> list[str]:
-    """A parameter as :func:`measured` has it; of one whose numbers are not one for each channel, one line a number.
+    """Format a parameter with :func:`measured`; with components other than the channels, one line per number.
 
     Example:
         >>> parameter_lines(EffectParameter("k", (1.0, 2.0), (0.1, 0.1), "µT", ("x", "y")), ("x", "y"))
@@ -179,31 +185,31 @@ def parameter_lines(parameter: EffectParameter, channels: Sequence[str]) -> list
 
 
 def _listed(parameter: EffectParameter) -> list[str]:
-    """What each number of a list is, and the number, with the digits and the power of ten of all."""
+    """Format each number of a list with its component name, in common digits and a common power of ten."""
     p = parameter
     (values,) = _rows(p.value)
     errors = next(_rows(p.standard_error)) if isinstance(p.standard_error, Sequence) else [math.nan] * len(values)
     digits = _Digits.of([values], [errors])
     cells = [digits.cell(v, e) for v, e in zip(values, errors, strict=True)]
     tail = digits.factor + (f" {plain(p.unit)}" if p.unit else "")
-    told = [f"({cell}){tail}" if digits.power and "±" in cell else f"{cell}{tail}" for cell in cells]
-    return [f"{plain(one)}: {cell}" for one, cell in zip(p.components, told, strict=True)]
+    sentences = [f"({cell}){tail}" if digits.power and "±" in cell else f"{cell}{tail}" for cell in cells]
+    return [f"{plain(component)}: {cell}" for component, cell in zip(p.components, sentences, strict=True)]
 
 
 def _known(error: Number | None) -> bool:
-    """Whether any of it is."""
+    """Whether any error is known."""
     return any(math.isfinite(e) for row in _rows(error) for e in row)
 
 
 def named_lines(parameter: EffectParameter, channels: Sequence[str]) -> list[str]:
-    """The same with the parameter's name before the first."""
+    """Return :func:`parameter_lines` with the parameter's name in the first line."""
     first, *rest = parameter_lines(parameter, channels)
     own = parameter.components and tuple(parameter.components) != tuple(channels)
     return [f"{parameter_name(parameter)}{',' if own else ''} {first}", *rest]
 
 
 def largest(parameter: EffectParameter) -> str:
-    """How large a parameter is, in short: of a long list its largest number.
+    """Format a parameter; of a long list only the largest number.
 
     Example:
         >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
@@ -218,7 +224,7 @@ def largest(parameter: EffectParameter) -> str:
 
 
 def probability(value: float) -> str:
-    """A p-value to two digits.
+    """Format a p-value to two digits.
 
     Example:
         >>> probability(0.005), probability(0.3712), probability(2e-7)
@@ -246,18 +252,18 @@ def _least(value: float, surrogates: int) -> bool:
 
 
 def gain(held_out: HeldOut, *, short: bool = False) -> str:
-    """The gain on data the fit has not seen, with its interval and to its digits; in short without words.
+    """Format the gain on held-out data with its interval, to the digits of the interval.
 
     Example:
         >>> held_out = HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT")
         >>> gain(held_out), gain(held_out, short=True)
-        ('+0.312 nats a sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
+        ('+0.312 nats per sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
     """
     value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
-    told = number(value, places)
-    signed = told if told.startswith("−") else f"+{told}"
+    text = number(value, places)
+    signed = text if text.startswith("−") else f"+{text}"
     if short:
         return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
     if not known:
@@ -266,7 +272,7 @@ def gain(held_out: HeldOut, *, short: bool = False) -> str:
 
 
 def improvement(before: float, after: float, unit: str) -> str:
-    """A residual before and after.
+    """Format a residual before and after.
 
     Example:
         >>> improvement(0.912, 0.521, "µT"), improvement(0.5, 0.5, "")
@@ -278,12 +284,12 @@ def improvement(before: float, after: float, unit: str) -> str:
     less = 1.0 - after / before
     if abs(less) < 5e-4:
         return f"{sizes} ({term('evidence.no_change')})"
-    told = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
-    return f"{sizes} ({told})"
+    text = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
+    return f"{sizes} ({text})"
 
 
 def behind(candidate: CandidateScore) -> str:
-    """How far a candidate is behind the first one, in nats.
+    """Format the penalised gap of a candidate to the first, in nats.
 
     Example:
         >>> behind(CandidateScore("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))

@@ -1,4 +1,4 @@
-"""The diagnosis report: what the simulation lacks, how sure that is and what to do, as one self-contained page."""
+"""The diagnosis report as a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
 
 _MOST_SHOWN = 12
 _MOST_FORCINGS = 3
-_FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, at right angles
+_FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, orthogonal
 
 
 class Bar(NamedTuple):
@@ -51,17 +51,17 @@ class Cell(NamedTuple):
 
 
 def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
-    """The page for a diagnosis.
+    """Return the page of a diagnosis.
 
     Args:
         diagnosis: what was found.
-        note: a sentence at the top of the page, such as that the data are simulated.
+        note: a sentence for the top of the page, for example that the data are simulated.
 
     Returns:
-        HTML with its pictures in it.
+        HTML with inline figures.
     """
     d = diagnosis
-    count, driven = len(d.findings), min(len(d.world.forcing), _MOST_FORCINGS)
+    count, driven = len(d.findings), min(len(d.environment.disturbance), _MOST_FORCINGS)
     works: list[Callable[[], str | None]] = [
         lambda: pictures.over_time(d) if len(d.traces.time) else None,
         *(partial(pictures.of_finding, d, i) for i in range(count)),
@@ -108,7 +108,7 @@ def _markup(svg: str | None) -> Markup | None:
 
 
 def bars(candidates: tuple[CandidateScore, ...]) -> list[Bar]:
-    """The best candidates in the order of their gains, with bars in proportion to those."""
+    """Return the best candidates by gain, with bars in proportion to it."""
     shown = sorted(candidates[:_MOST_SHOWN], key=lambda c: -c.log_likelihood_gain)
     best = max((c.log_likelihood_gain for c in shown), default=0.0)
     return [
@@ -117,7 +117,7 @@ def bars(candidates: tuple[CandidateScore, ...]) -> list[Bar]:
 
 
 def heat_map(separability: Separability) -> list[list[Cell]]:
-    """A row a candidate: what the refit leaves of it, then what each other candidate leaves."""
+    """Return one row per candidate: its share after the refit, then after each other candidate."""
     s = separability
     shown = min(len(s.labels), _MOST_SHOWN)
     rows = []

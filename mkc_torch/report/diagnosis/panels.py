@@ -1,4 +1,4 @@
-"""What all pictures of a diagnosis are made of: panels placed by hand, and their titles."""
+"""Panels of figures with fixed positions, and their titles."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _OWN_AXIS = 0.45
 
 @dataclass(frozen=True)
 class PanelGrid:
-    """Panels placed by hand, in inches: an automatic layout takes longer than all of the drawing.
+    """Grid of panels, in inches; an automatic layout takes longer than the drawing.
 
-    ``own_axes`` says that each panel has numbers and a name of its own.
+    ``own_axes``: each panel has its own tick labels and axis label.
     """
 
     rows: int
@@ -37,7 +37,7 @@ class PanelGrid:
 
     def axes(self, figure: Figure, row: int, column: int, *, wide: bool = False) -> Any:
         between = BETWEEN + (LEFT - 0.1 if self.own_axes else 0.0)
-        own = _OWN_AXIS if self.columns == 3 and not self.own_axes else 0.0  # the third panel has its own numbers
+        own = _OWN_AXIS if self.columns == 3 and not self.own_axes else 0.0  # the third panel has its own tick labels
         width = (WIDTH - LEFT - RIGHT - own - (self.columns - 1) * between) / self.columns
         left = LEFT + column * (width + between) + (own if column == 2 else 0.0)
         bottom = self.height - self.top - (row + 1) * ROW - row * self.below
@@ -46,5 +46,5 @@ class PanelGrid:
 
 
 def title(ax: Any, text: str, *, above: bool = False) -> None:
-    """The title of a panel, higher where numbers stand above it."""
+    """Set the title of a panel, higher if finding numbers are above it."""
     ax.set_title(text, pad=18.0 if above else None)

@@ -1,4 +1,4 @@
-"""The pictures of a diagnosis, as inline SVG: residuals before and after, and the curve of what was found."""
+"""Figures of a diagnosis as inline SVG: residuals before and after, curves of findings, and maps of gains."""
 
 from __future__ import annotations
 
@@ -28,22 +28,24 @@ __all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_s
 
 _DARK = "#9A4300"
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
-_CLOSE = 0.03  # of the axis: numbers nearer than this would overlap
+_CLOSE = 0.03
+"""Distance, as a share of the axis, below which numbers would overlap."""
+
 _MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
 
 
 @dataclass(frozen=True)
 class Panel:
-    """The residual of a channel over a driver: what one row of pictures shows."""
+    """A row of figures: the residual of a channel over a driver."""
 
     driver: str
     channel: int
 
 
 def over_time(diagnosis: Diagnosis) -> str:
-    """Residual before and after over time, a row a channel, with the onsets and intervals of the findings.
+    """Draw the residual over time, one row per channel, with onsets and intervals of the findings.
 
-    Where nothing was found there is no after.
+    Without findings there is no column "after".
     """
     t, findings = diagnosis.traces, diagnosis.findings
     rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
@@ -71,25 +73,25 @@ def over_time(diagnosis: Diagnosis) -> str:
 
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
-    """The sensor's noise floor of each channel that is an output."""
-    return {one.output: one.noise_floor for one in diagnosis.world.follows if one.output in diagnosis.traces.channels}
+    """Return the noise floor of each channel that is an output."""
+    return {fit.output: fit.noise_floor for fit in diagnosis.environment.goodness_of_fit if fit.output in diagnosis.traces.channels}
 
 
 def numbered(diagnosis: Diagnosis) -> bool:
-    """Whether the findings' numbers stand above the residual over time: of several, if one has a place there."""
+    """Whether the figure over time shows the numbers of findings: with several findings, of which any has a time."""
     findings = diagnosis.findings
     return len(findings) > 1 and any(f.onset is not None or f.intervals for f in findings)
 
 
 def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
-    """The curve of a finding and the residual over its drivers; None where there is neither."""
+    """Draw the curve of a finding and the residual over its drivers; None if there is neither."""
     t, finding = diagnosis.traces, diagnosis.findings[index]
     panels, curve = driver_panels(diagnosis, index), finding.curve
     if curve is None and not panels:
         return None
-    beside = curve is not None and len(panels) == 1
-    above = int(curve is not None and not beside)
-    grid = PanelGrid(len(panels) + above, 3 if beside else 2, top=0.3, below=0.72)
+    side_by_side = curve is not None and len(panels) == 1
+    above = int(curve is not None and not side_by_side)
+    grid = PanelGrid(len(panels) + above, 3 if side_by_side else 2, top=0.3, below=0.72)
     with style():
         figure = grid.figure()
         for row, panel in enumerate(panels, above):
@@ -99,14 +101,14 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
                 title(ax, of_channel(moment, t.channels[panel.channel]))
                 ax.set_xlabel(named(panel.driver, t.driver_units.get(panel.driver, "")))
         if curve is not None:
-            ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
-            draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if beside else 3 * MOST_LETTERS)
+            ax = grid.axes(figure, 0, 2) if side_by_side else grid.axes(figure, 0, 0, wide=True)
+            draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if side_by_side else 3 * MOST_LETTERS)
             title(ax, term("picture.curve"))
         return svg(figure, f"finding{index + 1}", term("picture.about_finding", number=index + 1))
 
 
 def over_states(diagnosis: Diagnosis, index: int) -> str | None:
-    """The map of a finding's gain over two states; None where it has none."""
+    """Draw a finding's gain over two states; None if it has no map."""
     found = diagnosis.findings[index].map
     if found is None:
         return None
@@ -118,9 +120,9 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
-    """Drivers and channels of a finding's pictures: of the channels it acts on, those that change most.
+    """Return drivers and channels of a finding's figures: the channels with the largest change.
 
-    Of several findings each has one, so that the page stays short.
+    Each of several findings has a single panel, to keep the page short.
     """
     t, finding = diagnosis.traces, diagnosis.findings[index]
     drivers = [name for name in finding.drivers if name in t.drivers]
@@ -129,7 +131,7 @@ def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
 
 
 def _number(ax: Any, findings: Sequence[Finding]) -> None:
-    """The numbers of the findings above the panel; of those too close to each other, side by side."""
+    """Write the numbers of the findings above the panel; join those that would overlap."""
     low, high = ax.get_xlim()
     placed: list[tuple[float, str]] = []
     for place, name in sorted(_places(findings)):

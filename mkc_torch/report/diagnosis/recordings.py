@@ -1,4 +1,4 @@
-"""What one of several recordings is called."""
+"""Name of a recording among several."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["recording_called"]
 
 
 def recording_called(number: int, name: str) -> str:
-    """A recording by its number and, where it has one of its own, its name.
+    """Return the number of a recording and, if it has one, its name.
 
     Example:
         >>> recording_called(2, "b.csv"), recording_called(2, "recording 2")

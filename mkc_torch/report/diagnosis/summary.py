@@ -1,4 +1,4 @@
-"""The box at the top of a page: does it follow, what is missing, where, how large, how sure, and by how much better."""
+"""Rows of the summary at the top of the page: fit, noise, findings, size, place, significance and improvement."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
 from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, probability
-from mkc_torch.report.diagnosis.unseen import better, left, residual_of_all, residuals
+from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
 from mkc_torch.report.diagnosis.verdict import reasons
 from mkc_torch.report.diagnosis.world import noise_lines, output_lines
-from mkc_torch.report.words.numbers import share, size
+from mkc_torch.report.words.numbers import size
 
 __all__ = ["Row", "chance", "residual_alone", "summary"]
 
 Row = tuple[str, tuple[str, ...]]
-"""A question with its answer, a line each; what stands between backticks is code."""
+"""Label and lines of a row; backticks mark code."""
 
 
 def summary(diagnosis: Diagnosis) -> list[Row]:
-    """The questions with their answers, however many findings there are."""
+    """Return the rows of the summary."""
     d = diagnosis
     follows = output_lines(d)
     rows = [_row("label.follows", *follows)] if follows else []
     if d.verdict == "unfit":
-        return [*rows, *([_row("label.why", *reasons(d))] if d.world.reasons else [])]
+        return [*rows, *([_row("label.why", *reasons(d))] if d.environment.reasons else [])]
     noise = _row("label.noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
     rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
-    beside = "" if d.findings else smooth_fit(d)
-    if beside:
-        rows.append(_row("label.for_comparison", f"{capital(beside)}."))
+    smooth = "" if d.findings else smooth_fit(d)
+    if smooth:
+        rows.append(_row("label.for_comparison", f"{capital(smooth)}."))
     return rows
 
 
@@ -45,59 +45,59 @@ def _row(key: str, *lines: str) -> Row:
 def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
     d = diagnosis
     if not d.findings:
-        if not d.world.follows:
+        if not d.environment.goodness_of_fit:
             yield _row("label.residual", residual_alone(d))
-        yield _row("label.how_sure", *_sure_of_pushes(d), chance(d.p_value, d))
+        yield _row("label.how_sure", *_process_noise_evidence(d), chance(d.p_value, d))
         return
     if len(d.findings) > 1:
         for number, f in enumerate(d.findings, 1):
             yield f"{number} · {capital(finding_name(f))}", tuple(_in_short(f, d))
         together = residual_of_all(d)
         if together:
-            yield _row("label.together", *(term("evidence.on_unseen", change=one) for one in together))
+            yield _row("label.together", *(term("evidence.on_unseen", change=change) for change in together))
         yield _row("label.how_sure", chance(d.findings[0].p_value, d))
         return
     (f,) = d.findings
-    told = _sizes(f, 2)
-    if told:
-        yield _row("label.how_large", f"{told}.")
+    text = _sizes(f, 2)
+    if text:
+        yield _row("label.how_large", f"{text}.")
     yield _row("label.where", f"{_place(f, d)}.")
     yield _row("label.how_sure", chance(f.p_value, d))
     if f.held_out is None:
         yield _row("label.how_much_better", f"{capital(term('evidence.not_measured'))}: {_closed(f.held_out_note)}")
         return
     sure = f"{capital(better(f.held_out))}; {gain(f.held_out)}."
-    sizes = [term("evidence.on_unseen", change=one) for one in residuals(f.held_out, d.world)]
-    yield _row("label.how_much_better", *sizes, sure, *filter(None, [left(f.held_out)]))
+    sizes = [term("evidence.on_unseen", change=residual) for residual in residuals(f.held_out, d.environment)]
+    yield _row("label.how_much_better", *sizes, sure, *filter(None, [diverged(f.held_out)]))
 
 
-def _sure_of_pushes(diagnosis: Diagnosis) -> Iterator[str]:
-    """How much less likely the noise is without what pushes; nothing where physics is what is asked about."""
-    known = [push for push in diagnosis.world.pushes if math.isfinite(push.nats)]
+def _process_noise_evidence(diagnosis: Diagnosis) -> Iterator[str]:
+    """State the evidence for process noise, and that no physics is significant."""
+    known = [process for process in diagnosis.environment.process_noise if math.isfinite(process.log_likelihood_gain)]
     if known:
-        yield term("world.less_likely", nats=size(known[0].nats), place=plain(known[0].place))
+        yield term("environment.process_noise_gain", nats=size(known[0].log_likelihood_gain), place=plain(known[0].place))
         if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
-            yield term("world.no_physics")
+            yield term("environment.no_physics")
 
 
 def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
-    """One of several findings: what it is worth, how large, where, and how sure."""
+    """Return grade, size, place and significance of one of several findings."""
     f = finding
     rival = f"; {term('evidence.rivals', rivals=rivals(f))}" if inseparable(f) else ""
     yield f"{capital(grade(f))}{rival}."
-    told = _sizes(f, 1)
-    if told:
-        yield f"{told}."
+    text = _sizes(f, 1)
+    if text:
+        yield f"{text}."
     yield f"{_place(f, diagnosis)}."
     sure = evidence(None, 0) if f.p_value is None else probability(f.p_value)
     if f.held_out is None:
         yield f"{sure}; {term('evidence.not_measured')}: {_closed(f.held_out_note)}"
         return
-    yield f"{sure}; {better(f.held_out)}: {'; '.join(residuals(f.held_out, diagnosis.world))}."
+    yield f"{sure}; {better(f.held_out)}: {'; '.join(residuals(f.held_out, diagnosis.environment))}."
 
 
 def _sizes(finding: Finding, most: int) -> str:
-    """How large it is; of a curve, which has no size of its own, its picture says so."""
+    """Format the first parameters; empty for a curve, which its figure shows."""
     return "" if is_curve(finding.effect) else "; ".join(largest(p) for p in finding.parameters[:most])
 
 
@@ -111,21 +111,19 @@ def _place(finding: Finding, diagnosis: Diagnosis) -> str:
 
 
 def residual_alone(diagnosis: Diagnosis) -> str:
-    """The residual of the simulation as it is."""
+    """Return the residual of the simulation without findings."""
     d = diagnosis
     return term("verdict.residual", residual=f"{size(d.baseline.rmse)} {plain(d.traces.unit)}".rstrip())
 
 
 def chance(p_value: float | None, diagnosis: Diagnosis) -> str:
-    """What a p-value means, in a sentence; None where no noise was drawn."""
+    """Return the p-value in a sentence."""
     d = diagnosis
     if p_value is None:
         return f"{capital(evidence(None, 0))}."
-    told = share(p_value)
     return term(
         "verdict.chance",
         candidates=f"{d.candidates_tried:,}",
-        share=term("verdict.at_most", share=told) if p_value <= (1.0 + 1e-9) / (1 + d.surrogates) else told,
         evidence=evidence(p_value, d.surrogates),
         level=f"{d.level:g}",
     )

@@ -1,4 +1,4 @@
-"""What unseen blocks say of a finding: whether it is better there, why not if it seems so, and each output's sizes."""
+"""Evidence for a finding on held-out blocks, in words: confirmation, reasons, and residuals of each output."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
 
-__all__ = ["better", "left", "residual_of_all", "residuals"]
+__all__ = ["better", "diverged", "residual_of_all", "residuals"]
 
 _BETTER = {
     "surely": "evidence.surely",
@@ -21,11 +21,11 @@ _BETTER = {
     "worse": "evidence.worse",
 }
 _UNCHANGED = 5e-4
-"""Share below which a residual counts as no smaller: "surely better" is not said of it, likelier though it be."""
+"""Share by which a residual must shrink for "surely better"."""
 
 
 def better(held_out: HeldOut) -> str:
-    """Whether unseen blocks show that the finding makes it better; where the residuals say otherwise, why.
+    """State whether held-out blocks confirm a finding, and why residual and likelihood disagree.
 
     Example:
         >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.01, (-0.1, 0.1), 1.0, 0.99, "µT"))
@@ -34,12 +34,12 @@ def better(held_out: HeldOut) -> str:
         'not shown to be better on unseen blocks: from block to block the gain differs by more than itself, so it ...'
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
-    told, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)
-    return term("evidence.because", better=term(told), reason=reason) if reason else term(told)
+    text, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)
+    return term("evidence.because", better=term(text), reason=reason) if reason else term(text)
 
 
 def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
-    """A term and a reason where the free run decides."""
+    """Return key and reason if the open-loop residual decides."""
     if vetoed(held_out):
         if kind in ("surely", "probably"):
             return _BETTER["not shown"], term("evidence.free_run_farther")
@@ -50,30 +50,49 @@ def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
 
 
 def _by_likelihood(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
-    """A term, and why residuals and likelihood disagree; empty where they do not."""
+    """Return the key, and why residual and likelihood disagree; the reason is empty if they agree."""
     less = change(held_out)
     if kind == "surely":
         if less >= _UNCHANGED:
             return _BETTER[kind], ""
-        return "evidence.surely_likelier", term("evidence.in_the_tail")
+        return "evidence.surely_more_likely", term("evidence.in_the_tail")
     if less < SMALL:
         return _BETTER[kind], ""
     why = term("evidence.tail_less_likely" if kind == "worse" else "evidence.blocks_differ")
-    return _BETTER[kind], _within(held_out.left) or why
+    return _BETTER[kind], _within(_diverged(held_out)) or why
 
 
 def _within(sentence: str) -> str:
-    """A sentence as a part of another."""
+    """Return a sentence as a clause."""
     return sentence[:1].lower() + sentence[1:].rstrip(".")
 
 
-def left(held_out: HeldOut) -> str:
-    """Of which blocks the free run leaves the recording's range; empty where none does or it was told as a reason."""
-    return "" if not held_out.left or _within(held_out.left) in better(held_out) else held_out.left
+def diverged(held_out: HeldOut) -> str:
+    """Return in how many blocks a simulation diverges; empty if none does or ``better`` already contains it."""
+    sentence = _diverged(held_out)
+    return "" if not sentence or _within(sentence) in better(held_out) else sentence
 
 
-def residuals(held_out: HeldOut, world: NoiseEnvironment) -> list[str]:
-    """The residual before and after, an output a line, each in its own unit and beside its noise floor.
+def _diverged(held_out: HeldOut) -> str:
+    """Return in how many blocks a simulation leaves the recording's range; empty if none does.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import DivergedBlock
+        >>> held_out = HeldOut(0.3, (0.2, 0.4), 0.3, 0.3, "", {}, (DivergedBlock(7, before=True, after=False),), 25)
+        >>> _diverged(held_out)
+        'The open-loop simulation diverges in 1 of 25 blocks without the finding; no mean includes them.'
+    """
+    before, after = (sum(getattr(b, side) for b in held_out.diverged_blocks) for side in ("before", "after"))
+    if not before and not after:
+        return ""
+    key = "evidence.diverged_both" if before and after else "evidence.diverged_before"
+    if after and not before:
+        key = "evidence.diverged_after"
+    return term(key, before=before, after=after, blocks=held_out.blocks)
+
+
+def residuals(held_out: HeldOut, environment: NoiseEnvironment) -> list[str]:
+    """Return one line per output: residual before and after, in its unit, with its noise floor.
 
     Example:
         >>> each = {"angle": ResidualSizes(0.02, 0.01, "rad"), "rate": ResidualSizes(0.3, 0.3, "rad/s")}
@@ -83,32 +102,32 @@ def residuals(held_out: HeldOut, world: NoiseEnvironment) -> list[str]:
         ['residual 0.900 → 0.500 µT (44 % less)']
     """
     if not held_out.outputs:
-        told = improvement(held_out.rmse_before, held_out.rmse_after, held_out.unit)
-        return [term("evidence.of_residual", change=told)]
-    return [_of_output(name, sizes, world) for name, sizes in held_out.outputs.items()]
+        text = improvement(held_out.rmse_before, held_out.rmse_after, held_out.unit)
+        return [term("evidence.of_residual", change=text)]
+    return [_of_output(name, sizes, environment) for name, sizes in held_out.outputs.items()]
 
 
-def _of_output(name: str, sizes: ResidualSizes, world: NoiseEnvironment) -> str:
-    told = improvement(sizes.before, sizes.after, sizes.unit)
-    floor = next((one.noise_floor for one in world.follows if one.output == name), math.nan)
+def _of_output(name: str, sizes: ResidualSizes, environment: NoiseEnvironment) -> str:
+    text = improvement(sizes.before, sizes.after, sizes.unit)
+    floor = next((fit.noise_floor for fit in environment.goodness_of_fit if fit.output == name), math.nan)
     if math.isfinite(floor):
-        told = term("evidence.with_floor", change=told, floor=f"{size(floor)} {plain(sizes.unit)}".rstrip())
-    return term("evidence.one_size", output=plain(name), change=told)
+        text = term("evidence.with_floor", change=text, floor=f"{size(floor)} {plain(sizes.unit)}".rstrip())
+    return term("evidence.output_size", output=plain(name), change=text)
 
 
 def residual_of_all(diagnosis: Diagnosis) -> list[str]:
-    """The same without any finding and with all; empty where outputs of several units have one number together."""
+    """Return the residuals without findings and with all findings; empty if outputs of several units share a number."""
     d = diagnosis
     held = [f.held_out for f in d.findings if f.held_out is not None]
-    if len(held) == len(d.findings) and all(one.outputs for one in held) and held:
+    if len(held) == len(d.findings) and all(held_out.outputs for held_out in held) and held:
         first, last = held[0].outputs, held[-1].outputs
         both = {
             name: ResidualSizes(sizes.before, last[name].after, sizes.unit)
             for name, sizes in first.items()
             if name in last
         }
-        return [_of_output(name, sizes, d.world) for name, sizes in both.items()]
+        return [_of_output(name, sizes, d.environment) for name, sizes in both.items()]
     if len(d.traces.channels) > 1 and not d.traces.unit:
         return []
-    told = improvement(d.baseline.rmse, d.corrected.rmse, d.traces.unit)
-    return [term("evidence.of_residual", change=told)]
+    text = improvement(d.baseline.rmse, d.corrected.rmse, d.traces.unit)
+    return [term("evidence.of_residual", change=text)]

@@ -1,4 +1,4 @@
-"""What a diagnosis says at first sight: how it looks, the headline, what to do, and what was noticed."""
+"""Headline, advice and warnings of a diagnosis."""
 
 from __future__ import annotations
 
@@ -21,22 +21,21 @@ __all__ = [
     "Tone",
     "apply_command",
     "headline",
-    "left_in_short",
-    "left_open",
+    "unexplained_place",
+    "unexplained",
     "reasons",
-    "said_first",
+    "notices_first",
     "to_do",
     "tone",
     "warned",
 ]
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Nothing is missing; physics is, and it is named; nothing that is worth correcting; the simulation does not follow, or
-something without a name drives it."""
+"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed structure."""
 
 
 def tone(diagnosis: Diagnosis) -> Tone:
-    """How a headline looks."""
+    """Return the style of the headline."""
     d = diagnosis
     if d.verdict in ("unfit", "unexplained"):
         return "open"
@@ -48,26 +47,26 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The verdict in a sentence or two, the findings by their grades."""
+    """Return the verdict in one or two sentences, the findings by grade."""
     d = diagnosis
-    if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.world)):
+    if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.environment)):
         return term("verdict.unfit")
     if nothing_shows(d):
-        real = [f for f in d.findings if f.grade != "not confirmed"]
+        real = [f for f in d.findings if f.grade != "unconfirmed"]
         return f"{term('verdict.not_worth')} {_found(real)}" if real else term("verdict.nothing")
-    told = [_found(d.findings), left_open(d)]
+    sentences = [_found(d.findings), unexplained(d)]
     if not any(worth_correcting(f) for f in d.findings):
-        told.reverse()  # what is there comes before what it is not
-    return " ".join(filter(None, told))
+        sentences.reverse()  # state the unnamed structure before unconfirmed findings
+    return " ".join(filter(None, sentences))
 
 
 def _found(findings: Sequence[Finding]) -> str:
-    told = []
+    sentences = []
     for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
-            told.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
-    return " ".join(told)
+            sentences.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
+    return " ".join(sentences)
 
 
 _LEFT_OUT, _NEAREST = "verdict.left_out", "verdict.nearest"
@@ -76,40 +75,40 @@ _SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.u
 
 
 def _kind(finding: Finding) -> str:
-    """The sentence that a finding belongs to."""
-    if finding.grade == "not confirmed" and finding.cannot_be:
+    """Return the key of the sentence that lists a finding."""
+    if finding.grade == "unconfirmed" and finding.cannot_be:
         return _CANNOT_BE
-    if finding.grade == "not confirmed":
+    if finding.grade == "unconfirmed":
         return _BOTH if small(finding) else _UNCONFIRMED
-    return {"left out": _LEFT_OUT, "real but small": _SMALL}.get(finding.grade, _NEAREST)
+    return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
 
 
 def _named(finding: Finding, *, alone: bool) -> str:
     name, others = finding_name(finding), inseparable(finding)
-    if finding.grade == "nearest in the catalogue":
+    if finding.grade == "nearest":
         gain = finding.shape.free_curve_gain if finding.shape is not None else math.nan
-        return term("verdict.nearest_one", finding=name, nats=size(gain)) if math.isfinite(gain) else name
+        return term("verdict.nearest_finding", finding=name, nats=size(gain)) if math.isfinite(gain) else name
     if not others:
         return name
     if not alone:
         return term("verdict.or_a_rival", finding=name)
     if len(others) == 1:
-        return term("verdict.or_one", finding=name, rival=rivals(finding))
+        return term("verdict.or_rival", finding=name, rival=rivals(finding))
     return term("verdict.or_many", finding=name, count=len(others))
 
 
-def left_open(diagnosis: Diagnosis) -> str:
-    """What no finding accounts for; empty where there is nothing."""
+def unexplained(diagnosis: Diagnosis) -> str:
+    """State the structure that no finding explains; empty if there is none."""
     d = diagnosis
     if d.stop is not None:
         return term("verdict.unfinished")
-    beside = any(worth_correcting(f) for f in d.findings)
-    if d.verdict == "unexplained" and d.world.pushes:
+    found = any(worth_correcting(f) for f in d.findings)
+    if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
-        pair = ("verdict.pushed", "verdict.yet_pushed") if rates else ("verdict.slow", "verdict.yet_slow")
-        return term(pair[int(beside)], places=several(places))
+        pair = ("verdict.disturbed", "verdict.yet_disturbed") if rates else ("verdict.drift", "verdict.yet_drift")
+        return term(pair[int(found)], places=several(places))
     if d.remaining:
-        return term("verdict.yet_smooth" if beside else "verdict.smooth", columns=several(d.remaining))
+        return term("verdict.yet_smooth" if found else "verdict.smooth", columns=several(d.remaining))
     passed = d.p_value is not None and d.p_value <= d.level
     if not d.findings and passed and d.verdict == "adequate":
         return term("verdict.unnamed")
@@ -117,75 +116,75 @@ def left_open(diagnosis: Diagnosis) -> str:
         return ""
     if any(unrecorded(f) for f in d.findings):
         return term("verdict.course_alone")
-    return term("verdict.yet_structure" if beside else "verdict.structure")
+    return term("verdict.yet_structure" if found else "verdict.structure")
 
 
 def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
-    """The states whose rates something pushes, and whether there are any; else the outputs that it is added to."""
-    pushes = diagnosis.world.pushes
-    rates = [push.place for push in pushes if push.at_rate]
-    places = rates or [push.place for push in pushes]
+    """Return whether states have process noise, and these states; otherwise the outputs with drift."""
+    processes = diagnosis.environment.process_noise
+    rates = [push.place for process in processes if process.at_rate]
+    places = rates or [process.place for process in processes]
     return bool(rates), [f"`{plain(place)}`" for place in dict.fromkeys(places)]
 
 
-def left_in_short(diagnosis: Diagnosis) -> str:
-    """Where something is without a name, in a few words; empty where nothing is."""
+def unexplained_place(diagnosis: Diagnosis) -> str:
+    """Return the place of unexplained structure in a few words; empty if there is none."""
     d = diagnosis
-    if not left_open(d):
+    if not unexplained(d):
         return ""
     if d.stop is not None:
-        return term("world.unfinished")
-    if d.verdict == "unexplained" and d.world.pushes:
+        return term("environment.unfinished")
+    if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
-        return term("world.rate_of", place=several(places)) if rates else several(places)
-    return several(d.remaining) if d.remaining else term("world.structure")
+        return term("environment.rate_of", place=several(places)) if rates else several(places)
+    return several(d.remaining) if d.remaining else term("environment.structure")
 
 
 def reasons(diagnosis: Diagnosis) -> list[str]:
-    """Why the simulation does not follow, the most likely first."""
-    return [capital(with_names(sentence, ())) for sentence in diagnosis.world.reasons]
+    """Return why the simulation does not fit, the most likely reason first."""
+    return [capital(with_names(sentence, ())) for sentence in diagnosis.environment.reasons]
 
 
 def to_do(diagnosis: Diagnosis) -> list[str]:
-    """What to do next, as the diagnosis advises it."""
+    """Return the advice of the diagnosis, with names for effect ids."""
     ids = _ids(diagnosis)
     return [capital(with_names(sentence, ids, _kinds(diagnosis))) for sentence in diagnosis.advice]
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
-    """The warnings by weight: what casts doubt on a finding or its driver first; effects in them by their names.
+    """Return the warnings, those on a finding or its driver first, with names for effect ids.
 
-    What says that all is a quick look, or that the search was stopped, stands apart, before everything else.
+    The notices of a quick look and of a stopped search are not included.
     """
     d, ids = diagnosis, _ids(diagnosis)
     doubted = {name for f in d.findings for name in (f.effect, *f.drivers)}
-    first = said_first(d)
+    first = notices_first(d)
     ordered = sorted(
-        [one for one in d.warnings if one not in first],
+        [warning for warning in d.warnings if warning not in first],
         key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)),
     )
     return [capital(with_names(sentence, ids, _kinds(d))) for sentence in ordered]
 
 
 def _kinds(diagnosis: Diagnosis) -> dict[str, str]:
-    """Of what quantity each effect that was found acts on."""
+    """Return the kind of quantity that each found effect acts on."""
     return {finding.effect: finding.kind for finding in diagnosis.findings}
 
 
-def said_first(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """What a reader has to know before anything else: that it is a quick look, or that the search was stopped."""
+def notices_first(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return the notices of a quick look and of a stopped search."""
     return notices(diagnosis.stop, quick=diagnosis.quick)
 
 
 def _ids(diagnosis: Diagnosis) -> set[str]:
-    """Of all effects that a sentence may be about; those of one word are words."""
+    """Return the effect ids that sentences may contain; ids without an underscore are ordinary words."""
     d = diagnosis
     found = {f.effect for f in d.findings} | {a.effect for f in d.findings for a in f.alternatives}
     return {effect for effect in found | {c.effect for c in d.candidates} if "_" in effect}
 
 
 def apply_command(diagnosis: Diagnosis) -> str:
-    """The command that uses on another recording what was found; empty where nothing found is of use there."""
+    """Return the command that corrects another recording; empty if no finding transfers."""
     d = diagnosis
     if not any(transfers(f) for f in d.findings):
         return ""

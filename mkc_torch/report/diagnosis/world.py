@@ -1,4 +1,4 @@
-"""The world around a simulation in words: how it follows each output, what pushes it, and what inputs do."""
+"""Sentences and tables of goodness of fit, process noise, drift, input hold and offsets."""
 
 from __future__ import annotations
 
@@ -14,73 +14,73 @@ from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
-    "between_sentence",
+    "input_hold_sentence",
     "explained",
-    "follows_table",
+    "goodness_of_fit_table",
     "noise_lines",
     "offset_sentences",
     "output_lines",
-    "push_sentence",
-    "pushes_table",
+    "process_noise_sentence",
+    "process_noise_table",
     "remainder",
 ]
 
 _MOST_OUTPUTS = 6
 _STILL = 2.0
-"""Times its noise floor up to which an output's variation is called hardly any."""
+"""Variation, in noise floors, up to which an output hardly varies."""
 _MOST_DECIMALS = 4
-_SOURCES = {"declared": "world.declared", "samples": "world.samples", "quantisation": "world.quantisation"}
-_BETWEEN = {"held": "world.held", "linear": "world.linear", "smooth": "world.smooth"}
+_SOURCES = {"declared": "environment.declared", "samples": "environment.samples", "quantisation": "environment.quantisation"}
+_BETWEEN = {"held": "environment.held", "linear": "environment.linear", "smooth": "environment.smooth"}
 
 
 def explained(value: float) -> str:
-    """A share of the variation, with as many nines as it has.
+    """Format a share of the variance, with all its nines.
 
     Example:
         >>> explained(0.9997), explained(0.12), explained(-0.06), explained(0.985), explained(1.0)
         ('99.97 %', '12 %', 'nothing', '98.5 %', '100 %')
     """
     if not value > 0.0:
-        return term("world.nothing")
+        return term("environment.nothing")
     places = 0 if value < 0.9 or value == 1.0 else min(max(-math.floor(math.log10(1.0 - value)) - 2, 1), _MOST_DECIMALS)
     return f"{number(100.0 * value, places)} %"
 
 
 def output_lines(diagnosis: Diagnosis) -> list[str]:
-    """A line an output: how the simulation follows it, in its own unit, beside the noise floor; and its offsets."""
-    each = diagnosis.world.follows
-    told = [_followed(one, lost=diagnosis.verdict == "unfit") for one in each[:_MOST_OUTPUTS]]
-    more = len(each) - len(told)
-    beside = [] if diagnosis.verdict == "unfit" else offset_sentences(diagnosis.world)
-    return [*told, *([term("world.more_outputs", count=more)] if more else []), *beside]
+    """Return one line per output, with residual and noise floor in its unit, and the offsets."""
+    each = diagnosis.environment.goodness_of_fit
+    lines = [_fit_text(fit, lost=diagnosis.verdict == "unfit") for fit in each[:_MOST_OUTPUTS]]
+    more = len(each) - len(lines)
+    offsets = [] if diagnosis.verdict == "unfit" else offset_sentences(diagnosis.environment)
+    return [*lines, *([term("environment.more_outputs", count=more)] if more else []), *offsets]
 
 
-def _followed(one: GoodnessOfFit, *, lost: bool) -> str:
-    """How an output is followed; of one that is not, what a trivial prediction reaches.
+def _fit_text(fit: GoodnessOfFit, *, lost: bool) -> str:
+    """Format the goodness of fit of an output; for a poor fit, with the RMSE of the mean.
 
     Example:
-        >>> one = GoodnessOfFit("angle", "rad", 0.0049, 0.35, 0.9998, 0.005, "declared", 0.35, 0.02)
-        >>> _followed(one, lost=False)
-        'angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation'
+        >>> fit = GoodnessOfFit("angle", "rad", 0.0049, 0.35, 0.9998, 0.005, "declared", 0.35, 0.02)
+        >>> _fit_text(fit, lost=False)
+        'angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance'
     """
     if lost:
         return term(
-            "world.lost",
-            output=plain(one.output),
-            share=explained(one.explained),
-            mean=_sized(one.mean_predicts, one.unit),
-            residual=_sized(one.residual, one.unit),
-            floor=_floor(one),
+            "environment.lost",
+            output=plain(fit.output),
+            share=explained(fit.explained),
+            mean=_sized(fit.rmse_of_mean, fit.unit),
+            residual=_sized(fit.residual, fit.unit),
+            floor=_floor(fit),
         )
-    key = "world.still" if one.variation <= _STILL * one.noise_floor else "world.follows_to"
-    share = explained(one.explained)
-    return term(key, output=plain(one.output), residual=_sized(one.residual, one.unit), floor=_floor(one), share=share)
+    key = "environment.still" if fit.variation <= _STILL * fit.noise_floor else "environment.fits"
+    share = explained(fit.explained)
+    return term(key, output=plain(fit.output), residual=_sized(fit.residual, fit.unit), floor=_floor(fit), share=share)
 
 
-def _floor(one: GoodnessOfFit) -> str:
-    if not math.isfinite(one.noise_floor):
-        return term("world.floor_unknown")
-    return term("world.floor", size=_sized(one.noise_floor, one.unit), source=term(_SOURCES[one.floor_source]))
+def _floor(fit: GoodnessOfFit) -> str:
+    if not math.isfinite(fit.noise_floor):
+        return term("environment.floor_unknown")
+    return term("environment.floor", size=_sized(fit.noise_floor, fit.unit), source=term(_SOURCES[fit.floor_source]))
 
 
 def _sized(value: float, unit: str) -> str:
@@ -89,24 +89,24 @@ def _sized(value: float, unit: str) -> str:
     return f"{size(value)} {plain(unit)}".rstrip()
 
 
-def follows_table(world: NoiseEnvironment) -> Table | None:
-    """The numbers of how each output is followed; None where that was not asked."""
-    if not world.follows:
+def goodness_of_fit_table(environment: NoiseEnvironment) -> Table | None:
+    """Return the goodness of fit of each output; None if it was not computed."""
+    if not environment.goodness_of_fit:
         return None
     rows = tuple(
         (
-            plain(one.output),
-            _sized(one.residual, one.unit),
-            _floor(one),
-            _sized(one.variation, one.unit),
-            explained(one.explained),
-            _sized(one.mean_predicts, one.unit),
-            _sized(one.last_value_predicts, one.unit),
+            plain(fit.output),
+            _sized(fit.residual, fit.unit),
+            _floor(fit),
+            _sized(fit.variation, fit.unit),
+            explained(fit.explained),
+            _sized(fit.rmse_of_mean, fit.unit),
+            _sized(fit.rmse_of_last_value, fit.unit),
         )
-        for one in world.follows
+        for fit in environment.goodness_of_fit
     )
     return Table(
-        term("section.follows"), tuple(term(key) for key in _FOLLOWS_COLUMNS), rows, term("world.follows_note")
+        term("section.follows"), tuple(term(key) for key in _FOLLOWS_COLUMNS), rows, term("environment.fit_note")
     )
 
 
@@ -116,80 +116,84 @@ _FOLLOWS_COLUMNS = (
     "table.noise_floor",
     "table.variation",
     "table.explained",
-    "table.mean_predicts",
-    "table.last_value_predicts",
+    "table.rmse_of_mean",
+    "table.rmse_of_last_value",
 )
 
 
-def push_sentence(push: ProcessNoise) -> str:
-    """What pushes a state, or is added to an output, in plain words.
+def process_noise_sentence(process: ProcessNoise) -> str:
+    """Format the process noise of a state or the drift of an output.
 
     Example:
-        >>> push_sentence(ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
-        'Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², for about 0.7 s at a time.'
-        >>> push_sentence(ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
-        'Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², anew at each sample.'
-        >>> push_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
-        'Something slow is added to `angle` beside its noise: 0.0100 ± 0.0020 rad, for about 30 s at a time.'
+        >>> process_noise_sentence(ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
+        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s.'
+        >>> process_noise_sentence(ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
+        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white.'
+        >>> process_noise_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
+        'Drift of `angle` in addition to its white noise: 0.0100 ± 0.0020 rad, correlation time 30 s.'
     """
-    told = measured(push.size, push.standard_error, tidy(push.unit))[0]
-    lasts = term("world.lasts", lasting=f"{push.lasting:.2g}") if push.lasting > 0.0 else term("world.each_sample")
-    return term("world.push" if push.at_rate else "world.slow", place=plain(push.place), size=told, lasts=lasts)
+    amount = measured(process.size, process.standard_error, tidy(process.unit))[0]
+    memory = term("environment.white")
+    if process.correlation_time > 0.0:
+        memory = term("environment.correlation_time", seconds=f"{process.correlation_time:.2g}")
+    key = "environment.process_noise" if process.at_rate else "environment.drift"
+    return term(key, place=plain(process.place), size=amount, memory=memory)
 
 
-def pushes_table(world: NoiseEnvironment) -> Table | None:
-    """The statistician's numbers of the pushes; None where there are none."""
-    if not world.pushes:
+def process_noise_table(environment: NoiseEnvironment) -> Table | None:
+    """Return the numbers of process noise and drift; None if there is neither."""
+    if not environment.process_noise:
         return None
     rows = tuple(
         (
-            term("world.rate_of", place=plain(push.place)) if push.at_rate else plain(push.place),
-            measured(push.size, push.standard_error, tidy(push.unit))[0],
-            f"{push.lasting:.3g} s" if push.lasting > 0.0 else term("unit.sample"),
-            size(push.nats) if math.isfinite(push.nats) else term("number.not_known"),
+            term("environment.rate_of", place=plain(process.place)) if process.at_rate else plain(process.place),
+            measured(process.size, process.standard_error, tidy(process.unit))[0],
+            f"{process.correlation_time:.3g} s" if process.correlation_time > 0.0 else term("unit.sample"),
+            size(process.log_likelihood_gain) if math.isfinite(process.log_likelihood_gain) else term("number.not_known"),
         )
-        for push in world.pushes
+        for process in environment.process_noise
     )
-    columns = (term("table.pushes"), term("table.standard_deviation"), term("table.lasts"), term("table.without"))
-    return Table(term("section.pushes"), columns, rows, term("world.pushes_note"))
+    columns = (term("table.process_noise"), term("table.standard_deviation"), term("table.lasts"), term("table.without"))
+    return Table(term("section.process_noise"), columns, rows, term("environment.process_noise_note"))
 
 
-def between_sentence(world: NoiseEnvironment) -> str:
-    """What inputs do between samples; empty where that was not asked.
+def input_hold_sentence(environment: NoiseEnvironment) -> str:
+    """Format the input hold; empty if it was not selected.
 
     Example:
-        >>> between_sentence(NoiseEnvironment(input_hold={"torque": "held", "force": "linear"}))
-        'Between samples `torque` is held, `force` goes straight.'
+        >>> input_hold_sentence(NoiseEnvironment(input_hold={"torque": "held", "force": "linear"}))
+        'Input hold: `torque` is constant between samples, `force` is linear between samples.'
     """
-    each = [term(_BETWEEN[how], input=plain(name)) for name, how in world.input_hold.items()]
-    return term("world.between", inputs=", ".join(each)) if each else ""
+    each = [term(_BETWEEN[how], input=plain(name)) for name, how in environment.input_hold.items()]
+    return term("environment.between", inputs=", ".join(each)) if each else ""
 
 
-def offset_sentences(world: NoiseEnvironment) -> list[str]:
-    """The offsets of each output in several recordings.
+def offset_sentences(environment: NoiseEnvironment) -> list[str]:
+    """Format the offsets of each output in several recordings.
 
     Example:
         >>> from mkc_torch.diagnosis.environment import Offset
         >>> offset_sentences(NoiseEnvironment(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
         ['Offset of speed in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
     """
-    told: dict[str, list[str]] = {}
-    for one in world.offsets:
-        size = measured(one.value, one.standard_error, tidy(one.unit))[0] if math.isfinite(one.standard_error) else "0"
-        told.setdefault(one.output, []).append(f"{recording_called(one.recording, one.name)}: {size}")
-    return [term("world.offset", output=plain(name), offsets=", ".join(each)) for name, each in told.items()]
+    sizes: dict[str, list[str]] = {}
+    for offset in environment.offsets:
+        known = math.isfinite(offset.standard_error)
+        value = measured(offset.value, offset.standard_error, tidy(offset.unit))[0] if known else "0"
+        sizes.setdefault(offset.output, []).append(f"{recording_called(offset.recording, offset.name)}: {value}")
+    return [term("environment.offset", output=plain(name), offsets=", ".join(each)) for name, each in sizes.items()]
 
 
 def remainder(diagnosis: Diagnosis) -> str:
-    """Whether what is left over is the sensor's noise; empty where nothing was asked of it."""
+    """State process noise and drift, or that the residual is the sensor's noise; empty if neither was tested."""
     d = diagnosis
-    if d.world.pushes:
-        return " ".join(push_sentence(push) for push in d.world.pushes)
-    if d.verdict == "adequate" and d.world.follows:
-        return term("world.sensor_alone")
+    if d.environment.process_noise:
+        return " ".join(process_noise_sentence(process) for process in d.environment.process_noise)
+    if d.verdict == "adequate" and d.environment.goodness_of_fit:
+        return term("environment.sensor_alone")
     return ""
 
 
 def noise_lines(diagnosis: Diagnosis) -> list[str]:
-    """What the noise of the world is made of, beside that of the fit."""
-    return [line for line in (remainder(diagnosis), between_sentence(diagnosis.world)) if line]
+    """Return the sentences on process noise, drift and input hold."""
+    return [line for line in (remainder(diagnosis), input_hold_sentence(diagnosis.environment)) if line]

@@ -1,4 +1,4 @@
-"""A calibration beside an older one in words and figures, the same in the terminal and on a page."""
+"""Comparison of two calibrations, for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ _ROUNDING = 9
 
 
 def difference_rows(found: Differences) -> list[tuple[str, str, str, str, str]]:
-    """Lines of a table: what it is, the new and the old value, the difference with its error, and that in errors.
+    """Return rows of name, new value, old value, difference with error, and difference in standard errors.
 
     Example:
-        >>> one = Difference("offset x", "µT", 12.5, 12.0, 0.25)
-        >>> difference_rows(Differences("old", (one,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))
+        >>> difference = Difference("offset x", "µT", 12.5, 12.0, 0.25)
+        >>> difference_rows(Differences("old", (difference,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))
         [('offset x, µT', '12.50', '12.00', '0.50 ± 0.25', '+2.0')]
     """
     return [row for group in _groups(found.numbers) for row in _rows(group)]
 
 
 def difference_sentences(found: Differences) -> list[str]:
-    """Whether the two are the same within errors, and what becomes of the field.
+    """State whether two calibrations differ significantly, and how their corrected fields differ.
 
     Example:
-        >>> one = Difference("offset x", "µT", 12.5, 12.0, 0.25)
-        >>> difference_sentences(Differences("old", (one,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0].partition(",")
-        ('The same within errors: offset x differs most', ',', ' by +2.0 combined standard errors, ...')
+        >>> difference = Difference("offset x", "µT", 12.5, 12.0, 0.25)
+        >>> difference_sentences(Differences("old", (difference,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0].partition(",")
+        ('No significant difference: offset x differs most', ',', ' by +2.0 combined standard errors ...')
     """
     return [
         _verdict(found),
         term(
-            "beside.field",
+            "comparison.field",
             samples=f"{found.samples:,}",
-            # below is rounding, not a difference
+            # smaller differences are rounding errors
             angle_max=size(round(found.angle_max, _ROUNDING)),
             angle_rms=size(round(found.angle_rms, _ROUNDING)),
             length_max=f"{size(found.length_max)} {found.unit}".rstrip(),
@@ -50,38 +50,38 @@ def difference_sentences(found: Differences) -> list[str]:
 
 def _verdict(found: Differences) -> str:
     if not found.known:
-        return term("beside.unknown")
+        return term("comparison.unknown")
     if not found.beyond:
-        largest = max(found.known, key=lambda one: abs(one.in_errors))
-        return term("beside.same", what=largest.name, errors=_signed(largest.in_errors), limit=f"{found.limit:.2f}")
-    named = [term("beside.one", what=one.name, errors=_signed(one.in_errors)) for one in found.beyond[:_NAMED]]
+        largest = max(found.known, key=lambda difference: abs(difference.in_errors))
+        return term("comparison.same", what=largest.name, errors=_signed(largest.in_errors), limit=f"{found.limit:.2f}")
+    named = [term("comparison.number", what=difference.name, errors=_signed(difference.in_errors)) for difference in found.beyond[:_NAMED]]
     if len(found.beyond) > _NAMED:
-        named.append(term("beside.more", count=len(found.beyond) - _NAMED))
-    return term("beside.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=share(LEVEL))
+        named.append(term("comparison.more", count=len(found.beyond) - _NAMED))
+    return term("comparison.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=share(LEVEL))
 
 
 def _groups(numbers: Sequence[Difference]) -> list[list[Difference]]:
-    """The offset, and the matrix: each in one power of ten."""
+    """Group offset and matrix; each has a common power of ten."""
     groups: dict[str, list[Difference]] = {}
-    for one in numbers:
-        groups.setdefault(one.name.split()[0], []).append(one)
+    for number in numbers:
+        groups.setdefault(number.name.split()[0], []).append(number)
     return list(groups.values())
 
 
 def _rows(group: Sequence[Difference]) -> list[tuple[str, str, str, str, str]]:
-    exponent = power(max(abs(one.new) for one in group))
+    exponent = power(max(abs(difference.new) for difference in group))
     scale = 10.0**exponent
     rows = []
-    for one in group:
-        places = decimals(one.error / scale)
-        unit = in_power(exponent, one.unit)
+    for difference in group:
+        places = decimals(difference.error / scale)
+        unit = in_power(exponent, difference.unit)
         rows.append(
             (
-                term("table.with_unit", name=one.name, unit=unit) if unit else one.name,
-                number(one.new / scale, places),
-                number(one.old / scale, places),
-                with_errors([one.new - one.old], [one.error], exponent)[0],
-                _signed(one.in_errors),
+                term("table.with_unit", name=difference.name, unit=unit) if unit else difference.name,
+                number(difference.new / scale, places),
+                number(difference.old / scale, places),
+                with_errors([difference.new - difference.old], [difference.error], exponent)[0],
+                _signed(difference.in_errors),
             )
         )
     return rows

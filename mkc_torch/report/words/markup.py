@@ -1,4 +1,4 @@
-"""Texts on a page: what is code, and where lines may not end."""
+"""Markup of texts: code, and non-breaking spaces."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["marked", "unbroken"]
 
 
 def marked(text: str) -> Markup:
-    """A text for a page, with what stands between backticks as code.
+    """Escape a text and set the text between backticks as code.
 
     Example:
         >>> marked("Column `a<b` is constant.")
@@ -20,7 +20,7 @@ def marked(text: str) -> Markup:
 
 
 def unbroken(page: str) -> str:
-    """A page whose lines end neither before a per cent sign nor about a plus-minus.
+    """Insert non-breaking spaces before per cent signs and around plus-minus signs.
 
     Example:
         >>> unbroken("95 % of 1.0 ± 0.1").count("\\u00a0")

@@ -1,4 +1,4 @@
-"""Results in words and figures, the same in the terminal and on a page."""
+"""Format numbers and calibrations, for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mkc_torch.recording.disturbance import RejectedInterval
 
 _MOST_DECIMALS = 9
 _LEAST, _MOST = 0.01, 1e6
-"""Sizes that are written without a power of ten."""
+"""Range of sizes that are written without a power of ten."""
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def decimals(step: float) -> int:
-    """Decimals that show two digits of a standard error, or three where it is not known.
+    """Return the decimals that show two digits of a standard error; 3 if the error is unknown.
 
     Example:
         >>> decimals(0.083), decimals(12.0), decimals(0.0)
@@ -30,7 +30,7 @@ def decimals(step: float) -> int:
 
 
 def number(value: float, places: int) -> str:
-    """A number with a true minus sign, and no minus before a zero.
+    """Format a number with a true minus sign, without a minus before zero.
 
     Example:
         >>> number(-1.25, 1), number(-0.01, 1)
@@ -41,7 +41,7 @@ def number(value: float, places: int) -> str:
 
 
 def power(largest: float) -> int:
-    """The power of ten, a multiple of three, that numbers of this size are written in; 0 for usual ones.
+    """Return the power of ten, a multiple of three, for numbers of this size; 0 for usual sizes.
 
     Example:
         >>> power(46.2), power(4.6e-5), power(4.6e31)
@@ -53,7 +53,7 @@ def power(largest: float) -> int:
 
 
 def in_power(exponent: int, unit: str) -> str:
-    """A unit of numbers that are written in a power of ten.
+    """Format a unit with a power of ten.
 
     Example:
         >>> in_power(-6, "T"), in_power(0, "µT")
@@ -63,7 +63,7 @@ def in_power(exponent: int, unit: str) -> str:
 
 
 def with_errors(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> list[str]:
-    """Values with their standard errors, all to the digits that the largest error leaves, in a power of ten.
+    """Format values with standard errors, to two digits of the largest error, in a power of ten.
 
     Example:
         >>> with_errors((-0.89431, 44.2), (0.085, 0.0925)), with_errors((1.5,), (math.nan,))
@@ -77,7 +77,7 @@ def with_errors(values: Sequence[float], errors: Sequence[float], exponent: int 
 def matrix_with_errors(
     matrix: Sequence[Sequence[float]], errors: Sequence[Sequence[float]], exponent: int = 0
 ) -> list[list[str]]:
-    """Rows of a matrix with their standard errors, all to the same digits, in a power of ten."""
+    """Format the rows of a matrix with standard errors, to the same digits, in a power of ten."""
     scale = 10.0**exponent
     known = [e for row in errors for e in row if math.isfinite(e)]
     places = decimals(max(known, default=math.nan) / scale)
@@ -90,12 +90,12 @@ def matrix_with_errors(
 def _with_error(value: float, error: float, places: int) -> str:
     if not math.isfinite(error):
         return number(value, places)
-    told = f"{error:.{places}f}"
-    return f"{number(value, places)} ± {told if float(told) > 0 or error == 0 else f'{error:.1e}'}"
+    text = f"{error:.{places}f}"
+    return f"{number(value, places)} ± {text if float(text) > 0 or error == 0 else f'{error:.1e}'}"
 
 
 def size(value: float) -> str:
-    """A size to three digits.
+    """Format a size to three digits.
 
     Example:
         >>> size(28.62), size(0.2837), size(758.09), size(0.0), size(4.6e31)
@@ -108,7 +108,7 @@ def size(value: float) -> str:
 
 
 def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> str:
-    """Values side by side, to the digits their errors leave, in a power of ten.
+    """Format a list of values, to two digits of the largest error, in a power of ten.
 
     Example:
         >>> listed((1.234, -2.0, 0.5), (0.1, 0.1, 0.1))
@@ -121,7 +121,7 @@ def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) 
 
 
 def share(value: float) -> str:
-    """A share in per cent; only what is nothing or everything is called so.
+    """Format a share in per cent; only exact 0 and 1 are written as 0 % and 100 %.
 
     Example:
         >>> share(0.0474), share(0.0), share(0.0004), share(0.45), share(0.9985), share(0.9999)
@@ -135,19 +135,19 @@ def share(value: float) -> str:
 
 
 def change(before: ResidualSpread, after: ResidualSpread, unit: str) -> str:
-    """The robust residual before and after."""
+    """Format the robust residual before and after."""
     return f"{size(before.robust)} → {size(after.robust)} {unit}".rstrip()
 
 
 def bandwidth(sigma: float) -> str:
-    """σ, "∞" where the density is Gaussian."""
+    """Format σ; "∞" for a Gaussian."""
     return "∞" if math.isinf(sigma) else f"{sigma:.2f}"
 
 
 def noise(calibration: Calibration) -> str:
-    """The noise along the field in the recording's unit, Gaussian or with the share of the errors in a heavy tail.
+    """Format the noise along the field in the recording's unit: Gaussian, or the share of residuals in the tail.
 
-    The algebraic residual is twice the relative error of the length, to first order.
+    To first order, the algebraic residual is twice the relative error of the length.
     """
     c = calibration
     if c.tails is None:
@@ -161,7 +161,7 @@ def noise(calibration: Calibration) -> str:
 
 
 def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
-    """Intervals of time, or of rows, as one phrase; empty where there are none.
+    """Format intervals of time or of rows; empty if there are none.
 
     Example:
         >>> when([RejectedInterval(12.13, 15.3)]), when([RejectedInterval(0, 1), RejectedInterval(5, 5.5)])
@@ -172,7 +172,7 @@ def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
         'between row 101 and row 140'
     """
     rows = unit == "row"
-    ends = [tuple(f"{end:.0f}" if rows else f"{end:.1f}" for end in one) for one in intervals]
+    ends = [tuple(f"{end:.0f}" if rows else f"{end:.1f}" for end in interval) for interval in intervals]
     if len(intervals) == 1:
         return term("where.between_rows" if rows else "where.between", start=ends[0][0], end=ends[0][1])
     name = "where.interval_of_rows" if rows else "where.interval"
@@ -185,19 +185,19 @@ def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
 
 
 def rejection(calibration: Calibration) -> str:
-    """What was rejected, and when, as a sentence."""
+    """Return the share of rejected samples and their intervals."""
     c = calibration
     if c.rejected == 0:
         return term("calibration.none_rejected", samples=f"{c.samples:,}")
-    key = "calibration.one_rejected" if c.rejected == 1 else "calibration.rejected"
-    told = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
+    key = "calibration.single_rejected" if c.rejected == 1 else "calibration.rejected"
+    text = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
     if c.disturbed:
-        return term("calibration.mainly", rejected=told, when=when(c.disturbed, c.disturbed_unit))
-    return term("calibration.scattered", rejected=told)
+        return term("calibration.mainly", rejected=text, when=when(c.disturbed, c.disturbed_unit))
+    return term("calibration.scattered", rejected=text)
 
 
 def rest_bias(found: RestBias) -> str:
-    """A gyroscope's bias from rest, as a phrase."""
+    """Format a gyroscope's bias from rest."""
     return term(
         "calibration.rest_bias",
         bias=listed(found.value, found.standard_error),
@@ -211,11 +211,11 @@ _RESPONSES = {
     "offset and scale": "aided.offset_and_scale",
     "full matrix": "aided.full_matrix",
 }
-"""The words for what an aided calibration chose."""
+"""Keys of the responses of an aided calibration."""
 
 
 def aided(calibration: Calibration) -> list[str]:
-    """How a calibration came about that the ellipsoid alone does not determine, in sentences; empty of an ellipsoid."""
+    """Return sentences on an aided calibration; empty for a calibration by the ellipsoid."""
     aid = calibration.aid
     if aid is None:
         return []
@@ -226,18 +226,18 @@ def aided(calibration: Calibration) -> list[str]:
         for name, value in aid.evidence
         if name != aid.response
     ]
-    told = [term("aided.by", by=aid.by, response=term(_RESPONSES[aid.response]), rivals="; ".join(rivals))]
+    sentences = [term("aided.by", by=aid.by, response=term(_RESPONSES[aid.response]), rivals="; ".join(rivals))]
     if math.isinf(aid.constant_error):
-        told.append(term("aided.turned", change=size(aid.heading_error)))
+        sentences.append(term("aided.turned", change=size(aid.heading_error)))
     else:
-        told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
+        sentences.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
     if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
-        told.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
-    return told
+        sentences.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
+    return sentences
 
 
 def headline(calibration: Calibration) -> list[str]:
-    """The result in three sentences."""
+    """Return the result in three sentences."""
     c = calibration
     exponent = power(c.radius)
     unit = f"× {in_power(exponent, c.unit)}" if exponent else c.unit
@@ -258,7 +258,7 @@ def headline(calibration: Calibration) -> list[str]:
 
 
 def python_code(calibration: Calibration) -> str:
-    """Lines that correct measurements, for pasting into a program with numpy."""
+    """Return NumPy code that corrects measurements."""
     c = calibration
     rows = ",\n".join(f"    [{', '.join(f'{v:.8g}' for v in row)}]" for row in c.matrix)
     return (
@@ -269,7 +269,7 @@ def python_code(calibration: Calibration) -> str:
 
 
 def c_code(calibration: Calibration) -> str:
-    """The same for C."""
+    """Return C code that corrects measurements."""
     c = calibration
     rows = ",\n".join("    {" + ", ".join(_c_number(v) for v in row) + "}" for row in c.matrix)
     offset = ", ".join(_c_number(v) for v in c.center)

@@ -1,4 +1,4 @@
-"""Differential equations: how a user writes them, their trajectories, and the ports through which effects act."""
+"""Simulations by differential equations: their definition, their trajectories, and the ports where effects act."""
 
 from mkc_torch.simulation.dynamics.definition import Dynamics
 

@@ -1,4 +1,4 @@
-"""Inputs between the samples of a recording."""
+"""Interpolation of inputs between the samples of a recording."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ if TYPE_CHECKING:
 __all__ = ["inputs_between", "smooth_between"]
 
 _POINTS = 6
+"""Samples that the interpolating polynomial goes through."""
 
 
 def inputs_between(
     values: Float[Tensor, "N u"], how: str, time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: SignalTimes
 ) -> Float[Tensor, "S u"]:
-    """Values at the moments of a clock: "held" at the sample before, "linear", or "smooth".
+    """Interpolate inputs at the times of a clock.
 
     Args:
-        values: at the samples.
-        how: as above.
-        time, begins: of the samples in s, and where a run begins.
-        clock: the moments.
+        values: (N, u), the inputs at the samples.
+        how: "held" at the preceding sample, "linear", or "smooth"; see :func:`smooth_between`.
+        time: (N,), times of the samples in s.
+        begins: (N,), True where a run begins.
+        clock: the S times to interpolate at.
     """
     if how == "held":
         return values[clock.before]
@@ -36,15 +38,15 @@ def inputs_between(
 def smooth_between(
     values: Float[Tensor, "N u"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: SignalTimes
 ) -> Float[Tensor, "S u"]:
-    """Values at the moments of a clock, by the polynomial through the six nearest samples of the same run.
+    """Interpolate inputs by the polynomial of fifth degree through the six nearest samples of the same run.
 
-    A run of fewer samples is interpolated by straight lines.
+    Runs of fewer than six samples are interpolated linearly.
 
     Args:
-        values: at the samples.
-        time: of the samples in s.
-        begins: where a run begins.
-        clock: the moments.
+        values: (N, u), the inputs at the samples.
+        time: (N,), times of the samples in s.
+        begins: (N,), True where a run begins.
+        clock: the S times to interpolate at.
 
     Example:
         >>> time = torch.arange(0.0, 10.0, dtype=torch.float64)

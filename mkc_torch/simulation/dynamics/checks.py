@@ -1,4 +1,4 @@
-"""A user's functions tried once, at the first guess: shapes, names, and values that are finite."""
+"""Check a user's functions once, at the first guess: shapes, names, and finite values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["SampledStates", "check_functions"]
 
 
 class SampledStates(NamedTuple):
-    """Times in s with the states, the inputs and the runs then."""
+    """Times in s with the states, the inputs and the number of the run at each."""
 
     time: Float[Tensor, " S"]
     states: Float[Tensor, "S n"]
@@ -30,16 +30,17 @@ class SampledStates(NamedTuple):
 def check_functions(
     system: Equations, p: Names, stations: SampledStates, samples: SampledStates, channels: tuple[str, ...]
 ) -> None:
-    """Refuse functions that do not fit the names of the system.
+    """Raise where a function of the system returns wrong names, wrong shapes or values that are not finite.
 
     Args:
-        system: whose functions are tried.
+        system: the system to check.
         p: its parameters.
-        stations, samples: where rates, and where outputs are computed.
-        channels: the outputs that are compared.
+        stations: where rates are computed.
+        samples: where outputs are computed.
+        channels: the outputs that are compared with the recording.
 
     Raises:
-        SimulationError: a wrong shape, a name that is missing, or values that are not finite.
+        SimulationError: a wrong shape, a missing name, or values that are not finite.
     """
     x, u = namespace(system.states, stations.states), namespace(system.inputs, stations.inputs)
     found = system.derivative(stations.time, x, u, p)
@@ -61,16 +62,16 @@ def check_functions(
     for name in system.inputs:
         if name not in acting:
             raise SimulationError(
-                f"{system.name}.actuated does not return `{name}`, which is one of its inputs; it returns "
-                f"{', '.join(map(str, acting)) or 'nothing'}."
+                f"{system.name}.actuator does not return the input `{name}`; it returns "
+                f"{', '.join(map(str, acting)) or 'nothing'}. Return every input."
             )
-        check_value(f"{system.name}.actuated: `{name}`", acting[name], stations.time, x, p)
+        check_value(f"{system.name}.actuator: `{name}`", acting[name], stations.time, x, p)
     at, u = namespace(system.states, samples.states), namespace(system.inputs, samples.inputs)
     outputs = system.output(samples.time, at, u, p)
     for name in channels:
         if name not in outputs:
             raise SimulationError(
                 f"{system.name}.output does not return `{name}`, which is in its outputs; it returns "
-                f"{', '.join(map(str, outputs))}."
+                f"{', '.join(map(str, outputs))}. Return every output."
             )
         check_value(f"{system.name}.output: `{name}`", outputs[name], samples.time, at, p)

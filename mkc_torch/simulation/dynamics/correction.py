@@ -1,4 +1,4 @@
-"""Differential equations with their effects, on a new recording."""
+"""A fitted system of differential equations with its effects, simulated on a new recording."""
 
 from __future__ import annotations
 
@@ -18,17 +18,21 @@ if TYPE_CHECKING:
 
 __all__ = ["DynamicsCorrection"]
 
-_HORIZONS, _ENOUGH = (0.1, 0.3, 1.0), 5
-"""Shares of a recording from which first states are estimated one after the other, and samples for each of them."""
+_HORIZONS = (0.1, 0.3, 1.0)
+"""Shares of the longest run, from its start, to which the initial states are fitted in turn."""
+
+_SAMPLES_PER_STATE = 5
+"""Samples for each initial state; shorter horizons are skipped."""
 
 
 class DynamicsCorrection:
-    """A simulation with its parameters and effects on a new recording: only the first states are estimated anew.
+    """A simulation with known parameters and effects on a new recording; only its initial states are estimated.
 
     Args:
-        prepared: the differential equations with the new recording: its inputs, and outputs from which the first
-            states are estimated.
-        first: in s, how much of each run they are estimated from; None for what the system says.
+        prepared: the differential equations with the new recording, which provides the inputs and the outputs for
+            the estimate of the initial states.
+        first: s from the start of each run that the initial states are estimated from; None for the system's
+            ``initial_window``.
     """
 
     def __init__(self, prepared: PreparedDynamics, first: float | None = None) -> None:
@@ -38,37 +42,45 @@ class DynamicsCorrection:
         self.ports = self.prepared.ports
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        """The outputs as simulated, with the runs' numbers where there are several."""
+        """Simulate the outputs.
+
+        Returns:
+            Columns ``time``, ``experiment`` where the recording has it, and each output, (N,).
+
+        Raises:
+            SimulationError: no trajectory is found.
+        """
         prepared = self.prepared
         p = len(prepared.known)
 
         first = prepared.start()[p:]
-        # friction that sticks at once leaves Newton's method far behind; a fit then begins with what was found
+        # stiff friction can defeat Newton's method from the guess; the fit then starts from this trajectory
         found = prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
         if not found.converged:
             raise SimulationError(
-                f"{prepared.name}: with the parameters and effects of this model no trajectory was found that begins "
-                "as this recording does. Give a smaller `step`, or split the recording into shorter runs."
+                f"{prepared.name}: no trajectory was found for this model's parameters and effects, starting from the first "
+                "states of this recording. Give a smaller `step`, or split the recording into shorter runs."
             )
         begin = first
         near: Nearby | None = found
         for seen in self._horizons():
-            if int(seen.sum()) > _ENOUGH * len(begin) or bool(seen.all()) or self.first is not None:
+            if int(seen.sum()) > _SAMPLES_PER_STATE * len(begin) or bool(seen.all()) or self.first is not None:
                 weight = seen.to(theta.dtype)
-                way = Continuation(prepared, lambda begin: (torch.cat([theta[:p], begin]), changes), near)
-                begin = fit(way, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
-                near = way.near(begin)
+                continuation = Continuation(prepared, lambda begin: (torch.cat([theta[:p], begin]), changes), near)
+                begin = fit(continuation, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
+                near = continuation.near(begin)
         outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes, near)
         table = prepared.recording
         runs = {"experiment": table["experiment"]} if "experiment" in table else {}
         return {"time": self.time} | runs | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
 
     def _horizons(self) -> list[Bool[Tensor, " N"]]:
-        """The samples that the first states are estimated from, first those soon after a run's beginning.
+        """Masks of the samples that the initial states are fitted to, over growing horizons from each run's start.
 
-        A pendulum that is a little too fast goes over the top, and from there nothing leads back.
+        A fit to all samples at once can end in a local minimum: a pendulum simulated slightly too fast goes over
+        the top and never returns.
         """
-        since = self.prepared.since_begin()
+        since = self.prepared.time_since_start()
         if self.first is not None:
             return [since <= self.first]
         return [since <= share * since.max() for share in _HORIZONS]

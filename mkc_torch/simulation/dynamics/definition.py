@@ -1,4 +1,4 @@
-"""Simulations by differential equations: a user's states, inputs, outputs and ``derivative``."""
+"""The base class of a user's simulation by differential equations."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ __all__ = ["Dynamics"]
 
 
 class Dynamics:
-    """A system of ordinary differential equations: give it names, parameters and a ``derivative``.
+    """A system of ordinary differential equations; subclasses define names, parameters and ``derivative``.
 
-    The parameters and the first state of each experiment are fitted to the recording; the trajectory between is that
-    of the differential equation alone.
+    The parameters and the initial states of each run are fitted to the recording. Within a run the trajectory follows
+    the differential equations alone (open loop).
 
     Attributes:
-        states: names.
+        states: names of the states.
         inputs: names of the columns that drive the system.
-        outputs: names of the columns that it answers to; by default those states that are columns of the recording.
-        parameters: name to value to start from, or :class:`Parameter`.
-        initial: of states that are not measured, a guess of their first value; default 0.
-        units: of states and inputs.
-        input_hold: what an input does between two samples: "held" at the earlier one, "linear", or "smooth", a polynomial
-            of fifth degree through six neighbours, for signals that were sampled a few times a period.
-        restart_after: in s, after which a trajectory may begin anew, for systems so unstable or chaotic that their start does
-            not determine them; None for never.
-        step: greatest step of the computation in s; None for what the recording's samples ask for.
-        starts_from: in s, how much of each run of a new recording its first states are estimated from, so that what
-            follows is a prediction; None for all of it.
+        outputs: names of the columns that it predicts; default: the states that are columns of the recording.
+        parameters: start value, or :class:`Parameter`, by name.
+        initial: guess of the initial value by state, for states that are not measured; default 0.
+        units: unit by state or input.
+        input_hold: how inputs are interpolated between samples: "held" at the earlier sample, "linear", or "smooth",
+            the polynomial of fifth degree through six samples, for signals with a few samples a period.
+        restart_after: length in s of the segments that a run is split into, each with initial states of its own, for
+            unstable or chaotic systems; None for whole runs.
+        step: largest step of integration in s; None to choose it by the recording.
+        initial_window: s from the start of each run of a new recording that the initial states are estimated from;
+            later samples are predicted. None for the whole run.
+        joins_experiments: whether one fit uses all runs of a recording.
 
     Example:
         >>> import torch
@@ -68,42 +69,42 @@ class Dynamics:
     joins_experiments: bool = True
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:
-        """Rate of change of each state, by its name or in the order of ``states``.
+        """Return the rate of change of each state, by name or in the order of ``states``.
 
         Args:
-            time: (S,) in s.
+            time: (S,), in s.
             x: the states, each (S,), as attributes.
             u: the inputs, each (S,), as attributes.
             p: the parameters as attributes.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} has no `derivative(self, time, x, u, p)`; write one that returns the rate of "
+            f"{type(self).__name__} has no `derivative(self, time, x, u, p)`; define it to return the rate of "
             "change of each state."
         )
 
     def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """What is measured, by the columns' names; by default the states themselves."""
+        """Return the outputs by column name; default: the states."""
         return vars(x)
 
     def actuator(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """What becomes of the inputs before they act, by their names; by default nothing.
+        """Return the inputs as they act on the system, by name; default: unchanged.
 
         Args:
-            time: (S,) in s, all of the recording.
+            time: (S,), in s, of the whole recording.
             u: the inputs, each (S,), as attributes.
             p: the parameters as attributes.
-            run: (S,), number of the run that each moment is of; what an actuator remembers ends with it.
+            run: (S,), number of the run at each time; an actuator's memory ends with its run.
         """
         return vars(u)
 
     def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """What sensors make of the outputs, by the columns' names; by default nothing.
+        """Return the outputs as the sensors measure them, by column name; default: unchanged.
 
         Args:
-            time: (N,) in s, all of the recording.
+            time: (N,), in s, of the whole recording.
             y: the outputs, each (N,).
             p: the parameters as attributes.
-            run: (N,), number of the run that each sample is of.
+            run: (N,), number of the run of each sample.
         """
         return y
 
@@ -116,11 +117,11 @@ class Dynamics:
         return frozenset({"time", "experiment", *self.inputs, *self.outputs, *self.states})
 
     def prepare(self, recording: Recording) -> PreparedDynamics:
-        """The simulation of a recording; its column ``experiment`` separates runs.
+        """Prepare the simulation of a recording; the column ``experiment`` separates its runs.
 
         Raises:
             MissingColumnError: the recording lacks ``time``, an input or an output.
-            SimulationError: names that do not fit together, a ``derivative`` or ``output`` of a wrong shape or that is
+            SimulationError: inconsistent names, a ``derivative`` or ``output`` with a wrong shape or values that are
                 not finite, or too few samples.
         """
         check_names(self)
@@ -133,5 +134,5 @@ class Dynamics:
         return PreparedDynamics(self, recording.finite("time", *self.inputs, *outputs).sorted_by_time(), outputs)
 
     def correction(self, _state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
-        """The same with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        """Prepare the simulation for a new recording; see :class:`mkc_torch.simulation.Correction`."""
         return DynamicsCorrection(self.prepare(recording))

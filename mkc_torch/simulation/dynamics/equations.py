@@ -1,4 +1,4 @@
-"""What a system of differential equations is to the rest of this folder, whoever defines it."""
+"""The interface of a system of differential equations."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ __all__ = ["Equations"]
 
 
 class Equations(Protocol):
-    """Names, parameters and functions of a system; :class:`mkc_torch.simulation.Dynamics` explains each.
+    """Names, parameters and functions of a system; see :class:`mkc_torch.simulation.Dynamics`.
 
     Attributes:
-        name: as ``diagnosis.json`` gives it.
-        states, inputs, outputs, parameters, initial, units, between, segment, step, starts_from: of the system.
+        name: name of the simulation in ``diagnosis.json``.
+        states, inputs, outputs, parameters, initial, units, input_hold, restart_after, step, initial_window: see
+            :class:`mkc_torch.simulation.Dynamics`.
     """
 
     @property

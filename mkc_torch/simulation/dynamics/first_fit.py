@@ -1,8 +1,8 @@
-"""A first fit that can be trusted: over short horizons first, where no trajectory gets lost, then over longer ones.
+"""A first fit from a poor guess: over short prediction horizons first, then over longer horizons.
 
-An observer that corrects the states at each sample by much predicts over a few samples alone, so its residual is nearly
-linear in the parameters; with weaker corrections the horizon grows, up to a free run. Ribeiro et al., "On the
-smoothness of nonlinear system identification", Automatica 121 (2020), shows why long horizons have many minima.
+An observer with large gains predicts over a few samples only, so its residual is nearly linear in the parameters. With
+smaller gains the horizon grows, up to the open loop. Ribeiro et al., "On the smoothness of nonlinear system
+identification", Automatica 121 (2020), shows why long horizons have many local minima.
 """
 
 from __future__ import annotations
@@ -27,41 +27,45 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["floor_of", "multiple_shooting_start", "strong_observer", "strongly_observed", "without_noise"]
+__all__ = ["floor_of", "multiple_shooting_start", "strong_observer", "with_strong_observer", "without_noise"]
 
 _CORRECTIONS = (100.0, 10.0)
-"""Sizes of the pushes that the corrections are for, over that at which they move an output by its noise."""
+"""Process noise that the observers assume, in units of the size at which it moves an output by its noise floor."""
 
 _SHORTEST = 1000.0
-"""The same of the shortest horizon, for a guess that the first of them loses."""
+"""The same for a still shorter horizon, for a guess from which the first observer diverges."""
 
 _OVERGROWN = 1e-30
-"""Share of a push's size without growth below which its size with growth says nothing of a few samples."""
+"""Ratio of the size with growth to the size without, below which the size with growth is useless for few samples."""
 
 _LOST = 1e6
-"""Standard deviations of an output from which a prediction over few samples is lost."""
+"""Standard deviations of an output beyond which a prediction over few samples has diverged."""
 
 _STEPS = 60
+"""Iterations of each fit at most."""
 
 
 def multiple_shooting_start(
     prepared: Observable, theta: Float[Tensor, " p"], *, shortest: bool = False
 ) -> Float[Tensor, " p"] | None:
-    """Parameters that predict over short horizons, from a guess that may be ten times off; None where there are none.
+    """Fit the parameters over growing horizons, from a guess that may be off by a factor of ten.
 
     Args:
         prepared: the simulation.
-        theta: the guess.
-        shortest: begin with a horizon that is shorter still.
+        theta: (p,), the guess.
+        shortest: start with a still shorter horizon.
+
+    Returns:
+        (p,), the parameters; None where a fit fails or no observer exists.
     """
     low, high = prepared.bounds
     for size in (_SHORTEST, *_CORRECTIONS) if shortest else _CORRECTIONS:
         observer = strong_observer(prepared, theta, size, shortest=shortest)
         if observer is None:
             return None
-        way = Continuation(prepared.observed(observer), lambda one: (one, {}))
+        continuation = Continuation(prepared.observed(observer), lambda parameters: (parameters, {}))
         try:
-            theta = fit(way, theta, lower=low, upper=high, covariance=None, max_iter=_STEPS).theta
+            theta = fit(continuation, theta, lower=low, upper=high, covariance=None, max_iter=_STEPS).theta
         except NoFitError:
             return None
     return theta
@@ -70,17 +74,19 @@ def multiple_shooting_start(
 def strong_observer(
     prepared: Observable, theta: Float[Tensor, " p"], size: float, *, shortest: bool = False
 ) -> Observer | None:
-    """An observer for pushes of all rates, along the first guess of the states; None where none moves an output.
+    """An observer with large gains, for white process noise of all rates, along the first guess of the states.
 
     Args:
         prepared: the simulation.
-        theta: its parameters.
-        size: of the pushes, over that at which they move an output by its noise.
-        shortest: what a push does is followed as if nothing in the system grew; so it is where what grows nears the
-            largest numbers.
+        theta: (p,), its parameters.
+        size: of the process noise, in units of the size at which it moves an output by its noise floor.
+        shortest: compute that unit without growth of the states, also used where growth would overflow.
+
+    Returns:
+        The observer; None where process noise moves no output, or numbers overflow.
     """
     flow = flow_along(prepared, theta, prepared.guess)
-    if not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.pushed, flow.seen)):
+    if not all(bool(np.isfinite(matrices).all()) for matrices in (flow.transition, flow.noise_input, flow.seen)):
         return None
     floor = floor_of(prepared)
     if without_noise(floor):
@@ -91,36 +97,45 @@ def strong_observer(
         limit if not np.isfinite(usual) or usual < _OVERGROWN * limit else usual
         for usual, limit in zip(sizes, steady, strict=True)
     ]
-    pushes = tuple(
+    disturbances = tuple(
         Disturbance(name, True, 0.0, size * usual)
-        for name, usual in zip(prepared.pushable, sizes, strict=True)
+        for name, usual in zip(prepared.disturbable, sizes, strict=True)
         if np.isfinite(usual)
     )
     try:
         with np.errstate(over="raise", invalid="raise"):
-            return observer_of(flow, pushes, floor, prepared.pushable, prepared.channels) if pushes else None
-    except FloatingPointError:  # what grows is lost between two samples already
+            return (
+                observer_of(flow, disturbances, floor, prepared.disturbable, prepared.channels)
+                if disturbances
+                else None
+            )
+    except FloatingPointError:  # unstable states overflow between two samples
         return None
 
 
 def _usual_sizes(prepared: Observable, flow: Flow, floor: Float[Tensor, " m"]) -> list[float]:
     with np.errstate(over="ignore", invalid="ignore"):
-        return [usual_size(flow, number, 0.0, floor.numpy()) for number in range(len(prepared.pushable))]
+        return [usual_size(flow, number, 0.0, floor.numpy()) for number in range(len(prepared.disturbable))]
 
 
 def _without_growth(flow: Flow) -> Flow:
-    """The flow with what grows from sample to sample held at its size."""
-    radius = np.abs(np.linalg.eigvals(flow.carried)).max(-1)
-    return replace(flow, carried=flow.carried / np.maximum(radius, 1.0)[:, None, None])
+    """The flow with transitions scaled to a spectral radius of at most 1."""
+    radius = np.abs(np.linalg.eigvals(flow.transition)).max(-1)
+    return replace(flow, transition=flow.transition / np.maximum(radius, 1.0)[:, None, None])
 
 
-def strongly_observed(prepared: PreparedDynamics, theta: Float[Tensor, " p"], size: float) -> PreparedDynamics | None:
-    """The simulation under that observer; None where there is none, or where even so it is lost within a few samples.
+def with_strong_observer(
+    prepared: PreparedDynamics, theta: Float[Tensor, " p"], size: float
+) -> PreparedDynamics | None:
+    """The simulation with the observer of :func:`strong_observer`.
 
     Args:
         prepared: the simulation.
-        theta: its parameters.
-        size: of the pushes that the observer is for; see :func:`strong_observer`.
+        theta: (p,), its parameters.
+        size: of the process noise; see :func:`strong_observer`.
+
+    Returns:
+        The simulation; None where there is no observer, or where its prediction diverges within a few samples.
     """
     observer = strong_observer(prepared, theta, size)
     if observer is None:
@@ -132,14 +147,14 @@ def strongly_observed(prepared: PreparedDynamics, theta: Float[Tensor, " p"], si
 
 
 def without_noise(floor: Float[Tensor, " m"]) -> bool:
-    """Whether an output has no noise at all, so that nothing can be weighed against it."""
+    """Whether the noise floor of an output is 0, so that no residual can be scaled by it."""
     return bool((floor.square() <= torch.finfo(floor.dtype).tiny).any())
 
 
 def floor_of(prepared: Observable) -> Float[Tensor, " m"]:
-    """White noise of each output, by third differences: of what is smooth from sample to sample little is left.
+    """White noise of each output, (m,), estimated by third differences, which remove smooth variation.
 
-    Never below a millionth of the output's spread.
+    At least a millionth of the output's standard deviation.
     """
     y = prepared.measured
     third = y[3:] - 3.0 * y[2:-1] + 3.0 * y[1:-2] - y[:-3]

@@ -1,4 +1,4 @@
-"""A first guess of a system's states: what is measured, its rate of change, or a user's word."""
+"""A first guess of a system's states: measured, differentiated, or given by the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 __all__ = ["despiked", "first_guess"]
 
 _WIDTH = 5
+"""Samples of the window for local lines."""
+
 _FAR = 6.0
+"""Median absolute deviations from the local line beyond which a sample is an outlier."""
 
 
 def first_guess(
@@ -30,15 +33,20 @@ def first_guess(
     before: Int[Tensor, " G"],
     share: Float[Tensor, " G"],
 ) -> Float[Tensor, "G n"]:
-    """Of the states at moments between samples.
+    """Guess the states at G times between samples.
+
+    A state that is an output is taken from the recording, with outliers replaced. The rate of such a state is its
+    slope. Every other state has its value in ``initial``, or 0.
 
     Args:
-        system: a state of it that is an output is as it was measured, outliers smoothed away, and one that is the rate
-            of such a state is its slope.
-        recording, channels: what was measured, and which columns of it are outputs.
-        begins: where a trajectory begins.
-        kinematic: states whose rate is another state.
-        time, before, share: the moments, the sample before each, and how far it is from that one to the next.
+        system: the equations.
+        recording: the measured columns.
+        channels: the columns that are outputs.
+        begins: (N,), True where a trajectory begins.
+        kinematic: state whose rate is another state, to that state.
+        time: (G,), the times in s.
+        before: (G,), the sample before each time.
+        share: (G,), how far each time is from that sample to the next, from 0 to 1.
     """
     known, at = {}, recording["time"]
     for name in system.states:
@@ -57,7 +65,7 @@ def first_guess(
 
 
 def _windows(values: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, "N width"]:
-    """The samples nearest to each one in its own run; a run of fewer has its last one again."""
+    """The samples nearest to each sample in its run, (N, width); shorter runs repeat their last sample."""
     N = len(values)
     first = torch.where(begins, torch.arange(N), 0).cummax(0).values
     start = begins.nonzero().squeeze(-1)
@@ -68,9 +76,10 @@ def _windows(values: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[T
 
 
 def despiked(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """The values, and the line through their neighbours where they are far from it.
+    """The values with outliers replaced by the local line.
 
-    The line is that of repeated medians, which two of five samples cannot move: Siegel, Biometrika 69 (1982), 242.
+    The line is fitted by repeated medians, which two outliers among five samples cannot move: Siegel, Biometrika 69
+    (1982), 242.
     """
     t, y = _windows(time, begins), _windows(values, begins)
     run, rise = t.unsqueeze(-1) - t.unsqueeze(-2), y.unsqueeze(-1) - y.unsqueeze(-2)
@@ -79,13 +88,13 @@ def despiked(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Boo
     level = y - slope.unsqueeze(-1) * (t - time.unsqueeze(-1))
     line = level.median(-1).values
     away = (values - line).abs()
-    # where few samples make a bend, all of them are far from a line
+    # in strongly curved windows all samples are far from the line
     usual = torch.maximum((level - line.unsqueeze(-1)).abs().median(-1).values, away.median())
     return torch.where(away > _FAR * usual + 1e-9 * values.abs().amax(), line, values)
 
 
 def _slope(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """By a straight line through the neighbours."""
+    """Slope of the least-squares line through the window around each sample, per s."""
     t, y = _windows(time, begins), _windows(values, begins)
     t, y = t - t.mean(-1, keepdim=True), y - y.mean(-1, keepdim=True)
     return (t * y).sum(-1) / t.square().sum(-1).clamp(min=1e-300)

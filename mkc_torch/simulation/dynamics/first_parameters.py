@@ -1,4 +1,4 @@
-"""Parameters that a fit begins with: the user's, or those with which the measured states obey the equations."""
+"""Start values of a fit: the user's, or a collocation fit to the measured states."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["first_parameters"]
 
 _WINDOW = 4
-"""Intervals over which defects are summed: noise of the states mostly cancels."""
+"""Intervals over which defects are summed, so that noise of the states mostly cancels."""
 
 
 def first_parameters(
@@ -31,30 +31,30 @@ def first_parameters(
     step: Float[Tensor, "G-1 1"],
     residual: Callable[[Float[Tensor, " p"]], Float[Tensor, "N m"]],
 ) -> Float[Tensor, " p"]:
-    """The user's values, or those with which the measured states obey the equations, whichever simulates better.
+    """The user's values, or those that minimise the defects of the guessed states, whichever has the smaller residual.
 
     Args:
-        given: the user's values, and a first guess of the first states.
-        bounds: of all parameters.
-        own: number of parameters before the first states.
-        rate: of change of the states, by the parameters.
-        guess: of the states at all moments.
-        step: length of each interval in s.
-        residual: recording less simulation, by the parameters.
+        given: (p,), the user's values, then a guess of the initial states.
+        bounds: lower and upper bounds of all parameters.
+        own: number of parameters before the initial states.
+        rate: from the parameters to the function for the states' rates of change.
+        guess: (G, n), of the states at all grid times.
+        step: (G-1, 1), length of each interval in s.
+        residual: recording minus simulation, (N, m), by the parameters.
     """
     starts = [given]
     if own:
         values, begin = given[:own], given[own:]
         typical = guess.abs().median(0).values.clamp(min=1e-12)
 
-        def lacking(values: Tensor) -> Tensor:
+        def summed_defects(values: Tensor) -> Tensor:
             left = defect(rate(torch.cat([values, begin])), guess, step) / typical
             total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
             return total[_WINDOW:] - total[:-_WINDOW]
 
         low, high = (bound[:own] for bound in bounds)
-        with suppress(NoFitError):  # the equations cannot be looked at there
-            found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
+        with suppress(NoFitError):  # the equations are not finite there
+            found = fit(summed_defects, values, lower=low, upper=high, covariance=None, max_iter=60).theta
             starts.append(torch.cat([found, begin]))
-    spread = [robust_scale(residual(one).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
+    spread = [robust_scale(residual(start).nan_to_num(torch.inf, torch.inf, torch.inf)) for start in starts]
     return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]

@@ -1,8 +1,8 @@
-"""Kalman filters for many models of the noise at once, along one linearised trajectory.
+"""Kalman filters for many noise models at once, along one linearised trajectory.
 
-Each model pushes rates, white or for a while, and adds to the outputs' white noise an own slow part; states begin where
-the simulation says. Outputs are taken up one after the other, which needs no inverse (Anderson & Moore, "Optimal
-Filtering", 1979, 6.4), and an innovation far outside of its distribution moves the states as one at its edge does.
+A model has process noise of the rates, white or correlated in time, and white noise and drift of the outputs. States
+start on the trajectory. Outputs are processed sequentially, which needs no matrix inverse (Anderson & Moore,
+"Optimal Filtering", 1979, 6.4). Innovations beyond a limit are clipped to it before they correct the states.
 """
 
 from __future__ import annotations
@@ -22,33 +22,36 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FilterEnd",
+    "FilterModels",
     "FilterStart",
     "Filtered",
     "Flow",
-    "Models",
-    "Parts",
+    "FlowParts",
     "filtered",
     "robust_likelihood",
-    "run",
+    "run_filter",
     "smoothed",
     "start_of",
 ]
 
 _CLIP = 4.0
-"""Standard deviations beyond which an innovation moves the states no further; one within moves them as it is, so that
-of normal noise the likeliest size is the true one."""
+"""Standard deviations at which an innovation is clipped; smaller ones pass unchanged, so that the most likely size of
+normal noise is unbiased."""
+
 _OUTLIERS = 0.05
-"""Share of the innovations that may be anywhere."""
+"""Share of outliers among the innovations."""
 
 _SCALINGS = 100
+"""Iterations of the profiled scale at most."""
+
 _SETTLED = 1e-9
-"""Share of a scale by which its last step moved it, at most."""
+"""Relative change of the scale at which its iteration has converged."""
 
 _FAR = 700.0
-"""Nats beyond which an exponential is none."""
+"""Nats at which an exponent is clipped, so that its exponential does not overflow."""
 
 _REACH = 20.0
-"""Robust standard deviations within which an outlier may be at least."""
+"""Smallest range of the outliers' uniform density, in robust standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +59,20 @@ class Flow:
     """A trajectory, linearised from sample to sample.
 
     Attributes:
-        carried: (N-1, n, n), the states at the next sample by those just after this one; 0 where a run ends.
-        pushed: (N-1, n, p), the same by a constant push of each of p rates in between.
-        seen: (N, m, n), outputs by states.
-        new: (N, m), recording less what the trajectory's states give.
-        shift: (N-1, n), by how much more than its own states the trajectory had moved at the next sample.
-        step: (N-1,), in s.
-        counts: (N, m), 0 where a sample does not count.
-        spread: (n,), by how much each state may be off where one begins within the trajectory.
+        transition: (N-1, n, n), derivative of the states at the next sample by the states just after this sample; 0
+            where a run ends.
+        noise_input: (N-1, n, p), derivative of the states at the next sample by a constant disturbance of each of p
+            rates in between.
+        seen: (N, m, n), derivative of the outputs by the states.
+        new: (N, m), recording minus outputs of the trajectory.
+        shift: (N-1, n), change of the trajectory until the next sample beyond the transition of its states.
+        step: (N-1,), time to the next sample in s; 0 where a run ends.
+        counts: (N, m), the mask: 0 where a sample has no weight.
+        spread: (n,), standard deviation of each state where a filter starts within the trajectory.
     """
 
-    carried: Float[np.ndarray, "N-1 n n"]
-    pushed: Float[np.ndarray, "N-1 n p"]
+    transition: Float[np.ndarray, "N-1 n n"]
+    noise_input: Float[np.ndarray, "N-1 n p"]
     seen: Float[np.ndarray, "N m n"]
     new: Float[np.ndarray, "N m"]
     shift: Float[np.ndarray, "N-1 n"]
@@ -77,23 +82,23 @@ class Flow:
 
     @property
     def rates(self) -> int:
-        return self.pushed.shape[-1]
+        return self.noise_input.shape[-1]
 
     @cached_property
     def reach(self) -> Float[np.ndarray, " m"]:
-        """How far outliers of each output may be from the trajectory: as far as any of its samples."""
+        """Range of the outliers of each output, (m,): the largest distance of a sample from the trajectory."""
         away = np.where(self.counts > 0, np.abs(self.new), 0.0)
-        used = [one[on > 0] for one, on in zip(away.T, self.counts.T, strict=True)]
-        usual = [_REACH * float(np.median(one)) / 0.6745 if len(one) else 0.0 for one in used]
+        used = [distances[counted > 0] for distances, counted in zip(away.T, self.counts.T, strict=True)]
+        usual = [_REACH * float(np.median(distances)) / 0.6745 if len(distances) else 0.0 for distances in used]
         return np.maximum(np.maximum(away.max(0), usual), 1e-300)
 
-    def in_parts(self, length: int, before: int, most: int | None = None) -> Parts:
-        """Stretches of so many samples, each with some before it in which a filter finds its way.
+    def in_parts(self, length: int, before: int, most: int | None = None) -> FlowParts:
+        """Split into stretches, each preceded by samples in which a filter converges.
 
         Args:
             length: samples of a stretch.
-            before: samples before it.
-            most: stretches; where there are more, so many of them, spread over the whole.
+            before: samples before a stretch.
+            most: number of stretches at most; if there are more, an evenly spread subset of this size.
         """
         N = len(self.new)
         count = max(N // max(length, 1), 1)
@@ -108,9 +113,9 @@ class Flow:
         mine = (index >= first[None, :]) & reached
         step = np.maximum(index[1:] - 1, 0)
         gone = reached[:-1]
-        return Parts(
-            np.where(gone[..., None, None], self.carried[step], 0.0),
-            np.where(gone[..., None, None], self.pushed[step], 0.0),
+        return FlowParts(
+            np.where(gone[..., None, None], self.transition[step], 0.0),
+            np.where(gone[..., None, None], self.noise_input[step], 0.0),
             self.seen[index],
             self.new[index],
             np.where(gone[..., None], self.shift[step], 0.0),
@@ -122,24 +127,24 @@ class Flow:
         )
 
     @property
-    def whole(self) -> Parts:
-        """In one stretch."""
+    def whole(self) -> FlowParts:
+        """The flow as one stretch."""
         return self.in_parts(len(self.new), 0)
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Stretches of a flow side by side: its arrays with a second dimension, of the G stretches.
+class FlowParts:
+    """G stretches of a flow, filtered in parallel: its arrays with a second dimension for the stretches.
 
     Attributes:
-        carried, pushed, seen, new, shift, step, counts: as a flow has them.
-        mine: (L, G, m), what counts of a stretch's own samples.
-        inside: (G,), whether it begins within the flow, where its states are not known.
-        spread: (n,), by how much they are not.
+        transition, noise_input, seen, new, shift, step, counts: as in :class:`Flow`.
+        mine: (L, G, m), the mask of the stretch's own samples, without those before it.
+        inside: (G,), whether a stretch starts within the flow, where its states are uncertain.
+        spread: (n,), standard deviation of the states at such a start.
     """
 
-    carried: np.ndarray
-    pushed: np.ndarray
+    transition: np.ndarray
+    noise_input: np.ndarray
     seen: np.ndarray
     new: np.ndarray
     shift: np.ndarray
@@ -151,15 +156,17 @@ class Parts:
 
 
 @dataclass(frozen=True)
-class Models:
-    """B models of the noise with D lasting disturbances each.
+class FilterModels:
+    """B noise models with D lasting (time-correlated) disturbances each.
 
     Attributes:
-        white: (B, p), standard deviation of a push of each rate that is new at each sample.
-        place: (B, D), what a lasting disturbance acts on: a rate, or p and more for an output.
-        size: (B, D), its standard deviation.
+        white: (B, p), standard deviation of each rate's white process noise.
+        place: (B, D), where a lasting disturbance acts: the index of a rate, or p plus the index of an output.
+        size: (B, D), standard deviation of a lasting disturbance.
         lasting: (B, D), its time constant in s.
         sensor: (B, m), standard deviation of each output's white noise.
+        hard_clip: whether an innovation within the clip is left as it is; otherwise a hyperbolic tangent shrinks it, as
+            an observer does, and the most likely process noise is a few per cent too large.
     """
 
     white: Float[np.ndarray, "B p"]
@@ -167,18 +174,20 @@ class Models:
     size: Float[np.ndarray, "B D"]
     lasting: Float[np.ndarray, "B D"]
     sensor: Float[np.ndarray, "B m"]
+    hard_clip: bool = False
 
     def __len__(self) -> int:
         return len(self.white)
 
-    def part(self, rows: slice) -> Models:
-        """Some of them."""
-        return Models(self.white[rows], self.place[rows], self.size[rows], self.lasting[rows], self.sensor[rows])
+    def part(self, rows: slice) -> FilterModels:
+        """The models in these rows."""
+        arrays = (self.white, self.place, self.size, self.lasting, self.sensor)
+        return FilterModels(*(array[rows] for array in arrays), self.hard_clip)
 
 
 @dataclass(frozen=True)
 class FilterStart:
-    """What is known at one end of each stretch: states and lasting disturbances, and their covariance."""
+    """Mean and covariance of the states and lasting disturbances at the first sample of each stretch."""
 
     state: Float[np.ndarray, "G B k"]
     covariance: Float[np.ndarray, "G B k k"]
@@ -186,10 +195,10 @@ class FilterStart:
 
 @dataclass(frozen=True)
 class FilterEnd(FilterStart):
-    """What is known after the last sample of each stretch.
+    """Mean and covariance after the last sample of each stretch.
 
     Attributes:
-        kept: what is left there of an error of the state before the first sample.
+        kept: (G, B, k, k), derivative of the error there by an error of the state before the first sample.
     """
 
     kept: Float[np.ndarray, "G B k k"]
@@ -197,12 +206,14 @@ class FilterEnd(FilterStart):
 
 @dataclass(frozen=True)
 class Filtered:
-    """What a filter leaves: standardised innovations of each stretch, and covariances and states on its way if kept.
+    """Innovations of the filters, and their covariances and states at each sample if kept.
 
     Attributes:
-        standard, log_spread: (L, G, B, m), of the innovations; the logarithm of what they were divided by.
-        prior, state: before each sample is taken up, covariances (L, G, B, k, k) and means (L, G, B, k), if kept.
-        posterior, after: the same after it.
+        standard: (L, G, B, m), innovations divided by their standard deviations.
+        log_spread: (L, G, B, m), logarithms of these standard deviations.
+        prior, state: covariances (L, G, B, k, k) and means (L, G, B, k) before each sample is processed; empty if not
+            kept.
+        posterior, after: the same after each sample.
     """
 
     standard: Float[np.ndarray, "L G B m"]
@@ -213,8 +224,8 @@ class Filtered:
     posterior: Float[np.ndarray, "L G B k k"]
 
 
-def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> FilterStart:
-    """States about where the trajectory has them, and disturbances as they are without any sample."""
+def start_of(spread: Float[np.ndarray, "G B n"], models: FilterModels) -> FilterStart:
+    """Start of the filters: states on the trajectory with this spread, disturbances with their prior variance."""
     G, B, n = spread.shape
     D = models.place.shape[1]
     P = np.zeros((G, B, n + D, n + D))
@@ -224,22 +235,22 @@ def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> FilterStart:
     return FilterStart(np.zeros((G, B, n + D)), P)
 
 
-def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
-    """What the filters leave; ``keep`` for covariances and states too."""
-    return run(flow, models, keep=keep)[0]
+def filtered(flow: FlowParts, models: FilterModels, *, keep: bool = False) -> Filtered:
+    """Filter the stretches; ``keep`` returns covariances and states too."""
+    return run_filter(flow, models, keep=keep)[0]
 
 
-def run(
-    flow: Parts, models: Models, *, keep: bool = False, start: FilterStart | None = None
+def run_filter(
+    flow: FlowParts, models: FilterModels, *, keep: bool = False, start: FilterStart | None = None
 ) -> tuple[Filtered, FilterEnd]:
-    """What the filters leave, and what is known after the last sample of each stretch.
+    """Filter the stretches, and return the states after the last sample of each too.
 
     Args:
-        flow: stretches.
-        models: of the noise.
-        keep: whether covariances and states on the way are kept.
-        start: what each stretch begins with; None where one that begins inside knows nothing of the samples before,
-            and nobody asks what is left of it.
+        flow: the stretches.
+        models: the noise models.
+        keep: whether covariances and states at each sample are kept.
+        start: state at the start of each stretch. None starts on the trajectory, with ``flow.spread`` inside the flow,
+            and does not compute ``kept``.
     """
     if start is None:
         begins = np.where(flow.inside[:, None, None], flow.spread, np.zeros((len(models), 1)))
@@ -248,7 +259,9 @@ def run(
     return _run(flow, models, start, keep=keep, through=True)
 
 
-def _run(flow: Parts, models: Models, start: FilterStart, *, keep: bool, through: bool) -> tuple[Filtered, FilterEnd]:
+def _run(
+    flow: FlowParts, models: FilterModels, start: FilterStart, *, keep: bool, through: bool
+) -> tuple[Filtered, FilterEnd]:
     N, G, m = flow.new.shape
     B, k = len(models), start.state.shape[-1]
     step = flow.step[:, :, None, None]
@@ -265,11 +278,11 @@ def _run(flow: Parts, models: Models, start: FilterStart, *, keep: bool, through
     else:
         end = FilterEnd(start.state.copy(), start.covariance.copy(), np.tile(np.eye(k), (G if through else 0, B, 1, 1)))
         whole = [
-            flow.carried, flow.pushed, flow.shift, phi, renewed, flow.seen, flow.new, flow.counts, models.white,
+            flow.transition, flow.noise_input, flow.shift, phi, renewed, flow.seen, flow.new, flow.counts, models.white,
             models.place, models.sensor**2,
         ]  # fmt: skip
         compiled(
-            *[np.ascontiguousarray(one) for one in whole], _CLIP, end.state, end.covariance, end.kept,
+            *[np.ascontiguousarray(array) for array in whole], _CLIP, models.hard_clip, end.state, end.covariance, end.kept,
             found.standard, found.log_spread, found.prior, found.state, found.after, found.posterior,
         )  # fmt: skip
     np.log(found.log_spread, out=found.log_spread)
@@ -277,8 +290,8 @@ def _run(flow: Parts, models: Models, start: FilterStart, *, keep: bool, through
 
 
 def _sample_by_sample(
-    flow: Parts,
-    models: Models,
+    flow: FlowParts,
+    models: FilterModels,
     start: FilterStart,
     phi: Float[np.ndarray, "L-1 G B D"],
     renewed: Float[np.ndarray, "L-1 G B D"],
@@ -287,12 +300,12 @@ def _sample_by_sample(
     keep: bool,
     through: bool,
 ) -> FilterEnd:
-    """What :func:`filter_samples` does, all stretches and models at once in NumPy; writes into ``found``."""
+    """Do the same as :func:`filter_samples`, for all stretches and models at once in NumPy; writes into ``found``."""
     N, G, m = flow.new.shape
-    n, p, B = flow.carried.shape[2], flow.pushed.shape[-1], len(models)
+    n, p, B = flow.transition.shape[2], flow.noise_input.shape[-1], len(models)
     D = models.place.shape[1]
     k = n + D
-    # a disturbance pushes its rate alone
+    # a disturbance acts on its own rate only
     acts = np.where((models.place < p)[:, None], np.arange(p)[:, None] == models.place[:, None], 0.0)  # (B, p, D)
     C = np.zeros((G, B, m, k))
     for j in range(m):
@@ -305,10 +318,10 @@ def _sample_by_sample(
     left = np.broadcast_to(np.eye(k), P.shape)
     for row in range(N):
         if row:
-            A[..., :n, :n] = flow.carried[row - 1][:, None]
-            pushed = flow.pushed[row - 1][:, None]
+            A[..., :n, :n] = flow.transition[row - 1][:, None]
+            noise_input = flow.noise_input[row - 1][:, None]
             if D:
-                A[..., :n, n:] = pushed @ acts
+                A[..., :n, n:] = noise_input @ acts
                 A[..., index, index] = phi[row - 1]
             state = (A @ state[..., None])[..., 0]
             state[..., :n] -= flow.shift[row - 1][:, None]
@@ -318,7 +331,7 @@ def _sample_by_sample(
             if D:
                 P[..., index, index] += renewed[row - 1]
             if whitened:
-                white = pushed * models.white[:, None, :]
+                white = noise_input * models.white[:, None, :]
                 P[..., :n, :n] += white @ white.swapaxes(2, 3)
         C[..., :n] = flow.seen[row][:, None]
         if keep:
@@ -331,7 +344,7 @@ def _sample_by_sample(
             z = (flow.new[row, :, j, None] - (c * state).sum(-1)) / root
             found.standard[row, :, :, j], found.log_spread[row, :, :, j] = z, root
             used = flow.counts[row, :, j, None]
-            pulled = used * np.clip(z, -_CLIP, _CLIP) / root
+            pulled = used * (np.clip(z, -_CLIP, _CLIP) if models.hard_clip else _CLIP * np.tanh(z / _CLIP)) / root
             state = state + Pc * pulled[..., None]
             gain = (used / S)[..., None] * Pc
             P = P - gain[..., None] * Pc[..., None, :]
@@ -350,24 +363,24 @@ def robust_likelihood(
     free: bool = True,
     least: Float[np.ndarray, " B"] | float = 0.0,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    """Log-likelihood of each model with a few outliers among the innovations, and its scale: profiled out, or one.
+    """Log-likelihood of each model with outliers among the innovations, and its scale: profiled, or 1; (B,) each.
 
-    An innovation is normal, or anywhere within the reach of its output, whatever the model: so an outlier, or a burst
-    of them, speaks for no model. (A contaminated normal density: Tukey 1960; Huber, "Robust Statistics", 1981, 1.1.)
+    An innovation is normal, or uniform within the reach of its output under every model. So outliers, even a burst of
+    them, favour no model. (A contaminated normal density: Tukey 1960; Huber, "Robust Statistics", 1981, 1.1.)
 
     Args:
-        found: of the filters.
-        counts: which innovations count.
-        reach: how far from what is predicted an outlier may be.
-        free: whether the scale is profiled out.
-        lower: scale of each model at least, where it is.
+        found: the innovations.
+        counts: (L, G, m), mask of the innovations.
+        reach: (m,), range of the outliers' uniform density.
+        free: whether the scale is profiled.
+        least: smallest profiled scale of each model.
     """
     B = found.standard.shape[2]
     used = counts > 0
     square = np.square(found.standard.swapaxes(2, 3)[used].T)  # (B, samples that count)
     spread = found.log_spread.swapaxes(2, 3)[used].T
     tail = math.log(math.sqrt(0.5 * math.pi) * _OUTLIERS / (1.0 - _OUTLIERS)) - np.log(reach)
-    # of an outlier's density over the normal one's at its middle
+    # log ratio of the outliers' density to the normal density at its mode
     odds = np.broadcast_to(tail, counts.shape)[used] + spread
     scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, 1e-300) if free else np.ones(B)
     for _ in range(_SCALINGS if free else 0):
@@ -383,13 +396,13 @@ def robust_likelihood(
 
 
 def smoothed(
-    flow: Flow, models: Models, found: Filtered
+    flow: Flow, models: FilterModels, found: Filtered
 ) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "N k k"]]:
-    """States and lasting disturbances of the first model by all of the samples, and their covariance.
+    """Mean and covariance of the first model's states and lasting disturbances given all samples (RTS smoother).
 
     Rauch, Tung & Striebel, AIAA Journal 3 (1965), 1445.
     """
-    N, n, p = len(flow.new), flow.carried.shape[1], flow.rates
+    N, n, p = len(flow.new), flow.transition.shape[1], flow.rates
     D = models.place.shape[1]
     state, P = found.after[:, 0, 0].copy(), found.posterior[:, 0, 0].copy()
     for row in range(N - 2, -1, -1):
@@ -397,11 +410,11 @@ def smoothed(
         if step <= 0:
             continue
         A = np.zeros((n + D, n + D))
-        A[:n, :n] = flow.carried[row]
+        A[:n, :n] = flow.transition[row]
         for d in range(D):
             place = models.place[0, d]
             if place < p:
-                A[:n, n + d] = flow.pushed[row][:, place]
+                A[:n, n + d] = flow.noise_input[row][:, place]
             A[n + d, n + d] = np.exp(-step / models.lasting[0, d])
         prior, at = found.prior[row + 1, 0, 0], found.state[row + 1, 0, 0]
         scale = 1.0 / np.sqrt(np.maximum(prior.diagonal(), 1e-300))

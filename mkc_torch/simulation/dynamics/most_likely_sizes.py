@@ -1,4 +1,4 @@
-"""The likeliest sizes of disturbances near those that a grid has, and their standard errors."""
+"""Maximum-likelihood sizes of disturbances near a grid point, and their standard errors."""
 
 from __future__ import annotations
 
@@ -20,40 +20,44 @@ if TYPE_CHECKING:
 __all__ = ["most_likely_sizes"]
 
 _NEAR = math.log(30.0)
-"""Of the logarithm of a number, by which the likeliest is sought away from the grid's."""
+"""Largest distance of the maximum from the grid point, in the logarithm of each number."""
 
 
 def most_likely_sizes(
     flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | None
 ) -> tuple[NoiseModel, tuple[float, ...]]:
-    """The likeliest sizes and time constants near those of a grid, by all samples, and each size's standard error.
+    """Maximise the likelihood of all samples over sizes and time constants, from a grid point.
 
-    The errors are of logarithms, and count that the time constants and the sensors' noise are not known either. Where
-    the likeliest is not plausible, or farther than thirty times away, sizes are as they were.
+    Where the maximum is implausible, or farther than a factor of 30 away, the grid point is returned.
 
     Args:
-        flow: of the trajectory.
-        noise: with sizes of a grid.
-        largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
+        flow: the linearised trajectory.
+        noise: the model at the grid point.
+        largest: (p+m,), largest plausible disturbance of each rate and each output, in their units; None for no limit.
+
+    Returns:
+        The model, and the standard error of the logarithm of each size. The errors include that the time constants
+        and the sensors' noise are estimated too.
     """
-    if not noise.pushes:
+    if not noise.components:
         return noise, ()
 
     def values(by: Float[np.ndarray, "B k"]) -> Float[np.ndarray, " B"]:
         check_deadline()
-        found = filtered_whole(flow, filter_models(flow, [_times(noise, one) for one in by]))
+        models = replace(filter_models(flow, [_times(noise, logarithms) for logarithms in by]), hard_clip=True)
+        found = filtered_whole(flow, models)
         return robust_likelihood(found, flow.counts[:, None], flow.reach, free=False)[0]
 
-    start = np.zeros(len(noise.pushes) + len(_lasting(noise)) + len(_unknown(noise)))
+    start = np.zeros(len(noise.components) + len(_lasting(noise)) + len(_unknown(noise)))
     at, curvature = peak(values, start)
     if np.abs(at).max() > _NEAR or not _plausible(_times(noise, at), noise, largest):
         at, curvature = peak(values, start, rounds=0)
-    return _times(noise, at).no_lower(), _errors(curvature)[: len(noise.pushes)]
+    return _times(noise, at).raised_to_floor(), _errors(curvature)[: len(noise.components)]
 
 
 def _lasting(noise: NoiseModel) -> list[int]:
     """Numbers of the disturbances that have a time constant."""
-    return [d for d, (_, _, time) in enumerate(noise.pushes) if time > 0]
+    return [d for d, (_, _, time) in enumerate(noise.components) if time > 0]
 
 
 def _unknown(noise: NoiseModel) -> list[int]:
@@ -62,28 +66,28 @@ def _unknown(noise: NoiseModel) -> list[int]:
 
 
 def _times(noise: NoiseModel, logarithms: Float[np.ndarray, " k"]) -> NoiseModel:
-    """A noise with its sizes, its time constants and its sensors' noise times numbers that are given in this order."""
+    """Scale sizes, time constants and unknown sensor noise, in this order, by the exponentials of logarithms."""
     lasting, unknown = _lasting(noise), _unknown(noise)
-    of_size, of_time, of_sensor = np.split(np.exp(logarithms), np.cumsum([len(noise.pushes), len(lasting)]))
-    time, sensor = np.ones(len(noise.pushes)), np.ones(len(noise.sensor))
+    of_size, of_time, of_sensor = np.split(np.exp(logarithms), np.cumsum([len(noise.components), len(lasting)]))
+    time, sensor = np.ones(len(noise.components)), np.ones(len(noise.sensor))
     time[lasting], sensor[unknown] = of_time, of_sensor
-    pushes = zip(noise.pushes, of_size.tolist(), time.tolist(), strict=True)
+    components = zip(noise.components, of_size.tolist(), time.tolist(), strict=True)
     return replace(
         noise,
-        pushes=tuple((place, by * size, longer * lasts) for (place, size, lasts), by, longer in pushes),
+        components=tuple((place, by * size, longer * lasts) for (place, size, lasts), by, longer in components),
         sensor=tuple((sensor * noise.sensor).tolist()),
     )
 
 
 def _plausible(found: NoiseModel, before: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> bool:
-    """Whether no disturbance has become larger than is plausible."""
-    pairs = zip(found.pushes, before.pushes, strict=True)
-    return largest is None or all(one[1] <= max(float(largest[one[0]]), was[1]) for one, was in pairs)
+    """Whether no disturbance exceeds both its largest plausible size and its size before."""
+    pairs = zip(found.components, before.components, strict=True)
+    return largest is None or all(component[1] <= max(float(largest[component[0]]), old[1]) for component, old in pairs)
 
 
 def _errors(curvature: Float[np.ndarray, "k k"]) -> tuple[float, ...]:
-    """Standard errors by the curvature of a log-likelihood; infinite where it does not bend down."""
+    """Standard errors by the curvature of a log-likelihood; infinite where the curvature is not positive."""
     if not np.isfinite(curvature).all() or float(np.linalg.eigvalsh(curvature)[0]) <= 0.0:
-        bend = np.diagonal(curvature)
-        return tuple(1.0 / math.sqrt(one) if math.isfinite(one) and one > 0 else math.inf for one in bend)
+        diagonal = np.diagonal(curvature)
+        return tuple(1.0 / math.sqrt(value) if math.isfinite(value) and value > 0 else math.inf for value in diagonal)
     return tuple(np.sqrt(np.diagonal(np.linalg.inv(curvature))).tolist())

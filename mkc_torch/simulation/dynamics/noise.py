@@ -1,9 +1,9 @@
-"""The likeliest noise of the world around a simulation, and the same simulation predicted under it."""
+"""Select the most likely noise model of a simulation, and estimate its disturbances over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ from mkc_torch.simulation.dynamics.noise_selection import (
     observer_of,
     rescale_noise_model,
     select_noise_model,
+    with_most_likely_sizes,
 )
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
 from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
@@ -28,18 +29,18 @@ from mkc_torch.simulation.protocol import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["DisturbancePath", "StateSpaceNoise", "likeliest_noise", "noise_of", "pushes_over_time"]
+__all__ = ["DisturbancePath", "StateSpaceNoise", "disturbance_paths", "most_likely_noise", "noise_of", "sized_noise"]
 
 
 @dataclass(frozen=True)
 class StateSpaceNoise:
-    """What is known of it, and the observer for it; None where the sensors' white noise is enough."""
+    """The selected noise, and its observer; the observer is None where white sensor noise is enough."""
 
-    disturbed: SelectedNoise
+    selected: SelectedNoise
     observer: Observer | None
 
 
-def likeliest_noise(
+def most_likely_noise(
     prepared: Observable,
     theta: Float[Tensor, " p"],
     changes: Changes,
@@ -50,21 +51,24 @@ def likeliest_noise(
     most: int,
     known: SelectedNoise | None = None,
 ) -> StateSpaceNoise | None:
-    """The likeliest noise along a simulation's trajectory; None where there is no trajectory.
+    """Select the most likely noise along a simulation's trajectory; None where no trajectory is found.
 
-    White noise that is not declared is nowhere smaller than what the recording's steps add.
+    White noise that is not declared is at least the rounding noise of the recording.
 
     Args:
-        prepared: the simulation, free or observed.
-        theta, changes, near: of its trajectory.
-        declared: standard deviation of the white noise of outputs that it is known of.
-        least, most: nats that a disturbance has to gain, and how many there may be.
-        known: disturbances that are to be given their sizes; None to seek them.
+        prepared: the simulation, in open loop or with an observer.
+        theta, changes, near: of its trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`.
+        declared: standard deviation of the white noise by output, where it is known.
+        least: nats that a disturbance has to gain.
+        most: number of disturbances at most.
+        known: disturbances whose sizes are refitted; None to search for disturbances.
     """
     flow = flow_of(prepared, theta, changes, near)
-    if flow is None or not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.seen, flow.new, flow.shift)):
+    if flow is None or not all(
+        bool(np.isfinite(array).all()) for array in (flow.transition, flow.seen, flow.new, flow.shift)
+    ):
         return None
-    names, channels = prepared.pushable, prepared.channels
+    names, channels = prepared.disturbable, prepared.channels
     largest = plausible_sizes(prepared, theta, changes, near)
     rounding = rounding_of(prepared.measured).tolist()
     if known is not None and known.disturbances:
@@ -75,13 +79,29 @@ def likeliest_noise(
         return None
     given = [name in declared for name in prepared.channels]
     white = [max(size, step) for size, step in zip(floor.tolist(), rounding, strict=True)]
-    sensor = floor.new_tensor([declared.get(name, one) for name, one in zip(channels, white, strict=True)])
+    sensor = floor.new_tensor([declared.get(name, size) for name, size in zip(channels, white, strict=True)])
     found = select_noise_model(flow, names, channels, sensor, given, least, most, largest, rounding)
     return StateSpaceNoise(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
 
 
+def sized_noise(
+    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, noise: StateSpaceNoise
+) -> StateSpaceNoise:
+    """Return a noise with its disturbances at the maximum-likelihood sizes along a trajectory, for the report.
+
+    The noise is returned as it is where there is no disturbance, or no trajectory is found.
+    """
+    flow = flow_of(prepared, theta, changes, near)
+    if flow is None or not noise.selected.disturbances:
+        return noise
+    largest = plausible_sizes(prepared, theta, changes, near)
+    rounding = rounding_of(prepared.measured).tolist()
+    names, channels = prepared.disturbable, prepared.channels
+    return replace(noise, selected=with_most_likely_sizes(flow, names, channels, noise.selected, largest, rounding))
+
+
 def noise_of(prepared: Observable, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """The noise that an observed simulation is under; None of one that runs freely."""
+    """The noise of a simulation's observer; None for an open-loop simulation."""
     observer = prepared.observer
     if observer is None:
         return None
@@ -91,27 +111,27 @@ def noise_of(prepared: Observable, declared: Mapping[str, float]) -> StateSpaceN
 
 @dataclass(frozen=True)
 class DisturbancePath:
-    """The course of one disturbance by all samples, (N,), and its standard error."""
+    """A disturbance estimated from all samples, (N,), and its standard error, (N,)."""
 
     value: Float[Tensor, " N"]
     error: Float[Tensor, " N"]
 
 
-def pushes_over_time(
+def disturbance_paths(
     prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, found: SelectedNoise
 ) -> tuple[DisturbancePath, ...]:
-    """The courses of disturbances, in their order; none where there is no trajectory.
+    """Estimate the disturbances over time, in their order; empty where no trajectory is found.
 
-    What is new at each sample is given a short memory, of a sample's length, for its course to be seen.
+    White disturbances are given a short time constant, so that the smoother estimates them as states.
     """
     flow = flow_of(prepared, theta, changes, near)
     if flow is None or not found.disturbances:
         return ()
     usual = float(np.median(flow.step[flow.step > 0]))
-    lasting = tuple(one.lasting_at_least(0.1 * usual) for one in found.disturbances)
-    models = models_of(flow, lasting, found.sensor, prepared.pushable, prepared.channels)
+    lasting = tuple(disturbance.lasting_at_least(0.1 * usual) for disturbance in found.disturbances)
+    models = models_of(flow, lasting, found.sensor, prepared.disturbable, prepared.channels)
     state, covariance = smoothed(flow, models, filtered_whole(flow, models, keep=True))
-    n = flow.carried.shape[1]
+    n = flow.transition.shape[1]
     courses = []
     for number in range(len(lasting)):
         variance = np.maximum(covariance[:, n + number, n + number], 0.0)

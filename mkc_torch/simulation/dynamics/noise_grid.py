@@ -1,4 +1,4 @@
-"""Models of the noise that a recording is tried under: white, slow errors of sensors, process noise, pairs of these."""
+"""A grid of noise models: white sensor noise, sensor drift, process noise, and pairs of disturbances."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from mkc_torch.simulation.dynamics.noise_selection import usual_size
 __all__ = ["NoiseGrid", "key_of"]
 
 _SIZES = (0.1, 1.0, 10.0, 100.0)
-"""Sizes tried, over that at which a disturbance moves an output by as much as its white noise."""
+"""Sizes tried, in units of the size at which a disturbance moves an output by its white noise."""
 
-_LASTING = (0.004, 0.03, 0.25)
+_TIME_CONSTANTS = (0.004, 0.03, 0.25)
 """Time constants tried, as shares of the longest run."""
 
 _SHORTEST = 1.9
-"""Samples that a disturbance with a memory lasts at least; a shorter one is new at each sample."""
+"""Shortest time constant of a lasting disturbance, in samples; shorter disturbances are white."""
 
 _DIGITS = 3
-"""Decimals of a logarithm in which two sizes, or two times, are the same."""
+"""Decimals of the logarithm to which two sizes or two time constants are equal."""
 
 
 @dataclass(frozen=True)
 class NoiseGrid:
-    """Models of the noise along a flow.
+    """Noise models along a flow.
 
     Attributes:
-        flow: of the trajectory.
-        white: the sensors' white noise alone.
+        flow: the linearised trajectory.
+        white: the model with white sensor noise only.
     """
 
     flow: Flow
     white: NoiseModel
 
     def singles(self) -> list[NoiseModel]:
-        """White noise alone, and one disturbance of each place, size and time constant beside it."""
+        """White noise alone, and with one disturbance of each place, size and time constant."""
         p, m = self.flow.rates, self.flow.new.shape[1]
-        lasting = sorted({max(share * self._longest, 2.0 * self._step) for share in _LASTING})
+        lasting = sorted({max(share * self._longest, 2.0 * self._step) for share in _TIME_CONSTANTS})
         sensor = np.array(self.white.sensor)
         found = [self.white]
         for place in range(p + m):
             for time in [0.0, *lasting] if place < p else lasting:
                 unit = usual_size(self.flow, place, time, sensor) if place < p else float(sensor[place - p])
                 if math.isfinite(unit):
-                    found += [replace(self.white, pushes=((place, size * unit, time),)) for size in _SIZES]
-        return [one for one in found if self.plausible(one)]
+                    found += [replace(self.white, components=((place, size * unit, time),)) for size in _SIZES]
+        return [model for model in found if self.plausible(model)]
 
     def pairs(self, model: NoiseModel, singles: Sequence[NoiseModel]) -> list[NoiseModel]:
-        """A model with each of the single disturbances beside its own."""
-        own = {(place, lasting) for place, _, lasting in model.pushes}
+        """A model with each of the single disturbances added, unless its place and time constant are taken."""
+        own = {(place, lasting) for place, _, lasting in model.components}
         return [
-            replace(model, pushes=(*model.pushes, *one.pushes))
-            for one in singles
-            if one.pushes and (one.pushes[0][0], one.pushes[0][2]) not in own
+            replace(model, components=(*model.components, *single.components))
+            for single in singles
+            if single.components and (single.components[0][0], single.components[0][2]) not in own
         ]
 
     def neighbours(self, model: NoiseModel, decades: float) -> list[NoiseModel]:
@@ -66,11 +66,11 @@ class NoiseGrid:
 
         Args:
             model: the model.
-            decades: by how much.
+            decades: size of the change, in decades.
         """
         factor = 10.0**decades
         found = []
-        for d, (place, size, lasting) in enumerate(model.pushes):
+        for d, (place, size, lasting) in enumerate(model.components):
             sizes = [(place, size * f, lasting) for f in (factor, 1.0 / factor)]
             times = [
                 (place, size * by, lasting * f)
@@ -79,7 +79,8 @@ class NoiseGrid:
                 if lasting > 0 and by != f
             ]
             found += [
-                replace(model, pushes=(*model.pushes[:d], other, *model.pushes[d + 1 :])) for other in sizes + times
+                replace(model, components=(*model.components[:d], other, *model.components[d + 1 :]))
+                for other in sizes + times
             ]
         several = len(model.sensor) > 1
         for j, known in enumerate(model.known):
@@ -89,12 +90,12 @@ class NoiseGrid:
                     for f in (factor, 1.0 / factor)
                     if not model.floor or f * model.sensor[j] >= model.floor[j]
                 ]
-        return [one for one in found if self.plausible(one)]
+        return [model for model in found if self.plausible(model)]
 
     def plausible(self, model: NoiseModel) -> bool:
-        """Whether each disturbance is of a time constant that this recording can show."""
+        """Whether each time constant is white, or between the sampling interval and the longest run."""
         return all(
-            lasting == 0.0 or _SHORTEST * self._step <= lasting <= self._longest for _, _, lasting in model.pushes
+            lasting == 0.0 or _SHORTEST * self._step <= lasting <= self._longest for _, _, lasting in model.components
         )
 
     @property
@@ -107,10 +108,10 @@ class NoiseGrid:
 
 
 def key_of(model: NoiseModel) -> tuple[object, ...]:
-    """The same for models that differ by rounding."""
+    """A hashable key, equal for models that differ by rounding only."""
 
     def rounded(value: float) -> float:
         return round(math.log10(value), _DIGITS) if value > 0.0 else -math.inf
 
-    pushes = sorted((place, rounded(size), rounded(lasting)) for place, size, lasting in model.pushes)
-    return tuple(pushes), tuple(rounded(one) for one in model.sensor)
+    components = sorted((place, rounded(size), rounded(lasting)) for place, size, lasting in model.components)
+    return tuple(components), tuple(rounded(size) for size in model.sensor)

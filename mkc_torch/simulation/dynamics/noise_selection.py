@@ -1,4 +1,4 @@
-"""The noise of the world: what pushes each state's rate, and what is added to each output, by likelihood."""
+"""Select process noise of the rates and drift of the outputs by likelihood."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.kalman import FilterModels, Flow, FlowParts, filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.most_likely_sizes import most_likely_sizes
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models, longest_run, place_of
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
@@ -28,44 +28,51 @@ __all__ = [
     "rescale_noise_model",
     "select_noise_model",
     "usual_size",
+    "with_most_likely_sizes",
 ]
 
 _SIZES = (0.1, 1.0, 10.0, 100.0)
-"""Tried, over that at which a disturbance moves an output by as much as its white noise."""
+"""Sizes tried, in units of the size at which a disturbance moves an output by its white noise."""
 
-_LASTING = (0.004, 0.03, 0.25)
+_TIME_CONSTANTS = (0.004, 0.03, 0.25)
 """Time constants tried, as shares of the longest run."""
 
-_STRETCH, _BEFORE = 150, 50
-"""Samples of a stretch that is filtered beside others, and before it, for the filter to find its way."""
+_STRETCH_SAMPLES = 150
+"""Samples of a stretch; stretches are filtered in parallel."""
+
+_WARMUP_SAMPLES = 50
+"""Samples before a stretch in which its filter converges."""
 
 _MOST_STRETCHES = 24
-"""Stretches that noises are tried on, spread over a recording; what is found is weighed on all samples.
+"""Stretches, spread over the recording, that candidates are compared on; the selection is confirmed on all samples.
 
-They are 3,600 samples, which tell the size of an oscillator's white push to some 4 %.
+Their 3,600 samples determine the size of an oscillator's white process noise to about 4 %.
 """
 
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)
-"""Of known sizes, tried where an effect may have made some of a push needless."""
+"""Shares of known sizes that are tried, since an effect may explain part of a disturbance."""
 
 _IMPLAUSIBLE = 1e12
-"""Nats that a disturbance of an implausible size is behind: it is taken where there is no other."""
+"""Nats subtracted for an implausible size, so that it is selected only where no plausible size is left."""
 
 _FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
+"""Factors of the refinement's grid around a number."""
+
 _ROUNDS = 3
+"""Rounds of the refinement."""
 
 
 @dataclass(frozen=True)
 class SelectedNoise:
-    """The likeliest noise.
+    """The most likely noise.
 
     Attributes:
-        disturbances: strongest first; none where white noise of the sensors is enough.
-        errors: standard error of the logarithm of each one's size.
-        gains: nats by which each is needed beside those before it.
+        disturbances: strongest first; empty where white sensor noise is enough.
+        errors: standard error of the logarithm of each disturbance's size; infinite where it is not estimated.
+        gains: log-likelihood gain of each disturbance given those before it, in nats.
         sensor: (m,), standard deviation of each output's white noise.
-        log_likelihood: in nats, robust, up to a constant.
-        declared: of which outputs the white noise is.
+        log_likelihood: robust, in nats, up to a constant.
+        declared: whether each output's white noise is declared.
     """
 
     disturbances: tuple[Disturbance, ...]
@@ -87,43 +94,45 @@ def select_noise_model(
     largest: Float[np.ndarray, " p+m"] | None = None,
     rounding: Sequence[float] = (),
 ) -> SelectedNoise:
-    """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
+    """Select the most likely noise along a flow by forward selection of disturbances.
 
     Args:
-        flow: of the trajectory.
-        names: of the states whose rates can be pushed, in the order of the flow.
-        channels: of the outputs.
-        floor: the outputs' white noise where it is known, else a first guess.
-        known: whether it is known.
-        lower: nats that a disturbance has to gain.
-        upper: disturbances at most.
-        largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
-        rounding: least size of each output's white noise, unless it is known; none for any.
+        flow: the linearised trajectory.
+        names: names of the states whose rates can be disturbed, in the order of the flow.
+        channels: names of the outputs.
+        floor: (m,), the outputs' white noise where it is known, else a first guess.
+        known: whether each output's white noise is known.
+        least: nats that a disturbance has to gain.
+        most: number of disturbances at most.
+        largest: (p+m,), largest plausible disturbance of each rate and each output, in their units; None for no limit.
+        rounding: smallest white noise of each output that is not known; empty for no limit.
     """
     p, m = flow.rates, len(channels)
     best = NoiseModel(tuple(floor.tolist()), (), tuple(known), tuple(rounding))
-    best, value = _white(flow, best)
+    best, value = _with_white_noise(flow, best)
     gains: list[float] = []
     for _ in range(most):
-        tried = [replace(best, pushes=(*best.pushes, one)) for one in _candidates(flow, best, p + m)]
+        tried = [
+            replace(best, components=(*best.components, component)) for component in _candidates(flow, best, p + m)
+        ]
         if not tried:
             break
-        number, scale = _likeliest(flow, tried, largest)
-        other = _finer(flow, _scaled(tried[number], scale), largest)
-        more, scale = _exactly(flow, other)
-        # the others may have come nearer to their best as well
-        nearer = replace(other, pushes=other.pushes[:-1])
-        again, its_scale = _exactly(flow, nearer)
+        number, scale = _most_likely(flow, tried, largest)
+        other = _refined(flow, _scaled(tried[number], scale), largest)
+        more, scale = _likelihood(flow, other)
+        # refining may have improved the disturbances before it as well
+        nearer = replace(other, components=other.components[:-1])
+        again, its_scale = _likelihood(flow, nearer)
         if again > value:
             best, value = _scaled(nearer, its_scale), again
         if not more > value + least:
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    found = _told(best, gains, flow, names, channels, floor, value, largest)
+    found = _as_selected_noise(best, gains, flow, names, channels, floor, value)
     if len(gains) < 2:
         return found
-    # one may have stood for another that was found later
+    # a disturbance may have become superfluous by another selected later
     fewer = rescale_noise_model(flow, names, channels, found, least, largest, rounding)
     return fewer if len(fewer.disturbances) < len(gains) else found
 
@@ -137,38 +146,47 @@ def rescale_noise_model(
     largest: Float[np.ndarray, " p+m"] | None = None,
     rounding: Sequence[float] = (),
 ) -> SelectedNoise:
-    """The same disturbances at the sizes that they have along another flow, without those that are needless there.
+    """Refit the sizes of known disturbances along another flow, and remove those that it does not need.
 
     Args:
-        flow: of the trajectory.
-        names, channels: as of :func:`select_noise_model`.
+        flow: the linearised trajectory.
+        names, channels: as in :func:`select_noise_model`.
         known: the disturbances.
-        lower: nats that each has to gain.
-        largest, rounding: as of :func:`select_noise_model`.
+        least: nats that each disturbance has to gain.
+        largest, rounding: as in :func:`select_noise_model`.
     """
     places = [*names, *channels]
-    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
-    noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared, tuple(rounding))
-    noise = noise.no_lower()
-    tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
-    number, scale = _likeliest(flow, tried, largest)
-    best = _finer(flow, _scaled(tried[number], scale), largest)
-    value, scale = _exactly(flow, best)
+    components = tuple(
+        (place_of(places, disturbance, len(names)), disturbance.size, disturbance.lasting)
+        for disturbance in known.disturbances
+    )
+    noise = NoiseModel(tuple(known.sensor.tolist()), components, known.declared, tuple(rounding))
+    noise = noise.raised_to_floor()
+    tried = [replace(noise, components=tuple((a, share * s, t) for a, s, t in components)) for share in _SHARES]
+    number, scale = _most_likely(flow, tried, largest)
+    best = _refined(flow, _scaled(tried[number], scale), largest)
+    value, scale = _likelihood(flow, best)
     best = _scaled(best, scale)
     gains: list[float] = []
-    while best.pushes:
-        without = [replace(best, pushes=(*best.pushes[:d], *best.pushes[d + 1 :])) for d in range(len(best.pushes))]
-        less = [_white(flow, one) if not one.pushes else (one, _exactly(flow, one)[0]) for one in without]
+    while best.components:
+        without = [
+            replace(best, components=(*best.components[:d], *best.components[d + 1 :]))
+            for d in range(len(best.components))
+        ]
+        less = [
+            _with_white_noise(flow, model) if not model.components else (model, _likelihood(flow, model)[0])
+            for model in without
+        ]
         gains = [value - other for _, other in less]
         weakest = min(range(len(gains)), key=gains.__getitem__)
         if gains[weakest] > least:
             break
         best, value = less[weakest][0], less[weakest][1]
         gains = []
-    return _told(best, gains, flow, names, channels, known.sensor, value, largest)
+    return _as_selected_noise(best, gains, flow, names, channels, known.sensor, value)
 
 
-def _told(
+def _as_selected_noise(
     noise: NoiseModel,
     gains: Sequence[float],
     flow: Flow,
@@ -176,23 +194,39 @@ def _told(
     channels: Sequence[str],
     like: Float[Tensor, " m"],
     value: float,
-    largest: Float[np.ndarray, " p+m"] | None,
 ) -> SelectedNoise:
-    """What was found, at the likeliest sizes."""
     places, p = (*names, *channels), flow.rates
-    noise, errors = most_likely_sizes(flow, noise, largest)
-    value = _exactly(flow, noise)[0] if errors else value
-    found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.pushes)
-    sensor = like.new_tensor(noise.sensor)
-    return SelectedNoise(found, errors, tuple(gains), sensor, value, noise.known)
+    found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.components)
+    return SelectedNoise(found, (math.inf,) * len(found), tuple(gains), like.new_tensor(noise.sensor), value, noise.known)
+
+
+def with_most_likely_sizes(
+    flow: Flow,
+    names: Sequence[str],
+    channels: Sequence[str],
+    found: SelectedNoise,
+    largest: Float[np.ndarray, " p+m"] | None = None,
+    rounding: Sequence[float] = (),
+) -> SelectedNoise:
+    """Return a selected noise at its maximum-likelihood sizes, with their standard errors.
+
+    Args:
+        flow: the linearised trajectory.
+        names, channels, largest, rounding: as of :func:`select_noise_model`.
+        found: the noise at a grid's sizes, whose gains are kept.
+    """
+    known = NoiseModel.of(found.disturbances, found.sensor.tolist(), names, channels, found.declared, rounding)
+    noise, errors = most_likely_sizes(flow, known, largest)
+    at_maximum = _as_selected_noise(noise, found.gains, flow, names, channels, found.sensor, found.log_likelihood)
+    return replace(at_maximum, errors=errors)
 
 
 def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, float, float]]:
-    """Disturbances of any place, time constant and size that is not there yet."""
+    """Components of any place, time constant and size, unless their place and time constant are taken."""
     p = flow.rates
     longest = longest_run(flow)
     usual = float(np.median(flow.step[flow.step > 0]))
-    lasting = sorted({max(share * longest, 2.0 * usual) for share in _LASTING})
+    lasting = sorted({max(share * longest, 2.0 * usual) for share in _TIME_CONSTANTS})
     sensor = np.array(known.sensor)
     found = []
     for place in range(places):
@@ -202,19 +236,26 @@ def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, f
         else:
             times, units = list(lasting), [float(sensor[place - p])] * len(lasting)
         for time, unit in zip(times, units, strict=True):
-            if not any(one[0] == place and one[2] == time for one in known.pushes):
+            if not any(component[0] == place and component[2] == time for component in known.components):
                 found += [(place, size * unit, time) for size in _SIZES if math.isfinite(size * unit)]
     return found
 
 
 _REACH = 400
-"""Samples over which the effect of a push is followed to find its usual size."""
+"""Samples over which the response to a disturbance is followed."""
 
 
 def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
-    """The size of a push at which it moves an output by the sensor's noise, somewhere along a run."""
+    """Size at which a rate's disturbance moves an output by its sensor noise; infinite if it moves none.
+
+    Args:
+        flow: the linearised trajectory.
+        place: index of the rate.
+        lasting: time in s that the disturbance lasts; 0 for white noise.
+        sensor: (m,), standard deviation of each output's white noise.
+    """
     N = len(flow.new)
-    state = np.zeros(flow.carried.shape[1])
+    state = np.zeros(flow.transition.shape[1])
     power = np.zeros(len(sensor))
     start = N // 3
     most = 0.0
@@ -223,20 +264,20 @@ def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray,
     for row in range(start, min(start + _REACH, N - 1)):
         if flow.step[row] <= 0:
             break
-        state = flow.carried[row] @ state
+        state = flow.transition[row] @ state
         if age <= hold:
-            state = state + flow.pushed[row][:, place]
+            state = state + flow.noise_input[row][:, place]
         age += flow.step[row]
         seen = flow.seen[row + 1] @ state
         power = power + seen**2 if lasting == 0.0 else np.maximum(power, seen**2)
-        # of an output without noise, and of a state that runs away, it is beyond all numbers
+        # infinite for an output without noise or an unstable state
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             most = max(most, float((np.sqrt(power) / sensor).max()))
     return 1.0 / most if 0.0 < most < math.inf else math.inf
 
 
 def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
-    """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
+    """Log-likelihood and profiled scale of each model, on the stretches; scale 1 where a sensor's noise is declared."""
     check_deadline()
     parts = _parts(flow)
     found = filtered(parts, filter_models(flow, noises))
@@ -244,15 +285,15 @@ def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, 
     return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known), least=least)
 
 
-def _likeliest(
+def _most_likely(
     flow: Flow, noises: Sequence[NoiseModel], largest: Float[np.ndarray, " p+m"] | None
 ) -> tuple[int, float]:
-    """The number of the likeliest model whose disturbances are of a plausible size at its scale, and that scale."""
+    """Index and scale of the most likely model, plausible sizes preferred."""
     values, scales = _likelihoods(flow, noises)
     values = np.nan_to_num(values, nan=-np.inf)
     if largest is not None:
         allowed = [
-            all(scale * size <= largest[place] for place, size, _ in noise.pushes)
+            all(scale * size <= largest[place] for place, size, _ in noise.components)
             for noise, scale in zip(noises, scales, strict=True)
         ]
         values = np.where(allowed, values, values - _IMPLAUSIBLE)
@@ -260,8 +301,11 @@ def _likeliest(
     return number, float(scales[number])
 
 
-def _exactly(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
-    """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
+def _likelihood(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
+    """Log-likelihood and profiled scale of a model on all samples in one stretch.
+
+    Stretches would not do: without process noise, a filter that starts within the flow never converges.
+    """
     found = filtered_whole(flow, filter_models(flow, [noise]))
     free, least = not any(noise.known), noise.least_scale
     values, scales = robust_likelihood(found, flow.counts[:, None], flow.reach, free=free, least=least)
@@ -269,49 +313,53 @@ def _exactly(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=2)
-def _parts(flow: Flow) -> Parts:
-    return flow.in_parts(_STRETCH, _BEFORE, _MOST_STRETCHES)
+def _parts(flow: Flow) -> FlowParts:
+    return flow.in_parts(_STRETCH_SAMPLES, _WARMUP_SAMPLES, _MOST_STRETCHES)
 
 
 def _scaled(noise: NoiseModel, scale: float) -> NoiseModel:
-    pushes = tuple((place, scale * size, lasting) for place, size, lasting in noise.pushes)
-    return replace(noise, sensor=tuple(scale * one for one in noise.sensor), pushes=pushes)
+    components = tuple((place, scale * size, lasting) for place, size, lasting in noise.components)
+    return replace(noise, sensor=tuple(scale * size for size in noise.sensor), components=components)
 
 
-def _white(flow: Flow, noise: NoiseModel) -> tuple[NoiseModel, float]:
-    """The sensors' white noise alone, each output by itself where there are several."""
+def _with_white_noise(flow: Flow, noise: NoiseModel) -> tuple[NoiseModel, float]:
+    """The model at its most likely white noise, each output scaled by itself, and its log-likelihood."""
     if not any(noise.known):
         new = flow.new
         sizes = [
-            float(np.median(np.abs(one[used > 0])) / 0.6745) for one, used in zip(new.T, flow.counts.T, strict=True)
+            float(np.median(np.abs(values[used > 0])) / 0.6745)
+            for values, used in zip(new.T, flow.counts.T, strict=True)
         ]
         typical = [max(size, 1e-300) for size in sizes]
-        other = replace(noise, sensor=tuple(typical)).no_lower()
-        noise = min((noise, other), key=lambda one: -_exactly(flow, one)[0])
-    value, scale = _exactly(flow, noise)
+        other = replace(noise, sensor=tuple(typical)).raised_to_floor()
+        noise = min((noise, other), key=lambda model: -_likelihood(flow, model)[0])
+    value, scale = _likelihood(flow, noise)
     return _scaled(noise, scale), value
 
 
-def _finer(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> NoiseModel:
-    """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
+def _refined(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> NoiseModel:
+    """Refine sizes, time constants and sensor noise by coordinate search on a shrinking grid; the scale is profiled."""
     power = 1.0
     for _ in range(_ROUNDS):
         tried = [noise]
-        alone = len(noise.sensor) == 1 and not noise.pushes  # its size is the scale
+        alone = len(noise.sensor) == 1 and not noise.components  # its size is the scale
         for j in [j for j, known in enumerate(noise.known) if not known and not alone]:
             tried += [
                 replace(noise, sensor=(*noise.sensor[:j], f**power * noise.sensor[j], *noise.sensor[j + 1 :]))
                 for f in _FINER
                 if f != 1.0
             ]
-        for d, (place, size, lasting) in enumerate(noise.pushes):
+        for d, (place, size, lasting) in enumerate(noise.components):
             others = [(place, f**power * size, lasting) for f in _FINER if f != 1.0]
             if lasting > 0:
                 others += [(place, size, f**power * lasting) for f in _FINER if f != 1.0]
                 others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
-            tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
-        tried = [one.no_lower() for one in tried]
-        number, scale = _likeliest(flow, tried, largest)
+            tried += [
+                replace(noise, components=(*noise.components[:d], component, *noise.components[d + 1 :]))
+                for component in others
+            ]
+        tried = [model.raised_to_floor() for model in tried]
+        number, scale = _most_likely(flow, tried, largest)
         noise = _scaled(tried[number], scale)
         if number == 0:
             power *= 0.4
@@ -325,7 +373,7 @@ def observer_of(
     names: Sequence[str],
     channels: Sequence[str],
 ) -> Observer | None:
-    """The gains of a noise along a flow; None where there is nothing but the sensors' white noise."""
+    """The observer of a noise along a flow; None without disturbances."""
     if not disturbances:
         return None
     models = models_of(flow, disturbances, sensor, names, channels)
@@ -343,7 +391,7 @@ def observer_of(
     gain = np.linalg.solve(S, cross.swapaxes(1, 2)).swapaxes(1, 2) * counts[:, None, :]
     L = np.linalg.cholesky(S)
     white = np.linalg.inv(L)
-    # of mean logarithm 0, so that likelihoods compare
+    # determinants of mean logarithm 0, so that likelihoods compare across observers
     level = np.exp(-np.log(np.diagonal(white, axis1=1, axis2=2)).mean(0))
     white = white * level[:, None]
     as_tensor = sensor.new_tensor
@@ -363,7 +411,10 @@ def models_of(
     sensor: Float[Tensor, " m"],
     names: Sequence[str],
     channels: Sequence[str],
-) -> Models:
+) -> FilterModels:
     places = [*names, *channels]
-    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in disturbances)
-    return filter_models(flow, [NoiseModel(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
+    components = tuple(
+        (place_of(places, disturbance, len(names)), disturbance.size, disturbance.lasting)
+        for disturbance in disturbances
+    )
+    return filter_models(flow, [NoiseModel(tuple(sensor.tolist()), components, (False,) * len(channels))])

@@ -1,4 +1,4 @@
-"""The side of a prepared system that an observer corrects: what is predicted, what is seen, and what jumps."""
+"""The part of a prepared system that an observer uses: predicted outputs, measured outputs, and corrections."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ __all__ = ["ObservedDynamics"]
 
 
 class ObservedDynamics:
-    """What a prepared system has for an observer; its attributes are those of :class:`Observable`.
+    """Base class of a prepared system for use with an observer; further attributes as in :class:`Observable`.
 
     Attributes:
-        kinematic: states whose rate is another state.
-        clean: (N, m), the outputs with outliers smoothed away.
+        kinematic: state whose rate is another state, to that state.
+        clean: (N, m), the measured outputs with outliers replaced.
         inputs_at_rows: (N, u), the inputs at the samples.
         run: (N,), number of each sample's run.
     """
@@ -43,45 +43,45 @@ class ObservedDynamics:
     kinematic: Mapping[str, str]
 
     def parameters_of(self, theta: Tensor) -> Names:
-        """The parameters of the equations by their names."""
+        """The parameters of the equations by name."""
         raise NotImplementedError
 
     def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
-        """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
+        """Ports whose effect has internal states, and these states."""
         raise NotImplementedError
 
     @property
     def own_offsets(self) -> tuple[OwnOffset, ...]:
-        """Offsets of outputs that each recording has of its own; the last ones of the equations' parameters."""
+        """Offsets of outputs in single recordings; they are the last of the equations' parameters."""
         found: tuple[OwnOffset, ...] = getattr(self.system, "own_offsets", ())
         return found
 
     @property
-    def pushable(self) -> tuple[str, ...]:
-        """States whose rate something unrecorded can push; that of a position is its speed."""
+    def disturbable(self) -> tuple[str, ...]:
+        """States whose rate process noise can act on; the rate of a position is its speed and has none."""
         return tuple(name for name in self.system.states if name not in self.kinematic)
 
     @property
     def lasting(self) -> tuple[Disturbance, ...]:
-        """What the observer follows beside the states."""
+        """Lasting disturbances that the observer estimates in addition to the states."""
         return () if self.observer is None else self.observer.lasting
 
     def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None:
-        """How the observer corrects the states at the samples."""
+        """Correction of the states by the observer at the samples; None in open loop."""
         if self.observer is None:
             return None
-        n, pushes = len(self.system.states), len(self.lasting)
+        n, extra = len(self.system.states), len(self.lasting)
         memories = sum(len(memory) for memory in self.remembering(changes).values())
-        places = (*range(n), *range(n + memories, n + memories + pushes))
+        places = (*range(n), *range(n + memories, n + memories + extra))
         by_states = self.predicted(theta)
 
         def predict(states: Tensor) -> Tensor:
-            return by_states(states) + self.pushed_outputs(states)
+            return by_states(states) + self.output_disturbance(states)
 
         return ObserverJump(self.observer, self.rows, places, self.seen(theta, changes), predict)
 
     def seen(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N m"]:
-        """The recording less what sensors and effects make of outputs: of these they may remember the earlier ones."""
+        """The recording minus the contributions of sensors and output effects, which may depend on earlier outputs."""
         clean = dict(zip(self.channels, self.clean.unbind(-1), strict=True))
         sensor = self.system.sensor(self.time, clean, self.parameters_of(theta), self.run)
         made = torch.stack([sensor[name] - clean[name] for name in self.channels], -1)
@@ -90,7 +90,7 @@ class ObservedDynamics:
         return self.measured - made
 
     def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]:
-        """Outputs at the samples by the states there, before a sensor makes something of them."""
+        """The function from the states at the samples to the outputs there, before the sensors."""
         n, p, u = len(self.system.states), self.parameters_of(theta), namespace(self.system.inputs, self.inputs_at_rows)
 
         def outputs(states: Tensor) -> Tensor:
@@ -99,10 +99,12 @@ class ObservedDynamics:
 
         return outputs
 
-    def pushed_outputs(self, states: Float[Tensor, "N n"]) -> Tensor:
-        """What lasting disturbances add to the outputs."""
+    def output_disturbance(self, states: Float[Tensor, "N n"]) -> Tensor:
+        """Contribution of the lasting disturbances to the outputs, (N, m)."""
         added = [torch.zeros_like(states[:, 0]) for _ in self.channels]
-        for one, push in zip(self.lasting, states[:, states.shape[1] - len(self.lasting) :].unbind(-1), strict=True):
-            if not one.at_rate:
-                added[self.channels.index(one.place)] = added[self.channels.index(one.place)] + push
+        for disturbance, value in zip(
+            self.lasting, states[:, states.shape[1] - len(self.lasting) :].unbind(-1), strict=True
+        ):
+            if not disturbance.at_rate:
+                added[self.channels.index(disturbance.place)] = added[self.channels.index(disturbance.place)] + value
         return torch.stack(added, -1)

@@ -1,9 +1,9 @@
-"""A trajectory that is corrected by what was measured: prediction from sample to sample, where states are pushed.
+"""Observers: trajectories that are corrected by the measured outputs at each sample.
 
-Where what is left of a simulation is not the sensors' noise alone, a free run drifts from the recording, and its
-residual says little about the next sample. With the gains of a Kalman filter, fixed beforehand, states and pushes are
-moved at each sample towards what was measured, and what is new in each sample is the residual: an innovations model
-(Ljung, "System Identification", 1999, 4.3; Kristensen, Madsen & Jørgensen, Automatica 40 (2004), 225).
+Under process noise, an open-loop simulation drifts from the recording, and its residuals are strongly correlated. An
+observer with fixed Kalman gains corrects states and disturbances at each sample, and the innovations are the residual:
+an innovations model (Ljung, "System Identification", 1999, 4.3; Kristensen, Madsen & Jørgensen, Automatica 40 (2004),
+225).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 __all__ = ["CLIP", "Disturbance", "Observable", "Observer", "ObserverJump", "clipped", "clipped_slope"]
 
 CLIP = 4.0
-"""Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
+"""Standard deviations that the correction by an innovation saturates at, since it may be an outlier."""
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Something random that acts on the rate of a state, or is added to an output.
+    """Process noise of a state's rate, or drift of an output.
 
     Attributes:
-        place: the state or the output.
+        place: name of the state or the output.
         at_rate: whether it acts on a rate.
-        lasting: time constant in s in which it forgets its value; 0 for one that is new at each sample.
+        lasting: time constant in s of its autocorrelation; 0 for white noise.
         size: standard deviation, in the unit of the rate or of the output.
     """
 
@@ -45,21 +45,21 @@ class Disturbance:
     size: float
 
     def lasting_at_least(self, time: float) -> Disturbance:
-        """The same with a memory of its own."""
+        """The disturbance with a time constant of at least this many seconds."""
         return replace(self, lasting=max(self.lasting, time))
 
 
 @dataclass(frozen=True)
 class Observer:
-    """Gains by which states and lasting disturbances are corrected at the samples, and the scale of what is new.
+    """Kalman gains at the samples, and the scale of the innovations.
 
     Attributes:
-        outputs: names.
-        disturbances: all of them.
+        outputs: names of the outputs.
+        disturbances: all disturbances.
         sensor: (m,), standard deviation of each output's white noise.
-        gain: (N, n + D, m), of n states and the D lasting disturbances, 0 where a sample does not count.
-        white: (N, m, m), what makes the innovations of a sample independent and of one size; its determinants have
-            a mean logarithm of 0 for each output, so that likelihoods compare across observers.
+        gain: (N, n + D, m), of n states and the D lasting disturbances; 0 where a sample is masked.
+        white: (N, m, m), whitens the innovations of a sample. The logarithms of its diagonal have mean 0 for each
+            output, so that likelihoods compare across observers.
         spread: (N, m), standard deviation of each innovation.
     """
 
@@ -72,16 +72,16 @@ class Observer:
 
     @property
     def lasting(self) -> tuple[Disturbance, ...]:
-        """Those that have a memory, in the order of their states."""
-        return tuple(one for one in self.disturbances if one.lasting > 0.0)
+        """The disturbances with a time constant, in the order of their states."""
+        return tuple(disturbance for disturbance in self.disturbances if disturbance.lasting > 0.0)
 
     def whitened(self, new: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-        """Innovations as independent residuals of one size, in the outputs' units."""
+        """Whiten innovations to independent residuals of equal size, in the outputs' units."""
         return torch.einsum("nij,nj->ni", self.white, new)
 
 
 def clipped(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-    """What an observer takes of innovations of these standard deviations: a few of them at most."""
+    """Clip innovations smoothly to ``CLIP`` standard deviations."""
     limit = CLIP * spread
     return limit * torch.tanh(new / limit)
 
@@ -93,14 +93,14 @@ def clipped_slope(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Fl
 
 @dataclass(frozen=True)
 class ObserverJump:
-    """The jump of a trajectory's states at the samples.
+    """The correction of a trajectory's states at the samples; a :class:`..trajectory.Jump`.
 
     Attributes:
         observer: the gains.
-        rows: (N,), the moment of each sample.
-        places: where the states that the gains are of stand among those of the trajectory.
-        measured: (N, m), with what effects and sensors make of the outputs taken off.
-        predict: outputs at the samples by the states there, (N, n) to (N, m).
+        rows: (N,), grid index of each sample.
+        places: indices of the corrected states among the trajectory's states.
+        measured: (N, m), the recording minus the contributions of effects and sensors.
+        predict: from the states at the samples, (N, n), to the outputs, (N, m).
     """
 
     observer: Observer
@@ -128,24 +128,28 @@ class ObserverJump:
         return self.observer.gain
 
     def _spread_out(self, values: Float[Tensor, "N *rest k"], at: Float[Tensor, "N n"]) -> Float[Tensor, "N *rest n"]:
-        """Values for the states with gains, as values for all states."""
+        """Scatter values of the corrected states to all states; 0 elsewhere."""
         all_ = values.new_zeros(*values.shape[:-1], at.shape[1])
         return all_.index_copy(-1, torch.tensor(self.places, device=at.device), values)
 
 
 class Observable(Protocol):
-    """What the noise of the world asks of a prepared system of differential equations.
+    """The interface of a prepared system that noise estimation uses.
 
     Attributes:
-        system: names and functions.
-        channels: the outputs.
-        pushable: states whose rate something unrecorded can push.
-        measured, counts: (N, m), the outputs as they were recorded, and which samples are no outliers by themselves.
-        time, begins: (N,), of the samples, and where a run begins.
-        grid, rows, guess: the moments, those of the samples, and a first guess of the states then.
-        bounds: of the parameters.
-        observer: that corrects it; None where it runs freely.
-        lasting: what an observer follows beside the states.
+        system: the equations.
+        channels: names of the outputs.
+        disturbable: states whose rate process noise can act on.
+        measured: (N, m), the recorded outputs.
+        counts: (N, m), False where a sample is an outlier among its neighbours.
+        time: (N,), times of the samples in s.
+        begins: (N,), True where a run starts.
+        grid: the grid times.
+        rows: (N,), grid index of each sample.
+        guess: (G, n), a first guess of the states at the grid times.
+        bounds: lower and upper bounds of the parameters.
+        observer: the observer that corrects the states; None in open loop.
+        lasting: lasting disturbances that the observer estimates.
     """
 
     system: Equations
@@ -161,7 +165,7 @@ class Observable(Protocol):
     observer: Observer | None
 
     @property
-    def pushable(self) -> tuple[str, ...]: ...
+    def disturbable(self) -> tuple[str, ...]: ...
     @property
     def lasting(self) -> tuple[Disturbance, ...]: ...
     def observed(self, observer: Observer | None) -> Any: ...

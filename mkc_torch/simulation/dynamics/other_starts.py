@@ -1,4 +1,4 @@
-"""Further starts for a first fit that failed: the user's values, values between and around them."""
+"""Further starts after a failed first fit: the user's values, and values between and around them."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ if TYPE_CHECKING:
 __all__ = ["OtherStarts", "other_starts"]
 
 _BETWEEN = (0.25, 0.5, 0.75)
-"""Shares of the way from the user's values to the start that failed."""
+"""Points between the user's values (0) and the failed start (1)."""
 
 _FACTORS = (-1.0, 0.1, 10.0, 0.03, 30.0, 0.3, 3.0, 0.0)
-"""Factors by which one parameter, or all of them, may be off."""
+"""Factors that a single parameter, or all of them, are multiplied by."""
 
 _MOST_TRIED = 60
-"""Starts that are simulated at most."""
+"""Number of starts that are simulated at most."""
 
 
 @dataclass(frozen=True)
 class OtherStarts:
-    """Starts whose free run stays finite, and how the others are lost.
+    """Starts whose open-loop simulation stays finite, and how the others diverge.
 
     Attributes:
-        starts: (p,) each, those with the smallest residual first.
+        starts: (p,) each, smallest residual first.
         tried: number of starts that were simulated.
-        output: the output that is lost first with the user's values; empty where none is.
-        until: time in s of that, since the recording's first sample; 0 where the equations have no trajectory at all.
-        parameter, value, lasts: the parameter whose change alone keeps the run finite for longest, its value then, and
-            until when in s; an empty name where no change of a single parameter helps.
+        output: first output that diverges with the user's values; empty where none diverges.
+        until: time of the divergence, in s since the recording's first sample; 0 where no trajectory is found.
+        parameter: the parameter whose change alone keeps the simulation finite longest; empty where no such change
+            helps.
+        value: that parameter's changed value.
+        lasts: time until which the simulation is finite then, in s.
     """
 
     starts: tuple[Float[Tensor, " p"], ...]
@@ -51,14 +53,14 @@ class OtherStarts:
 
 
 def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: int) -> OtherStarts:
-    """Starts for a fit that failed, by free runs: the user's values, and others between and around them.
+    """Search starts whose open-loop simulation is finite: the user's values, and values between and around them.
 
-    The states at the start of a run are those of the first guess.
+    The initial states of a run are those of the first guess.
 
     Args:
         prepared: the simulation.
-        start: where a fit failed.
-        count: starts to return at most.
+        start: (p,), the start of the failed fit.
+        count: number of starts to return at most.
     """
     free, given = prepared.observed(None), prepared.given
     variation = robust_scale(free.measured - free.measured.median(0).values).clamp(min=1e-300)
@@ -76,7 +78,7 @@ def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: 
             best = number, float(theta[number]), lasts
         if not len(rows):
             usable.append((float((robust_scale(residual) / variation).clamp(min=1e-300).log().sum()), theta))
-    usable.sort(key=lambda one: one[0])
+    usable.sort(key=lambda pair: pair[0])
     starts = tuple(theta for _, theta in usable[:count])
     if not output or best[2] <= until:
         return OtherStarts(starts, tried, output, until)
@@ -84,12 +86,12 @@ def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: 
 
 
 def _distinct(prepared: PreparedDynamics, start: Tensor) -> Iterator[tuple[int, Tensor]]:
-    """The candidates within the bounds, each once; a candidate's parameter is -1 where several are changed."""
+    """Distinct candidates within the bounds, with the index of the changed parameter; -1 where several are changed."""
     low, high = prepared.bounds
     known: list[Tensor] = []
     for number, theta in _candidates(prepared.given, start, len(start) - prepared.beginnings):
         inside = torch.minimum(torch.maximum(theta, low), high)
-        if bool(inside.isfinite().all()) and not any(torch.equal(inside, one) for one in known):
+        if bool(inside.isfinite().all()) and not any(torch.equal(inside, other) for other in known):
             known.append(inside)
             yield number, inside
 

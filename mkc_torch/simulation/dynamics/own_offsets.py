@@ -1,4 +1,4 @@
-"""Differential equations whose sensors have an offset of their own in each recording."""
+"""Differential equations with a sensor offset for each recording."""
 
 from __future__ import annotations
 
@@ -21,45 +21,45 @@ __all__ = ["with_own_offsets"]
 
 
 class _Offset:
-    """A system with offsets of outputs among its parameters, behind its own; all else is the system's.
+    """A system with output offsets as further parameters after its own; everything else is delegated to the system.
 
     Args:
-        system: whose sensors have the offsets.
-        own_offsets: which.
-        of_run: number of the recording that each run is of.
+        system: the equations.
+        own_offsets: the offsets.
+        of_run: (K,), index of the recording of each run.
     """
 
     def __init__(self, system: Equations, own_offsets: tuple[OwnOffset, ...], of_run: Int[Tensor, " K"]) -> None:
         self.system, self.own_offsets, self.of_run = system, own_offsets, of_run
         self.parameters: Mapping[str, float | Parameter] = {
             **system.parameters,
-            **{one.name: Parameter(0.0, unit=system.units.get(one.output, "")) for one in own_offsets},
+            **{offset.name: Parameter(0.0, unit=system.units.get(offset.output, "")) for offset in own_offsets},
         }
 
     def __getattr__(self, name: str) -> Any:
-        if name == "system" or name.startswith("__"):  # a copy has nothing yet
+        if name == "system" or name.startswith("__"):  # copies are looked up before `system` is set
             raise AttributeError(name)
         return getattr(self.system, name)
 
     def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:
-        """What the system's sensors make of the outputs, and the offset of each recording."""
+        """Return the outputs of the system's sensors plus the offset of each recording."""
         shown = dict(self.system.sensor(time, y, p, run))
         recording = self.of_run[run]
-        for one in self.own_offsets:
-            there = (recording == one.recording).to(time.dtype)
-            shown[one.output] = shown[one.output] + getattr(p, one.name) * there
+        for offset in self.own_offsets:
+            there = (recording == offset.recording).to(time.dtype)
+            shown[offset.output] = shown[offset.output] + getattr(p, offset.name) * there
         return shown
 
 
 def with_own_offsets(
     prepared: PreparedDynamics, recording: Int[Tensor, " N"], names: Sequence[str]
 ) -> PreparedDynamics:
-    """The same with an offset of each output in each recording, as far as they are determined.
+    """Add an offset of each output in each recording, as far as the recordings determine it.
 
     Args:
         prepared: the simulation of several recordings.
-        recording: number of the recording that each sample is of.
-        names: of the recordings.
+        recording: (N,), index of the recording of each sample.
+        names: names of the recordings.
     """
     load_forward_mode()
     theta = prepared.start()

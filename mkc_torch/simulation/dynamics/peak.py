@@ -1,4 +1,4 @@
-"""The peak of a smooth function of a few numbers near a point, by Newton's method on differences."""
+"""Maximise a smooth function of a few numbers by Newton's method with finite differences."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ if TYPE_CHECKING:
 __all__ = ["peak"]
 
 _FIRST = 0.05
-"""By which each number is moved for the first differences."""
+"""Width of the first differences, in each number."""
 
 _LOSS = 0.5
-"""Of the value, by which later differences look away from a point; a standard error, of a log-likelihood."""
+"""Loss of the function over the width of later differences; for a log-likelihood, a standard error."""
 
-_WIDEST, _FARTHEST = 0.2, 0.6
-"""A difference, and a step, in any of the numbers at most: a parabola is not trusted any farther."""
+_WIDEST = 0.2
+"""Width of a difference at most, in any number."""
+
+_FARTHEST = 0.6
+"""Length of a Newton step at most, in any number."""
 
 _SHARES = np.array([1.0, 0.5, 0.2, 0.05])
-"""Of a Newton step, tried together."""
+"""Shares of a Newton step that are tried together."""
 
 _SETTLED = 1e-3
-"""Gain below which the peak is reached."""
+"""Gain of a step below which the iteration has converged."""
 
 
 def peak(
@@ -33,25 +36,25 @@ def peak(
     start: Float[np.ndarray, " k"],
     rounds: int = 8,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """The point of the largest value near a start, and the negative of the function's second derivatives there.
+    """Find the local maximum near a start, and the negative Hessian there.
 
-    The numbers are of a scale of one, such as logarithms. Differences are along the axes of the function's own
-    curvature, so that a narrow ridge is followed.
+    The numbers have a scale of 1, such as logarithms. Differences are taken along the axes of the function's
+    curvature, so that the iteration follows a narrow ridge.
 
     Args:
-        values: of B points; -inf where there is none.
-        start: near the peak.
-        rounds: steps at most; none for the second derivatives at the start.
+        values: function values at B points; -inf where the function is not defined.
+        start: (k,), near the maximum.
+        rounds: Newton steps at most; 0 for the Hessian at the start only.
 
     Example:
         >>> at, curvature = peak(lambda x: -2.0 * (x[:, 0] - 0.3) ** 2 - (x[:, 1] - x[:, 0]) ** 2, np.zeros(2))
         >>> at.round(3).tolist(), curvature.round(3).tolist()
         ([0.3, 0.3], [[6.0, -2.0], [-2.0, 2.0]])
     """
-    at, ways, gained = start, _FIRST * np.eye(len(start)), np.inf
-    slope, bend, here = _parabola(values, at, ways)
+    at, directions, gained = start, _FIRST * np.eye(len(start)), np.inf
+    slope, curvature, here = _parabola(values, at, directions)
     for _ in range(rounds):
-        step = ways @ _newton(slope, bend)
+        step = directions @ _newton(slope, curvature)
         step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-300))
         steps = at + _SHARES[:, None] * step
         found = np.nan_to_num(values(steps), nan=-np.inf)
@@ -59,47 +62,49 @@ def peak(
         settled, gained = gained < _SETTLED, found[best] - here
         if gained > 0.0:
             at = steps[best]
-        ways = _own_ways(ways, bend)
-        slope, bend, here = _parabola(values, at, ways)
+        directions = _curvature_axes(directions, curvature)
+        slope, curvature, here = _parabola(values, at, directions)
         if settled and gained < _SETTLED:
             break
-    inverse = np.linalg.inv(ways)
-    return at, inverse.T @ bend @ inverse
+    inverse = np.linalg.inv(directions)
+    return at, inverse.T @ curvature @ inverse
 
 
 def _parabola(
     values: Callable[[Float[np.ndarray, "B k"]], Float[np.ndarray, " B"]],
     at: Float[np.ndarray, " k"],
-    ways: Float[np.ndarray, "k k"],
+    directions: Float[np.ndarray, "k k"],
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], float]:
-    """Slope, negative second derivatives and value at a point, along some ways, the columns."""
-    k, one = len(at), ways.T
+    """Gradient, negative Hessian and value at a point, in the basis of the columns of ``directions``."""
+    k, steps = len(at), directions.T
     pairs = [(a, b) for a in range(k) for b in range(a)]
-    mixed = [one[a] + one[b] for a, b in pairs]
-    found = values(np.stack([at, *(at + one), *(at - one), *(at + both for both in mixed)]))
+    mixed = [steps[a] + steps[b] for a, b in pairs]
+    found = values(np.stack([at, *(at + steps), *(at - steps), *(at + both for both in mixed)]))
     here, more, less, both = found[0], found[1 : k + 1], found[k + 1 : 2 * k + 1], found[2 * k + 1 :]
-    with np.errstate(invalid="ignore"):  # where there is no value
-        bend, slope = np.diag(2.0 * here - more - less), 0.5 * (more - less)
+    with np.errstate(invalid="ignore"):  # values may be infinite
+        curvature, slope = np.diag(2.0 * here - more - less), 0.5 * (more - less)
         for (a, b), value in zip(pairs, both, strict=True):
             rise = value - here - slope[a] - slope[b]
-            bend[a, b] = bend[b, a] = -rise - 0.5 * (bend[a, a] + bend[b, b])
-    return slope, bend, float(here)
+            curvature[a, b] = curvature[b, a] = -rise - 0.5 * (curvature[a, a] + curvature[b, b])
+    return slope, curvature, float(here)
 
 
-def _newton(slope: Float[np.ndarray, " k"], bend: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
-    """The way to the peak of a parabola; where the function does not bend down, upwards."""
-    if not (np.isfinite(slope).all() and np.isfinite(bend).all()):
+def _newton(slope: Float[np.ndarray, " k"], curvature: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
+    """Newton step to a parabola's maximum; uphill where the curvature is not positive."""
+    if not (np.isfinite(slope).all() and np.isfinite(curvature).all()):
         return np.zeros_like(slope)
-    size, axes = np.linalg.eigh(bend)
-    way: np.ndarray = axes @ (axes.T @ slope / np.maximum(np.abs(size), 1e-9))
-    return way
+    size, axes = np.linalg.eigh(curvature)
+    newton_step: np.ndarray = axes @ (axes.T @ slope / np.maximum(np.abs(size), 1e-9))
+    return newton_step
 
 
-def _own_ways(ways: Float[np.ndarray, "k k"], bend: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    """The axes of a curvature that was found along some ways, as long as the function loses half a unit along each."""
-    if not np.isfinite(bend).all():
-        return 0.5 * ways
-    size, axes = np.linalg.eigh(bend)
-    own = ways @ axes * np.sqrt(2.0 * _LOSS / np.maximum(np.abs(size), 1e-12))
+def _curvature_axes(
+    directions: Float[np.ndarray, "k k"], curvature: Float[np.ndarray, "k k"]
+) -> Float[np.ndarray, "k k"]:
+    """Eigenvectors of a curvature given in the basis ``directions``, scaled for a loss of ``_LOSS`` along each."""
+    if not np.isfinite(curvature).all():
+        return 0.5 * directions
+    size, axes = np.linalg.eigh(curvature)
+    own = directions @ axes * np.sqrt(2.0 * _LOSS / np.maximum(np.abs(size), 1e-12))
     shortened: np.ndarray = own * np.minimum(1.0, _WIDEST / np.abs(own).max(0))
     return shortened

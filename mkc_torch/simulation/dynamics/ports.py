@@ -1,4 +1,4 @@
-"""Where effects can act on a system of differential equations: rates, exchanges, inputs and outputs."""
+"""Ports of a system of differential equations, where effects act: rates, exchanges, inputs and outputs."""
 
 from __future__ import annotations
 
@@ -26,26 +26,29 @@ _MEMORIES: Mapping[str, Mapping[str, bool]] = {
     "lagged rate": {"lagged": True},
     "resonant rate": {"deflection_of": False, "hidden": True},
 }
-"""Kinds of ports with internal states: what they are called, and whether they begin like the state or at 0."""
+"""Internal states by kind of port: name prefix, and whether they start at the state's value or at 0."""
 
 RATES = ("rate", "loaded rate", *_MEMORIES, "exchange")
 """Kinds of ports at which an effect adds to rates of change."""
 
 _REVERSED = 0.05
-"""Share of a recording that a state has to be of either sign to be one that reverses."""
+"""Share of the recording for which a state must be positive, and negative, to count as reversing."""
 
 _HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
+"""Names of positions that are heights."""
 
 
 @dataclass(frozen=True)
 class PortContext:
-    """A system on a recording, as far as its ports depend on it.
+    """The properties of a system and its recording that its ports depend on.
 
     Attributes:
-        system, recording, channels: the equations, the recording, and the columns that answer them.
-        kinematic: states whose rate is another state.
+        system: the equations.
+        recording: the recording.
+        channels: the columns that are outputs.
+        kinematic: state whose rate is another state, to that state.
         guess: (N, n), a first guess of the states at the samples.
-        clock: the moments at which rates and inputs are computed.
+        clock: the times at which rates and inputs are computed.
         run: (N,), number of each sample's run.
     """
 
@@ -58,7 +61,7 @@ class PortContext:
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
-        """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
+        """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
         system = self.system
         places = {}
         for state in system.states:
@@ -73,14 +76,14 @@ class PortContext:
                 port = self._rate_port(state, kind, parts)
                 places[f"{kind} of {state}"] = replace(port, memory=memory_at(kind, state))
         pairs = [
-            (one, other)
-            for one, other in combinations((s for s in system.states if s not in self.kinematic), 2)
-            if self._unit_of(one) == self._unit_of(other)
+            (first, second)
+            for first, second in combinations((s for s in system.states if s not in self.kinematic), 2)
+            if self._unit_of(first) == self._unit_of(second)
         ]
-        for one, other in pairs:
-            sideways = {"sideways": other} if self._is_way(one) and self._is_way(other) else {}
-            port = self._rate_port(one, "exchange", {"own": one, "other": other, **sideways})
-            places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
+        for first, second in pairs:
+            sideways = {"sideways": second} if self._is_way(first) and self._is_way(second) else {}
+            port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways})
+            places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
         for name in system.inputs:
             places[f"input {name}"] = Port(
                 (name,),
@@ -100,14 +103,14 @@ class PortContext:
         return places | {"output": output}
 
     def _remembering(self, parts: Mapping[str, str]) -> tuple[str, ...]:
-        """Kinds of ports with internal states that the rate of a state with these parts has."""
+        """Kinds of ports with internal states at the rate of a state with these parts."""
         if self.system.restart_after is not None:
-            return ()  # segments of one run would each begin without what the one before remembers
+            return ()  # each segment of a run would start without the memory of the segment before
         needs = {"hysteretic rate": "position", "lagged rate": "own", "resonant rate": "flowing"}
         return tuple(kind for kind, part in needs.items() if part in parts)
 
     def _parts(self, state: str) -> dict[str, str]:
-        """What an effect on the rate of a state can refer to."""
+        """Signals by role that an effect on the rate of a state can refer to."""
         positions = [i for i, j in self.kinematic.items() if j == state]
         parts = {"own": state, **({"position": positions[0]} if positions else {})}
         if positions and self._unit_of(positions[0]) == "rad":
@@ -129,12 +132,12 @@ class PortContext:
         return parts
 
     def _is_way(self, state: str) -> bool:
-        """Whether a state is the speed along a straight line, as far as names and units tell."""
+        """Whether a state is a linear speed, judged by names and units."""
         positions = [i for i, j in self.kinematic.items() if j == state]
         return self._unit_of(state) == "m/s" or (bool(positions) and self._unit_of(positions[0]) not in ("rad", "°"))
 
     def _reverses(self, state: str) -> bool:
-        """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
+        """Whether a state has either sign for more than ``_REVERSED`` of the recording, by the first guess."""
         values = self.guess[:, self.system.states.index(state)]
         return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
 
@@ -158,7 +161,7 @@ class PortContext:
         return surroundings(self.system)
 
     def _sizes(self, state: str, parts: Mapping[str, str]) -> dict[str, SignalSizes]:
-        """Of the parts that are states, and of the surroundings how far the state is from them."""
+        """Sizes of the parts that are states; for the surroundings, of the state's difference to them."""
         values = dict(zip(self.system.states, self.guess.unbind(-1), strict=True))
         sizes = {part: SignalSizes.of(values[name]) for part, name in parts.items() if name in values}
         if "surroundings" in parts:
@@ -170,11 +173,11 @@ class PortContext:
 
 
 def memory_at(kind: str, state: str) -> dict[str, str]:
-    """Internal states at the rate of a state, and the state that each begins like; empty for 0.
+    """Internal states at the rate of a state, with the state that each starts equal to; empty to start at 0.
 
     Args:
-        kind: of the port.
-        state: whose rate it is.
+        kind: kind of the port.
+        state: the state.
 
     Example:
         >>> memory_at("resonant rate", "speed"), memory_at("rate", "speed")
@@ -184,6 +187,6 @@ def memory_at(kind: str, state: str) -> dict[str, str]:
 
 
 def common_unit(units: Iterable[str]) -> str:
-    """The unit that all of them are; empty where they differ."""
+    """The common unit; empty where units differ."""
     found = set(units)
     return found.pop() if len(found) == 1 else ""

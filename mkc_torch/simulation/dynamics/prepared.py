@@ -1,4 +1,4 @@
-"""Differential equations with the recording that answers them."""
+"""A system of differential equations prepared with a recording."""
 
 from __future__ import annotations
 
@@ -42,13 +42,14 @@ if TYPE_CHECKING:
 __all__ = ["PreparedDynamics"]
 
 _PATIENT = 2
-"""Moments at a time of a march that has to find its way."""
+"""Stride of the growing horizon, in grid times, for trajectories that are hard to solve."""
 
 _NOUGHT = 1e-3
+"""Share of a parameter's start value below which its fitted value does not define its size."""
 
 
 class PreparedDynamics(ObservedDynamics):
-    """A system of differential equations with the recording that answers it."""
+    """A system of differential equations with its recording; implements the protocol of a prepared simulation."""
 
     prior: GaussianPrior | None = None
 
@@ -61,8 +62,8 @@ class PreparedDynamics(ObservedDynamics):
         self.independent = (True,) * len(outputs)
         self.state: Mapping[str, object] = {"class": system.name, "outputs": list(outputs)}
         self.known = {
-            name: one if isinstance(one, Parameter) else Parameter(float(one))
-            for name, one in system.parameters.items()
+            name: parameter if isinstance(parameter, Parameter) else Parameter(float(parameter))
+            for name, parameter in system.parameters.items()
         }
         self.begins, self.labels = beginnings(recording, system)
         self.run = experiment_runs(recording)
@@ -73,18 +74,18 @@ class PreparedDynamics(ObservedDynamics):
         starts = [f"{state} at the start{label}" for label in self.labels for state in system.states]
         self.parameter_names = (*self.known, *starts)
         p, n = len(self.known), len(starts)
-        low = [one.lower for one in self.known.values()]
-        high = [one.upper for one in self.known.values()]
+        low = [parameter.lower for parameter in self.known.values()]
+        high = [parameter.upper for parameter in self.known.values()]
         self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
         self._p = p
-        self.clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
+        self.clean = torch.stack([despiked(values, self.time, self.begins) for values in self.measured.unbind(-1)], -1)
         self.counts = self.clean == self.measured
         self._faithful: dict[int, bool] = {}
         self._check_functions()
         self._refine()
 
     def _lay_out(self, parts: int) -> None:
-        """Nodes and stations, each interval between samples in so many parts."""
+        """Set up the grid with this many intervals between samples, and everything that depends on the grid."""
         N, self.parts = len(self.time), parts
         inside = ~self.begins[1:]
         count = torch.where(inside, parts, 1)
@@ -92,7 +93,7 @@ class PreparedDynamics(ObservedDynamics):
         part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
         step = 1.0 / count.repeat_interleave(count).double()
         share = (part.unsqueeze(-1) + torch.tensor([0.0, 0.5, 1.0], dtype=step.dtype)) * step.unsqueeze(-1)
-        # between two runs there is nothing: time and inputs stay at the end of the first
+        # the interval between two runs is empty: time and inputs stay at the end of the first
         share = torch.where(inside.repeat_interleave(count).unsqueeze(-1), share, 0.0)
         node_before = torch.cat([before, before[-1:]])
         node_share = torch.cat([share[:, 0], share[-1:, 2]])
@@ -110,7 +111,7 @@ class PreparedDynamics(ObservedDynamics):
         self.guess = first_guess(
             self.system, self.recording, self.channels, self.begins, self.kinematic, time, node_before, node_share
         )
-        self.__dict__.pop("ports", None)  # their clock is that of the stations
+        self.__dict__.pop("ports", None)  # their clock has the times of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
@@ -120,8 +121,8 @@ class PreparedDynamics(ObservedDynamics):
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
 
-    def holding(self, between: Mapping[str, str]) -> PreparedDynamics:
-        """The same with inputs that do something else between samples: "held", "linear" or "smooth", by their names."""
+    def with_input_hold(self, between: Mapping[str, str]) -> PreparedDynamics:
+        """The simulation with other input interpolation, "held", "linear" or "smooth", by input name."""
         other = copy.copy(self)
         other.input_hold = {**self.input_hold, **between}
         other.inputs = other._between(self.inputs_at_rows)
@@ -130,7 +131,7 @@ class PreparedDynamics(ObservedDynamics):
         return other
 
     def finer(self) -> PreparedDynamics | None:
-        """The same with half the step of integration; None where the user set the step, or it is the smallest."""
+        """The simulation with half the integration step; None where the user set the step, or it is the smallest."""
         if self.system.step is not None or 2 * self.parts > FINEST:
             return None
         other = copy.copy(self)
@@ -140,7 +141,7 @@ class PreparedDynamics(ObservedDynamics):
         return other
 
     def guessed(self, near: Nearby | None) -> PreparedDynamics:
-        """The same with the states of a trajectory as its guess: states that no output shows have a size then."""
+        """The simulation with a trajectory's states as its guess, so that unmeasured states have a size."""
         if not isinstance(near, Trajectory):
             return self
         other = copy.copy(self)
@@ -149,7 +150,7 @@ class PreparedDynamics(ObservedDynamics):
         return other
 
     def observed(self, observer: Observer | None) -> PreparedDynamics:
-        """The same, predicted from sample to sample by an observer; None for a free run."""
+        """The simulation corrected by an observer; None for the open loop."""
         if observer is self.observer:
             return self
         other = copy.copy(self)
@@ -158,7 +159,7 @@ class PreparedDynamics(ObservedDynamics):
 
     @cached_property
     def ports(self) -> dict[str, Port]:
-        """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
+        """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
         places = PortContext(
             self.system, self.recording, self.channels, self.kinematic, self.guess[self.rows], self.clock, self.run
         )
@@ -166,7 +167,7 @@ class PreparedDynamics(ObservedDynamics):
 
     @property
     def beginnings(self) -> int:
-        """Number of the parameters that are of a run or a recording: its offsets, its first states; they come last."""
+        """Number of parameters of single runs or recordings: offsets and initial states; they come last."""
         return len(self.parameter_names) - self._p + len(self.own_offsets)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
@@ -174,8 +175,8 @@ class PreparedDynamics(ObservedDynamics):
 
     @property
     def given(self) -> Float[Tensor, " p"]:
-        """The user's values, and the first guess of the first states."""
-        values = self.time.new_tensor([one.value for one in self.known.values()])
+        """The user's values, then the first guess of the initial states."""
+        values = self.time.new_tensor([parameter.value for parameter in self.known.values()])
         return torch.cat([values, self.guess[self.grid.begins].flatten()])
 
     @cached_property
@@ -191,7 +192,7 @@ class PreparedDynamics(ObservedDynamics):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What of the parameters the recording leaves undetermined, near where the fit starts."""
+        """Warnings about parameters that the recording does not determine, near the start of the fit."""
         if not self._p:
             return ()
         if self.observer is not None:
@@ -200,15 +201,15 @@ class PreparedDynamics(ObservedDynamics):
         theta = self.start()
         near = self.trajectory(theta, {})
         tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta).flatten(0, 1)
-        # a value near 0 says nothing of the size that is meant
-        meant = theta.new_tensor([one.value for one in self.known.values()])
+        # a value near 0 does not define the parameter's size
+        meant = theta.new_tensor([parameter.value for parameter in self.known.values()])
         typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))
         meant = torch.cat([meant.abs(), typical])
         size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
         return undetermined(tangents, size, self.parameter_names, self._p)
 
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
-        """Recording less prediction, and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
+        """The residual and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
         found = self.trajectory(theta, changes, near)
         # a tensor of a transform must not outlive it
         lasting = found.converged and not is_wrapped(found.states)
@@ -216,10 +217,10 @@ class PreparedDynamics(ObservedDynamics):
         return Answer(self._residual(theta, changes, found), nearby)
 
     def compiled(self, meaning: Meaning, size: int) -> CompiledDynamics | None:
-        """The residual by ``size`` parameters, computed without torch; None where a function of it cannot be traced.
+        """The residual as a function of ``size`` parameters, computed without torch; None where it cannot be traced.
 
         Args:
-            meaning: the simulation's own parameters and the changes at its ports, by these.
+            meaning: maps these parameters to the simulation's own parameters and the changes at its ports.
             size: number of parameters.
         """
         stations = len(self.clock.time)
@@ -230,7 +231,7 @@ class PreparedDynamics(ObservedDynamics):
     def residual(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Float[Tensor, "N m"]:
-        """That of the answer."""
+        """The residual of :meth:`answer`."""
         return self._residual(theta, changes, self.trajectory(theta, changes, near))
 
     def _residual(self, theta: Tensor, changes: Changes, found: Trajectory) -> Float[Tensor, "N m"]:
@@ -250,11 +251,11 @@ class PreparedDynamics(ObservedDynamics):
     def outputs_by_states(
         self, theta: Float[Tensor, " p"], changes: Changes, states: Float[Tensor, "N w"]
     ) -> Float[Tensor, "N m"]:
-        """The outputs at the samples by the states there, internal states of effects and disturbances included."""
+        """The outputs at the samples from the states there, including internal states of effects and disturbances."""
         outputs = self._outputs(theta, states)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
-        return outputs + self.pushed_outputs(states)
+        return outputs + self.output_disturbance(states)
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes, near)
@@ -280,13 +281,13 @@ class PreparedDynamics(ObservedDynamics):
         *,
         patient: bool = False,
     ) -> Trajectory:
-        """The states at all moments, with what effects change.
+        """Solve for the states at all grid times, with the changes by effects.
 
         Args:
-            theta: the parameters.
-            changes: what effects change.
-            near: a trajectory at parameters nearby, to begin with; None to find the way alone.
-            patient: go from moment to moment if it must.
+            theta: (p,), the parameters.
+            changes: the changes by effects, by port.
+            near: a trajectory at parameters nearby to start from; None to start from the guess.
+            patient: whether to fall back to a horizon that grows in small strides.
         """
         rate, jump = self.rate(theta, changes), self.jump(theta, changes)
         begin, memories = self.first_states(theta, changes)
@@ -308,7 +309,7 @@ class PreparedDynamics(ObservedDynamics):
     def _marched(
         self, theta: Tensor, changes: Changes, guess: Float[Tensor, "G w"], stride: int
     ) -> Float[Tensor, "G w"] | None:
-        """A guess near the trajectory, solved over a horizon that grows; None where there is none."""
+        """Improve a guess by solving over a growing horizon; None where that fails."""
         compiled = self.compiled(lambda parameters: (parameters, changes), len(theta)) if is_plain(theta) else None
         if compiled is not None:
             return compiled.marched(theta, guess, stride)
@@ -316,31 +317,34 @@ class PreparedDynamics(ObservedDynamics):
         return marched(rate, self.grid, self.first_states(theta, changes)[0], guess, stride=stride, jump=jump)
 
     def first_states(self, theta: Float[Tensor, " p"], changes: Changes) -> tuple[Float[Tensor, "K w"], list[str]]:
-        """The states that the runs begin in, internal ones included, and the state that each of these begins like."""
+        """Initial states of the runs, with internal states, and the state that each internal state starts equal to."""
         memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
         memories += [""] * len(self.lasting)
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
-    def since_begin(self) -> Float[Tensor, " N"]:
-        """Time since the beginning of each sample's run, in s."""
+    def time_since_start(self) -> Float[Tensor, " N"]:
+        """Time since the start of each sample's run, in s."""
         first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
         return self.time - self.time[first]
 
     def with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
-        """The states, and internal ones that are not yet among them: like another state, or zeros."""
+        """The states with missing internal states appended, equal to another state or 0."""
         n = len(self.system.states)
         more = [
             states[:, self.system.states.index(like)] if like else states.new_zeros(len(states))
             for like in memories[states.shape[1] - n :]
         ]
-        return torch.cat([states[:, : n + len(memories)], *(one.unsqueeze(-1) for one in more)], -1)
+        return torch.cat([states[:, : n + len(memories)], *(column.unsqueeze(-1) for column in more)], -1)
 
     def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
-        """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
+        """Ports whose effect has internal states, and these states.
+
+        An effect has them if it returns their rates too when its signal contains them.
+        """
         found = {}
         for name, port in self.ports.items():
-            # what does not see the signal remembers nothing
+            # a change that does not depend on the signal has no memory
             if port.memory and name in changes and not isinstance(changes[name], FreeChange):
                 seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + len(port.memory))
                 if changes[name](seen).shape[1] > len(port.channels):
@@ -348,10 +352,10 @@ class PreparedDynamics(ObservedDynamics):
         return found
 
     def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
-        """Of the states, and of the internal states that effects bring, which come after them."""
+        """The function for the rates of the states, the effects' internal states and the lasting disturbances."""
         inputs = self._inputs(theta, changes)
         remembering = self.remembering(changes)
-        rows = [*self.system.states, *(one for memory in remembering.values() for one in memory)]
+        rows = [*self.system.states, *(name for memory in remembering.values() for name in memory)]
         lasting, n = self.lasting, len(self.system.states)
         acting = [
             (port, [rows.index(row) for row in (*port.channels, *remembering.get(name, ()))], name)
@@ -360,32 +364,32 @@ class PreparedDynamics(ObservedDynamics):
         ]
 
         def rate(states: Tensor) -> Tensor:
-            own, memories, pushes = states.split([n, len(rows) - n, len(lasting)], -1)
+            own, memories, disturbances = states.split([n, len(rows) - n, len(lasting)], -1)
             plain = self._rates(theta, own, inputs)
-            rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
+            rates = [*plain, *(torch.zeros_like(memory) for memory in memories.unbind(-1))]
             for port, places, name in acting:
                 signal = self._signal(port, theta, own, inputs, plain)
                 if name in remembering:
                     signal = torch.cat([signal, states[:, places[len(port.channels) :]]], -1)
                 for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
-            for one, push in zip(lasting, pushes.unbind(-1), strict=True):
-                if one.at_rate:
-                    rates[rows.index(one.place)] = rates[rows.index(one.place)] + push
-                rates.append(-push / one.lasting)
+            for disturbance, value in zip(lasting, disturbances.unbind(-1), strict=True):
+                if disturbance.at_rate:
+                    rates[rows.index(disturbance.place)] = rates[rows.index(disturbance.place)] + value
+                rates.append(-value / disturbance.lasting)
             return torch.stack(rates, -1)
 
         return rate
 
     def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
-        """Of the states, by the simulation's own equations."""
+        """Rates of the states by the simulation's own equations."""
         u = namespace(self.system.inputs, inputs)
         return self._derivative(self.clock.time, states, u, self.parameters_of(theta))
 
     def _signal(
         self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor, rates: Sequence[Tensor]
     ) -> Float[Tensor, "S k"]:
-        """What passes through a port of rates: states and inputs, and where the port has them the load or the rate."""
+        """Signal at a rate port: the states and inputs, then the rate or the load where the port has it."""
         own = self.system.states.index(port.parts["own"])
         if "rate" in port.parts:
             return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
@@ -394,7 +398,7 @@ class PreparedDynamics(ObservedDynamics):
         p, idle = self.parameters_of(theta), namespace(self.system.inputs, torch.zeros_like(inputs))
         at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
         coasting, held = (self._derivative(self.clock.time, x, idle, p)[own] for x in (states, at_rest))
-        load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against what holds it
+        load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against the holding forces
         return torch.cat([states, inputs, load], -1)
 
     def _derivative(self, time: Tensor, states: Tensor, u: Any, p: Any) -> list[Tensor]:
@@ -426,7 +430,7 @@ class PreparedDynamics(ObservedDynamics):
         return Names(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
 
     def _check_functions(self) -> None:
-        theta = self.time.new_tensor([one.value for one in self.known.values()])
+        theta = self.time.new_tensor([parameter.value for parameter in self.known.values()])
         at = self.grid.spread(self.guess)
         first = at[::3][:1].expand(len(self.time), -1)
         stations = SampledStates(self.clock.time, at, self.inputs, self.run[self.clock.before])
@@ -434,7 +438,7 @@ class PreparedDynamics(ObservedDynamics):
         check_functions(self.system, self.parameters_of(theta), stations, samples, self.channels)
 
     def _refine(self) -> None:
-        """Parts of an interval between samples: by the greatest step, or until twice as many change nothing."""
+        """Set the number of intervals between samples: by the user's step, or until doubling changes nothing."""
         if self.system.step is not None:
             inside = self.time.diff()[~self.begins[1:]]
             self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))

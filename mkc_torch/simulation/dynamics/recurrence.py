@@ -1,4 +1,4 @@
-"""Affine recurrences of the states of a trajectory, composed by doubling."""
+"""Solve the affine recurrence of a trajectory's states by parallel composition."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ if TYPE_CHECKING:
 __all__ = ["Recurrence"]
 
 _FEW = 256
-"""Moments from which on it is cheaper to join them all at once than one half to the other."""
+"""Number of grid times up to which products over 1, 2, 4 ... intervals are cheaper than halving."""
 
 
 @dataclass(frozen=True)
 class Recurrence:
-    """The recurrence ``δ[k+1] = A[k] δ[k] − B[k] D[k]``: its A, those of every second moment and so on, and B.
+    """The recurrence ``δ[k+1] = A[k] δ[k] − B[k] D[k]``, composed for parallel solution.
 
-    Neighbours are joined until few are left, which takes a few times the work of one step after the other; those few
-    are joined over 1, 2, 4 … intervals, which takes fewer operations.
+    Neighbouring intervals are composed until at most ``_FEW`` times are left, at a few times the work of sequential
+    steps. These are composed over 1, 2, 4 … intervals, which takes fewer operations.
+
+    Attributes:
+        carries: A at all grid times, at every second time, and so on.
+        products: products of A over 1, 2, 4 ... intervals at the last level.
+        inverse: B.
     """
 
     carries: tuple[Tensor, ...]
@@ -31,7 +36,7 @@ class Recurrence:
 
     @classmethod
     def of(cls, carries: Float[Tensor, "G n n"], inverse: Float[Tensor, "G-1 n n"], longest: int) -> Recurrence:
-        """From A as it arrives at each moment, B, and the number of moments of the longest trajectory."""
+        """Compose from A into each grid time, B, and the number of grid times of the longest trajectory."""
         levels = []
         while longest > _FEW:
             levels.append(carries)
@@ -45,8 +50,8 @@ class Recurrence:
         return cls(tuple(levels), tuple(products), inverse)
 
     def solved(self, start: Float[Tensor, "G n"], defect: Float[Tensor, "G-1 n"]) -> Float[Tensor, "G n"]:
-        pushed = _applied(self.inverse, defect)
-        return self._passed_on(start - torch.cat([torch.zeros_like(pushed[:1]), pushed]), 0)
+        source = _applied(self.inverse, defect)
+        return self._passed_on(start - torch.cat([torch.zeros_like(source[:1]), source]), 0)
 
     def _passed_on(self, values: Float[Tensor, "G n"], level: int) -> Float[Tensor, "G n"]:
         if level < len(self.carries):
@@ -58,8 +63,8 @@ class Recurrence:
             return _in_turn(torch.cat([first[:1], later]), second)
         shift = 1
         for product in self.products:
-            carried = _applied(product, values[:-shift])
-            values = torch.cat([values[:shift], values[shift:] + carried])
+            later = _applied(product, values[:-shift])
+            values = torch.cat([values[:shift], values[shift:] + later])
             shift *= 2
         return values
 
@@ -69,6 +74,6 @@ def _applied(matrices: Float[Tensor, "G n n"], values: Float[Tensor, "G n"]) -> 
 
 
 def _in_turn(first: Float[Tensor, "G n"], second: Float[Tensor, "H n"]) -> Float[Tensor, "G+H n"]:
-    """Rows of the one and of the other, in turn; the first may have one more."""
+    """Interleave the rows of two tensors; the first may have a row more."""
     paired = torch.stack([first[: len(second)], second], 1).flatten(0, 1)
     return torch.cat([paired, first[len(second) :]])

@@ -1,4 +1,4 @@
-"""How many steps of integration an interval between samples takes."""
+"""Choose the number of integration steps between samples."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
 __all__ = ["FINEST", "enough_parts"]
 
 FINEST = 8
-"""Steps of integration between two samples at most."""
+"""Integration steps between two samples at most."""
 
 _ROUGH = 0.02
-"""Share of an output's spread by which half the step may move it."""
+"""Largest change of an output when the step is halved, as a share of its median absolute deviation."""
 
 
 def enough_parts(simulated: Callable[[int], Float[Tensor, "N m"]], measured: Float[Tensor, "N m"]) -> int:
-    """The fewest steps between samples of which twice as many change nothing; 1 where no trajectory is found.
+    """The smallest number of steps between samples that doubling no longer changes; 1 where no trajectory is found.
 
     Args:
-        simulated: the outputs with so many steps; NaN where no trajectory is found.
-        measured: the outputs as recorded.
+        simulated: the outputs by the number of steps; NaN where no trajectory is found.
+        measured: (N, m), the recorded outputs.
     """
     parts, before = 1, simulated(1)
     spread = (measured - measured.median(0).values).abs().median(0).values.clamp(min=1e-300)
     while parts < FINEST:
         after = simulated(2 * parts)
-        # no trajectory, NaN, may come from steps that are too long
+        # NaN, no trajectory, fails this test: the steps may be too long
         if bool(((after - before).abs().amax(0) <= _ROUGH * spread).all()):
             break
         parts, before = 2 * parts, after

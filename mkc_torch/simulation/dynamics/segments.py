@@ -1,4 +1,4 @@
-"""Where trajectories begin: runs, and the segments of long ones."""
+"""Starts of trajectories: of runs, and of the segments that long runs are split into."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 __all__ = ["beginnings", "refuse_few"]
 
 _FEWEST = 3
+"""Samples of a trajectory at least."""
 
 
 def beginnings(recording: Recording, system: Equations) -> tuple[Tensor, list[str]]:
-    """Where trajectories begin, and what each is called."""
+    """Mask of the samples where trajectories start, (N,), and a label for each trajectory."""
     time = recording["time"]
     begins = torch.zeros(len(time), dtype=torch.bool)
     begins[0] = True
@@ -47,7 +48,7 @@ def beginnings(recording: Recording, system: Equations) -> tuple[Tensor, list[st
 
 
 def _short_ends(begins: Bool[Tensor, " N"], first: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
-    """Where the last segment of a run begins, if it is too short for a trajectory of its own."""
+    """Mask of the starts of last segments that are too short for a trajectory of their own."""
     short = torch.zeros_like(begins)
     rows = begins.nonzero().squeeze(-1)
     ends = torch.cat([rows[1:], rows.new_tensor([len(begins)])])
@@ -57,10 +58,11 @@ def _short_ends(begins: Bool[Tensor, " N"], first: Int[Tensor, " N"]) -> Bool[Te
 
 
 def refuse_few(begins: Tensor, name: str) -> None:
+    """Raise where a trajectory has fewer than three samples."""
     first = begins.nonzero().squeeze(-1)
     shortest = int(torch.cat([first, first.new_tensor([len(begins)])]).diff().min())
     if shortest < _FEWEST:
         raise SimulationError(
-            f"{name}: a run of {shortest} samples is too short for a trajectory; it needs {_FEWEST} at least. Leave "
-            "it out, or use longer segments."
+            f"{name}: a run of {shortest} samples is too short for a trajectory; expected at least {_FEWEST}. Leave "
+            "it out, or use longer segments (`restart_after`)."
         )

@@ -1,29 +1,29 @@
-"""Settings of Newton's method on a trajectory."""
+"""Settings of Newton's method for trajectories."""
 
 from __future__ import annotations
 
 __all__ = ["HALVINGS", "HORIZON", "MOST_STEPS", "QUICK", "ROUGHLY", "ROUNDING", "SETTLED", "STALLED"]
 
 MOST_STEPS = 30
-"""Steps at most."""
+"""Newton steps at most."""
 
 STALLED = 5
-"""Steps after which the defects must have halved."""
+"""Newton steps within which the defects must halve."""
 
 SETTLED = 1e-9
-"""Largest change, as a share of each state's size, at which the equations are solved."""
+"""Largest change, as a share of each state's size, at which Newton's method has converged."""
 
 HALVINGS = 6
 """Halvings of a step at most."""
 
 QUICK = 0.01
-"""Largest share of the defects that a step with the linearised equations of a trajectory nearby may leave."""
+"""Largest remaining share of the defects after a step with the linearisation of a trajectory nearby."""
 
 ROUNDING = 1e-6
-"""Change, as a share of each state's size, below which defects that no longer shrink are of rounding."""
+"""Change, as a share of each state's size, below which defects that no longer shrink are rounding errors."""
 
 HORIZON = 32
-"""Moments by which the horizon of a guess grows that is found step by step."""
+"""Grid times by which the horizon grows when a guess is solved over growing horizons."""
 
 ROUGHLY = 1e-4
-"""Change, as a share of each state's size, at which such a guess is good enough for its horizon to grow."""
+"""Change, as a share of each state's size, at which such a guess has converged and its horizon grows."""

@@ -1,4 +1,4 @@
-"""Inputs that are the surroundings of a state: it is known by its difference to them."""
+"""Inputs that a state acts relative to, as an ambient temperature."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from mkc_torch.simulation.parameter import Parameter
 __all__ = ["surroundings"]
 
 _SHIFT = 0.7
+"""Common shift of state and input in the test."""
 
 
 def surroundings(system: Equations) -> dict[str, str]:
-    """The input that each state is known by its difference to, of states that have one.
+    """Find the input that each state acts relative to; states without such an input are left out.
 
-    That is an input which can be shifted together with the state, and with all states of its unit, without a change of
-    the state's rate, as can an ambient temperature; where there is none, an input of the same unit.
+    It is an input whose common shift with all states of the state's unit leaves the state's rate unchanged, as with an
+    ambient temperature. If there is none, it is an input of the same unit.
 
     Args:
-        system: the equations, with units as they are declared, or as names tell.
+        system: the equations; units are those declared, or the defaults of the names.
 
     Example:
         >>> from mkc_torch.simulation import Dynamics
@@ -37,7 +38,10 @@ def surroundings(system: Equations) -> dict[str, str]:
         >>> surroundings(Heater())
         {'temp': 'outside'}
     """
-    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
+    known = {
+        name: parameter if isinstance(parameter, Parameter) else Parameter(parameter)
+        for name, parameter in system.parameters.items()
+    }
     found = {}
     for state in system.states:
         unit = _unit_of(system, state)
@@ -54,14 +58,14 @@ def _unit_of(system: Equations, name: str) -> str:
 
 
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
-    """Whether the rate of a state depends on states of one unit only by their difference to an input."""
+    """Whether the rate of a state depends on the states of its unit only by their difference to an input."""
     time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
-    # a parameter that begins at 0 would hide what it multiplies
-    p = Names(**{one: torch.tensor(known[one].value or 1.0).double() for one in known})
+    # a parameter of 0 would hide what it multiplies
+    p = Names(**{parameter: torch.tensor(known[parameter].value or 1.0).double() for parameter in known})
 
     def rate(of_states: float, of_input: float) -> torch.Tensor:
         moved, driven = states.clone(), inputs.clone()
-        moved[:, [system.states.index(one) for one in alike]] += of_states
+        moved[:, [system.states.index(other) for other in alike]] += of_states
         driven[:, system.inputs.index(name)] += of_input
         found = system.derivative(time[:, 0], namespace(system.states, moved), namespace(system.inputs, driven), p)
         value = found[state] if isinstance(found, Mapping) else found[system.states.index(state)]
@@ -74,7 +78,7 @@ def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: l
 
 
 def _scattered(count: int) -> torch.Tensor:
-    """(20, count) values from 0.1 to 1.1; the same ones each time, and allowed where random ones are not."""
+    """Fixed scattered values from 0.1 to 1.1, (20, count), without the random number generator."""
     turns = (
         torch.arange(1, 21, dtype=torch.float64).unsqueeze(-1) * (torch.arange(count, dtype=torch.float64) + 2.7).sqrt()
     )

@@ -1,10 +1,10 @@
-"""Trajectories of a differential equation at all their moments at once: collocation, solved by Newton's method.
+"""Trajectories of a differential equation at all grid times at once: collocation, solved by Newton's method.
 
-Between neighbouring moments the solution obeys the Hermite-Simpson formula (Lobatto IIIA of fourth order, A-stable:
-Hairer & Wanner, "Solving Ordinary Differential Equations II", 1996, IV.5). All of these equations are linearised
-together; what is left is an affine recurrence from one moment to the next, which is composed by doubling (Blelloch,
-"Prefix sums and their applications", 1990). So nothing is stepped through one by one, derivatives with respect to
-parameters and inputs come with the last step, and a guess from measured states keeps unstable systems in reach.
+Between neighbouring grid times the solution obeys the Hermite-Simpson formula (Lobatto IIIA of fourth order, A-stable:
+Hairer & Wanner, "Solving Ordinary Differential Equations II", 1996, IV.5). Linearising all of these equations gives an
+affine recurrence from each grid time to the next, which is composed in parallel (Blelloch, "Prefix sums and their
+applications", 1990). So there is no sequential integration, the last Newton step gives the derivatives by parameters
+and inputs, and a guess from measured states makes unstable systems solvable.
 """
 
 from __future__ import annotations
@@ -40,31 +40,32 @@ __all__ = [
     "Linear",
     "Rate",
     "Trajectory",
-    "carried",
     "defect",
     "linearised_later",
     "marched",
     "slopes",
     "solve",
     "stations",
+    "transition_matrices",
 ]
 
 Rate = Callable[[Tensor], Tensor]
-"""Of change of the states, (S, n) → (S, n), at the stations of a grid."""
+"""Rate of change of the states at the stations of a grid, (S, n) → (S, n)."""
 
 _DIGITS = 100.0
+"""Convergence threshold at least, in units of the machine epsilon."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Moments in their order, of one or several trajectories that follow one another.
+    """Grid times of one or several trajectories, in sequence.
 
-    The differential equation is looked at in three stations of each interval between neighbours: its left end, its
-    middle and its right end. Where a trajectory begins, the interval before it counts for nothing.
+    The rates are evaluated at three stations of each interval: its left end, middle and right end. The interval before
+    the start of a trajectory has length 0.
 
     Attributes:
-        time: (G,) in s.
-        begins: (G,), where a trajectory begins; True for the first moment.
+        time: (G,), in s.
+        begins: (G,), True where a trajectory starts, and for the first time.
     """
 
     time: Float[Tensor, " G"]
@@ -72,46 +73,46 @@ class Grid:
 
     @property
     def step(self) -> Float[Tensor, " G-1"]:
-        """Length of each interval in s; 0 before the beginning of a trajectory."""
+        """Length of each interval in s; 0 before the start of a trajectory."""
         return torch.where(self.begins[1:], 0.0, self.time.diff())
 
     @property
     def stations(self) -> Float[Tensor, " 3G-3"]:
-        """Their times in s."""
+        """Times of the stations in s."""
         return self.spread(self.time)
 
     def spread(self, values: Float[Tensor, G * rest]) -> Float[Tensor, "3G-3 *rest"]:
-        """Values at the moments as values at the stations, with the mean in the middle."""
+        """Interpolate values at the grid times to the stations linearly."""
         left, right = values[:-1], values[1:]
         return torch.stack([left, 0.5 * (left + right), right], 1).flatten(0, 1)
 
     @property
     def longest(self) -> int:
-        """Number of moments of the longest trajectory."""
+        """Number of grid times of the longest trajectory."""
         first = self.begins.nonzero().squeeze(-1)
         return int(torch.cat([first, first.new_tensor([len(self.begins)])]).diff().max())
 
 
 class Jump(Protocol):
-    """What happens to the states at the moments of a grid, as where they are corrected by what was measured."""
+    """A jump of the states at grid times, such as an observer's corrections."""
 
     def applied(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
-        """The states just after each moment, by those just before it."""
+        """Return the states just after each grid time, from those just before."""
         ...
 
     def slope(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n n"]:
-        """Of the states after by those before, as a constant."""
+        """Return the derivative of the states after by those before, without a gradient of its own."""
         ...
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States at the moments of a grid.
+    """States at the grid times.
 
     Attributes:
         states: (G, n).
-        converged: whether they solve the equations.
-        linear: the equations, linearised; None where that is not kept.
+        converged: whether they solve the collocation equations.
+        linear: the equations linearised about them; None where not kept.
     """
 
     states: Float[Tensor, "G n"]
@@ -120,17 +121,17 @@ class Trajectory:
 
     @property
     def bare(self) -> Trajectory:
-        """The states alone: small, and the same in whichever process they were found."""
+        """The trajectory without its linearisation: small, and independent of the process that found it."""
         return Trajectory(self.states, self.converged)
 
 
 class Linear:
-    """Equations linearised near a trajectory.
+    """Collocation equations linearised near a trajectory.
 
     Args:
-        renewed: linearises them at its states themselves.
-        recurrence: the linearised equations; None takes those of ``renewed`` when they are asked for.
-        factor: the same for NumPy, see :mod:`mkc_torch.simulation.dynamics.compiled`; None where there is none.
+        renewed: linearises the equations about the trajectory's states.
+        recurrence: the linearised equations; None calls ``renewed`` at the first use.
+        factor: the linearised equations for NumPy, see :mod:`mkc_torch.simulation.dynamics.compiled`; None without.
     """
 
     def __init__(
@@ -154,19 +155,22 @@ def solve(
     known: Trajectory | None = None,
     jump: Jump | None = None,
 ) -> Trajectory:
-    """The trajectories that begin in given states.
+    """Solve for the trajectories with given initial states.
 
-    Derivatives of the states with respect to whatever ``rate`` and ``begin`` depend on are exact in first order, in
-    forward and in reverse mode; the guess has no derivative.
+    First derivatives of the states by anything that ``rate`` and ``begin`` depend on are exact, in forward and in
+    reverse mode. The guess has no derivative.
 
     Args:
-        rate: of change of the states at the stations.
-        grid: its K trajectories.
-        begin: their first states.
-        guess: of all states.
-        known: a trajectory nearby, instead of the guess, with its equations linearised: they serve as long as they
-            bring these to rest quickly.
-        jump: what happens to the states at each moment; the trajectory has those just before. None for nothing.
+        rate: rate of change of the states at the stations.
+        grid: the grid times of K trajectories.
+        begin: (K, n), the initial states.
+        guess: (G, n), a guess of all states.
+        known: a trajectory nearby that replaces the guess; its linearised equations are used as long as they converge
+            quickly.
+        jump: jump of the states at each grid time; the trajectory holds the states just before. None for no jump.
+
+    Returns:
+        The trajectory; ``converged`` is False where none is found.
 
     Example:
         A decay at a rate of 2/s:
@@ -212,17 +216,17 @@ def solve(
         if len(norms) > STALLED and norms[-1] > 0.5 * norms[-1 - STALLED] and size * part > ROUNDING:
             break
     states, left = at.states, at.left
-    transformed = any(is_wrapped(one) for one in (left, begin))
+    transformed = any(is_wrapped(tensor) for tensor in (left, begin))
 
     def renewed() -> Recurrence:
-        # nothing here is of a transform that this is asked for in, and in one it would be forward mode again
+        # these tensors belong to no transform of the caller, within which this would nest forward mode
         with nullcontext() if transformed else temporarily_clear_interpreter_stack():
             return _recurrence(rate, states, step, grid, jump)
 
-    if transformed or any(one.requires_grad for one in (left, begin)):
-        # outside of the transform it is the same, and cheaper
+    if transformed or any(tensor.requires_grad for tensor in (left, begin)):
+        # outside of the transform the result is the same, and cheaper
         recurrence = renewed() if linear is None or moved_on else linear.renewed()
-    # one more step, whose value is that of rounding and whose derivative is that of the solution
+    # one more Newton step: it changes the value by rounding only, and has the derivative of the solution
     start = torch.where(origin, begin[places] - states, 0.0)
     return Trajectory(states + recurrence.solved(start, left), converged, Linear(renewed, recurrence))
 
@@ -233,12 +237,12 @@ def linearised_later(
     grid: Grid,
     factor: object | None = None,
 ) -> Linear:
-    """The equations of a solved trajectory, linearised when they are asked for.
+    """The equations of a solved trajectory, linearised at the first use.
 
     Args:
         functions: returns the rate and the jump of :func:`solve`.
-        states: of the trajectory.
-        grid: its moments.
+        states: (G, n), of the trajectory.
+        grid: its grid times.
         factor: the linearised equations for NumPy.
     """
 
@@ -259,16 +263,16 @@ def marched(
     stride: int = HORIZON,
     jump: Jump | None = None,
 ) -> Float[Tensor, "G n"] | None:
-    """A guess that is near the trajectories, from one that is not: they are solved over a horizon that grows.
+    """Improve a poor guess by solving the trajectories over a growing horizon.
 
     Args:
-        rate, grid, begin: as of :func:`solve`.
-        guess: of all states.
-        stride: moments by which the horizon grows; fewer find more, and take longer.
-        jump: as of :func:`solve`.
+        rate, grid, begin: as in :func:`solve`.
+        guess: (G, n), of all states.
+        stride: grid times by which the horizon grows; small strides are slower and more robust.
+        jump: as in :func:`solve`.
 
     Returns:
-        The states, to a rough tolerance; None where even a short horizon has no solution.
+        The states, (G, n), to a rough tolerance; None where the iteration diverges.
     """
     step = grid.step.unsqueeze(-1)
     index = torch.arange(len(guess), device=guess.device)
@@ -276,7 +280,7 @@ def marched(
     place = index - first
     states = torch.where(grid.begins.unsqueeze(-1), begin.detach()[grid.begins.long().cumsum(0) - 1], guess.detach())
     for horizon in range(stride, grid.longest + stride, stride):
-        # beyond what is solved the last state stays
+        # beyond the horizon the last solved state is held
         states = states[torch.minimum(index, first + horizon - stride)]
         inside = (place <= horizon).unsqueeze(-1)
         for _ in range(MOST_STEPS):
@@ -302,7 +306,7 @@ def marched(
 
 @dataclass(frozen=True)
 class _Point:
-    """States on the way to a solution: what they lack of the equations, in size, and the scale of each state."""
+    """An iterate: the states, their defects, the scale of each state, and the mean square of the scaled defects."""
 
     states: Tensor  # (G, n)
     left: Tensor  # (G-1, n), with derivatives
@@ -329,7 +333,7 @@ def _joined(left: Tensor, middle: Tensor, right: Tensor) -> Tensor:
 def stations(
     rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
 ) -> Float[Tensor, "3G-3 n"]:
-    """States at the stations: in the middle of an interval those of the cubic through its ends."""
+    """States at the stations; the midpoint is on the cubic Hermite polynomial through the interval's ends."""
     left, right = _after(states, jump)[:-1], states[1:]
     middle = 0.5 * (left + right)
     at_left, _, at_right = _ends(rate(_joined(left, middle, right)))
@@ -339,7 +343,7 @@ def stations(
 def defect(
     rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
 ) -> Float[Tensor, "G-1 n"]:
-    """What the ends of each interval lack of Simpson's rule; 0 before the beginning of a trajectory."""
+    """Defect of Simpson's rule over each interval, (G-1, n); 0 before the start of a trajectory."""
     at = stations(rate, states, step, jump)
     left, middle, right = _ends(rate(at))
     gone = torch.where(step > 0, states[1:] - at[::3], 0.0)
@@ -350,10 +354,10 @@ def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G 
     return states if jump is None else jump.applied(states)
 
 
-def carried(
+def transition_matrices(
     rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
 ) -> tuple[Float[Tensor, "G-1 n n"], Float[Tensor, "G-1 n n"]]:
-    """How a small change of the states just after a moment arrives at the next one, and how a lack of it does."""
+    """Derivatives of the next states by the states just after a grid time, and by the interval's negative defect."""
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
     slope = slopes(rate, stations(rate, states, step, jump).detach())
@@ -368,19 +372,20 @@ def carried(
 def _recurrence(
     rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid, jump: Jump | None
 ) -> Recurrence:
-    carries, inverse = carried(rate, states, step, jump)
+    carries, inverse = transition_matrices(rate, states, step, jump)
     if jump is not None:
         carries = carries @ jump.slope(states.detach())[:-1]
-    # the first moment has none before it
+    # no interval ends at the first grid time
     carries = torch.cat([torch.zeros_like(carries[:1]), carries])
     return Recurrence.of(carries, inverse, grid.longest)
 
 
 def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
-    """Of the rates by the states of their own station: as a constant, in reverse mode where nothing else is watched.
+    """Jacobian of the rates by the states of their own station, without a gradient of its own.
 
-    Forward mode computes with the zeros of every constant in the user's function, for more than all the rest. Reverse
-    mode multiplies the branch that ``torch.where`` left out by 0, so an infinite slope there asks for forward mode.
+    Reverse mode is used outside of function transforms. It is cheaper than forward mode, which propagates the zero
+    tangents of every constant. Forward mode is the fallback where the Jacobian is not finite, since reverse mode
+    multiplies an infinite slope in the unused branch of ``torch.where`` by 0.
     """
     with torch.enable_grad():
         given = at.requires_grad_() if not is_wrapped(at) else at
@@ -391,9 +396,9 @@ def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
                 return at.new_zeros(len(at), n, at.shape[1])
             rows = [
                 torch.autograd.grad(
-                    one.sum(), given, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True
+                    values.sum(), given, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True
                 )[0]
-                for k, one in enumerate(rates.unbind(-1))
+                for k, values in enumerate(rates.unbind(-1))
             ]
             slope = torch.stack(rows, 1)
             if bool(slope.isfinite().all()):

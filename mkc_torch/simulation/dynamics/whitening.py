@@ -1,8 +1,8 @@
-"""Series along a linearised trajectory, whitened under many models of the noise.
+"""Whiten series along a linearised trajectory under many noise models.
 
-A Kalman filter's gains depend on the model of the noise alone, so one pass over its covariances whitens any number of
-series: a recording, draws of noise, tangents of parameters and of candidate effects. A series is given relative to the
-trajectory, with the jumps that it makes in the states, and the filter follows the difference: so the series of an
+A Kalman filter's gains depend on the noise model only, so one pass over its covariances whitens any number of series: a
+recording, draws of noise, tangents of parameters and of candidate effects. A series is given relative to the
+trajectory, with the jumps that it makes in the states, and the filter estimates the difference. So the series of an
 unstable system stay finite.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mkc_torch.simulation.dynamics.kalman import Flow, Models
+from mkc_torch.simulation.dynamics.kalman import FilterModels, Flow
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
 from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 __all__ = ["FilterGains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
 
 _CELLS = 24_000_000
-"""Numbers of whitened series that are held at once: 192 MB."""
+"""Numbers of whitened series held in memory at once: 192 MB."""
 
 _WHOLE = 1500
-"""Samples up to which a recording is filtered in one pass; longer ones in stretches side by side, in two."""
+"""Samples up to which a recording is filtered in one pass; longer recordings take two over parallel stretches."""
 
 _STRETCH = 300
-"""Samples of such a stretch."""
+"""Samples of a parallel stretch."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class SeriesAlong:
     """K series along a trajectory.
 
     Attributes:
-        new: (N, m, K), what each adds to the outputs beside the trajectory's own states.
-        shift: (N-1, n, K), what each adds to the trajectory's states on the way to the next sample.
+        new: (N, m, K), additions to the outputs, given the trajectory's states.
+        shift: (N-1, n, K), additions to the trajectory's states until the next sample.
     """
 
     new: Float[np.ndarray, "N m K"]
@@ -54,46 +54,46 @@ class SeriesAlong:
 
 @dataclass(frozen=True)
 class FilterGains:
-    """The filters of B models of the noise.
+    """The Kalman filters of B noise models.
 
     Attributes:
         models: the models.
-        gain: (N, B, k, m), of states and lasting disturbances; 0 where a sample does not count.
-        white: (N, B, m, m), what makes the innovations of a sample independent, of variance 1; 0 likewise.
-        log_spread: (B,), sum of the logarithms of the innovations' standard deviations, of the samples that count.
+        gain: (N, B, k, m), of states and lasting disturbances; 0 where a sample is masked.
+        white: (N, B, m, m), whitens the innovations of a sample to variance 1; 0 where a sample is masked.
+        log_spread: (B,), sum of the logarithms of the innovations' standard deviations, over unmasked samples.
     """
 
-    models: Models
+    models: FilterModels
     gain: Float[np.ndarray, "N B k m"]
     white: Float[np.ndarray, "N B m m"]
     log_spread: Float[np.ndarray, " B"]
 
 
 def joined(*series: SeriesAlong) -> SeriesAlong:
-    """Series beside one another."""
+    """Concatenate series."""
     return SeriesAlong(
-        np.concatenate([one.new for one in series], -1), np.concatenate([one.shift for one in series], -1)
+        np.concatenate([part.new for part in series], -1), np.concatenate([part.shift for part in series], -1)
     )
 
 
-def gains_of(flow: Flow, models: Models) -> FilterGains:
-    """The gains of filters along a flow.
+def gains_of(flow: Flow, models: FilterModels) -> FilterGains:
+    """Compute the gains of Kalman filters along a flow.
 
     Args:
-        flow: of the trajectory.
-        models: B models of the noise.
+        flow: the linearised trajectory.
+        models: B noise models.
     """
-    n, D = flow.carried.shape[1], models.place.shape[1]
+    n, D = flow.transition.shape[1], models.place.shape[1]
     N, m = flow.new.shape
     P = filtered_whole(flow, models, keep=True).prior[:, 0]
-    if P.shape[1:] != (len(models), n + D, n + D):  # states that nothing pushes are known
+    if P.shape[1:] != (len(models), n + D, n + D):  # without process noise the states are known exactly
         P = np.zeros((N, len(models), n + D, n + D))
     C = _seen(flow, models)
     cross = P @ C.swapaxes(-1, -2)
     variance = models.sensor[:, :, None] ** 2 * np.eye(m)
     S = C @ cross + variance
     used = flow.counts > 0
-    # a sample of which some outputs do not count is whitened by those that do
+    # masked outputs of a sample take no part in its whitening
     both = used[:, None, :, None] & used[:, None, None, :]
     S = np.where(both, S, np.eye(m))
     cross = cross * used[:, None, None, :]
@@ -105,7 +105,7 @@ def gains_of(flow: Flow, models: Models) -> FilterGains:
 
 
 def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"]:
-    """Inverses of lower triangular matrices by forward substitution, over all of them at once."""
+    """Invert a batch of lower triangular matrices by forward substitution."""
     inverse = np.zeros_like(L)
     for row in range(L.shape[-1]):
         known = (L[..., row, :row, None] * inverse[..., :row, :]).sum(-2)
@@ -116,11 +116,11 @@ def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"
 
 
 def whitened(flow: Flow, gains: FilterGains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
-    """The series under each model of the noise: the number of the model, and its innovations, of variance 1.
+    """Whiten series under each noise model; yields the index of the model and innovations of variance 1.
 
     Args:
-        flow: of the trajectory.
-        gains: of the models.
+        flow: the linearised trajectory.
+        gains: the filters of the models.
         series: K series.
     """
     N, m, K = series.new.shape
@@ -136,14 +136,14 @@ def whitened(flow: Flow, gains: FilterGains, series: SeriesAlong) -> Iterator[tu
 def whitened_in_blocks(
     flow: Flow, gains: FilterGains, number: int, series: SeriesAlong, length: int
 ) -> Iterator[tuple[slice, Float[np.ndarray, "L m K"]]]:
-    """The series under one model of the noise, some samples at a time: which samples, and their innovations.
+    """Whiten series under one noise model, block by block; yields the samples of a block and their innovations.
 
-    The innovations of a block are overwritten by those of the next one.
+    The next block overwrites the innovations of the block before.
 
     Args:
-        flow: of the trajectory.
-        gains: of the models.
-        number: of the model.
+        flow: the linearised trajectory.
+        gains: the filters of the models.
+        number: index of the model.
         series: K series.
         length: samples of a block.
     """
@@ -164,7 +164,7 @@ def whitened_in_blocks(
         on = slice(rows.start, min(rows.stop, N - 1))
         here = out[:, : rows.stop - rows.start]
         compiled(
-            flow.carried[on], flow.pushed[on], phi[on], models.place, flow.seen[rows], gain[rows], white[rows],
+            flow.transition[on], flow.noise_input[on], phi[on], models.place, flow.seen[rows], gain[rows], white[rows],
             series.new[rows], series.shift[on], start, here,
         )  # fmt: skip
         yield rows, here[0]
@@ -178,21 +178,21 @@ def relative_to(
     innovations: Float[np.ndarray, "N m K"],
     corrects: Float[np.ndarray, "N m"] | float = 1.0,
 ) -> SeriesAlong:
-    """The series whose innovations, under a filter with these gains, are given.
+    """The series that have given innovations under a filter; the inverse of whitening.
 
     Args:
-        flow: of the trajectory.
-        gain: of the filter.
-        places: what each of its D lasting disturbances acts on: a rate, or p and more for an output.
+        flow: the linearised trajectory.
+        gain: gains of the filter.
+        places: where each of its D lasting disturbances acts: the index of a rate, or p plus the index of an output.
         lasting: their time constants in s.
         innovations: of each series.
-        corrects: share of an innovation that the filter corrects by.
+        corrects: share of an innovation that enters the correction.
     """
-    n, p, D = flow.carried.shape[1], flow.rates, len(places)
+    n, p, D = flow.transition.shape[1], flow.rates, len(places)
     scale = np.broadcast_to(corrects, innovations.shape[:2])[..., None]
     jump = gain @ (scale * innovations)
     new = innovations.copy()
-    shift = flow.carried @ jump[:-1, :n]
+    shift = flow.transition @ jump[:-1, :n]
     if D:
         phi = np.where(flow.step[:, None] > 0, np.exp(-flow.step[:, None] / lasting), 0.0)
         value = np.zeros((D, innovations.shape[-1]))
@@ -206,11 +206,11 @@ def relative_to(
             if row < len(shift):
                 for d, place in enumerate(places):
                     if place < p:
-                        shift[row] += flow.pushed[row][:, int(place), None] * value[d]
+                        shift[row] += flow.noise_input[row][:, int(place), None] * value[d]
     return SeriesAlong(new, shift)
 
 
-def _seen(flow: Flow, models: Models) -> Float[np.ndarray, "N B m k"]:
+def _seen(flow: Flow, models: FilterModels) -> Float[np.ndarray, "N B m k"]:
     N, m, n = flow.seen.shape
     B, D = models.place.shape
     own = (models.place[:, None, :] == flow.rates + np.arange(m)[:, None]).astype(float)
@@ -221,20 +221,20 @@ def _seen(flow: Flow, models: Models) -> Float[np.ndarray, "N B m k"]:
 
 
 def _filtered(flow: Flow, gains: FilterGains, part: slice, series: SeriesAlong) -> Float[np.ndarray, "N B m K"]:
-    """Whiten in one stretch, or in stretches side by side: from states of 0, then from where the one before it ends."""
+    """Whiten in one stretch, or in parallel stretches: from states of 0, then from the end of the stretch before."""
     N, m, K = series.new.shape
     compiled = machine_code(whiten_samples)
     if compiled is not None:
         return _by_machine_code(compiled, flow, gains, part, series)
     count = 1 if N <= _WHOLE else -(-N // _STRETCH)
-    way = _Stretches.of(flow, gains, part, series, count)
-    B, k = way.carry.shape[2:4]
+    stretches = _Stretches.of(flow, gains, part, series, count)
+    B, k = stretches.carry.shape[2:4]
     start = np.zeros((count, B, k, K))
     if count > 1:
-        end, passed_on = way.run(start)[1:]
+        end, passed_on = stretches.run(start)[1:]
         for g in range(count - 1):
             start[g + 1] = end[g] + passed_on[g] @ start[g]
-    return way.run(start)[0].reshape(-1, B, m, K)[:N]
+    return stretches.run(start)[0].reshape(-1, B, m, K)[:N]
 
 
 def _by_machine_code(
@@ -244,15 +244,15 @@ def _by_machine_code(
     out = np.empty((len(models), N, m, K))
     start = np.zeros((len(models), gains.gain.shape[2], K))
     whole = [
-        flow.carried, flow.pushed, _stays(flow, models), models.place, flow.seen, gains.gain[:, part],
+        flow.transition, flow.noise_input, _stays(flow, models), models.place, flow.seen, gains.gain[:, part],
         gains.white[:, part], series.new, series.shift,
     ]  # fmt: skip
-    compiled(*[np.ascontiguousarray(one) for one in whole], start, out)
+    compiled(*[np.ascontiguousarray(array) for array in whole], start, out)
     return out.swapaxes(0, 1)
 
 
-def _stays(flow: Flow, models: Models) -> Float[np.ndarray, "N-1 B D"]:
-    """The share of each lasting disturbance that stays until the next sample."""
+def _stays(flow: Flow, models: FilterModels) -> Float[np.ndarray, "N-1 B D"]:
+    """Share of each lasting disturbance that remains at the next sample."""
     step = flow.step[:, None, None]
     share: np.ndarray = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
     return share
@@ -260,7 +260,7 @@ def _stays(flow: Flow, models: Models) -> Float[np.ndarray, "N-1 B D"]:
 
 @dataclass(frozen=True)
 class _Stretches:
-    """G stretches of L samples each under B models, with the series: arrays by place in the stretch, then stretch."""
+    """G stretches of L samples under B models, with the series; the first axis is the sample within its stretch."""
 
     carry: Float[np.ndarray, "L G B k k"]
     seen: Float[np.ndarray, "L G B m k"]
@@ -291,7 +291,7 @@ class _Stretches:
     def run(
         self, start: Float[np.ndarray, "G B k K"]
     ) -> tuple[Float[np.ndarray, "G L B m K"], Float[np.ndarray, "G B k K"], Float[np.ndarray, "G B k k"]]:
-        """The innovations from these states; the states after the last sample, and what they keep of the first ones."""
+        """Innovations from initial states, states after the last sample, and their derivative by the initial states."""
         L, G, B, k, _ = self.carry.shape
         m, K = self.new.shape[2:]
         n = self.shift.shape[2]
@@ -307,13 +307,13 @@ class _Stretches:
         return out, state, kept
 
 
-def _carried(flow: Flow, models: Models) -> Float[np.ndarray, "N-1 B k k"]:
-    """States and lasting disturbances at the next sample by those at a sample."""
-    n, p, (B, D) = flow.carried.shape[1], flow.rates, models.place.shape
+def _carried(flow: Flow, models: FilterModels) -> Float[np.ndarray, "N-1 B k k"]:
+    """Transition matrices of states and lasting disturbances to the next sample."""
+    n, p, (B, D) = flow.transition.shape[1], flow.rates, models.place.shape
     acts = (np.arange(p)[:, None] == models.place[:, None, :]).astype(float)
     A = np.zeros((len(flow.step), B, n + D, n + D))
-    A[..., :n, :n] = flow.carried[:, None]
-    A[..., :n, n:] = flow.pushed[:, None] @ acts
+    A[..., :n, :n] = flow.transition[:, None]
+    A[..., :n, n:] = flow.noise_input[:, None] @ acts
     index = n + np.arange(D)
     step = flow.step[:, None, None]
     A[..., index, index] = np.where(step > 0, np.exp(-step / models.lasting), 0.0)

@@ -1,4 +1,4 @@
-"""Simulations that a tool has exported as FMUs (Functional Mock-up Units, FMI 2.0 and 3.0, fmi-standard.org)."""
+"""Simulations exported as FMUs (Functional Mock-up Units, FMI 2.0 and 3.0, fmi-standard.org)."""
 
 from mkc_torch.simulation.fmu.cosimulation import Simulated
 from mkc_torch.simulation.fmu.description import FmuError

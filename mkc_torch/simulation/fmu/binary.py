@@ -1,7 +1,7 @@
-"""An FMU's binary: evaluated at rows of time, states and inputs.
+"""The binary of an FMU, evaluated at rows of time, states and inputs.
 
-FMPy loads, instantiates and initialises it. The few functions that are called for each row are taken from the library
-itself, with addresses in place of arrays, for a call through FMPy takes ten times as long as the model's own equations.
+FMPy loads, instantiates and initialises it. The functions that are called for each row are taken from the library
+directly, with addresses in place of arrays: a call through FMPy takes ten times as long as the model's equations.
 """
 
 from __future__ import annotations
@@ -28,25 +28,28 @@ if TYPE_CHECKING:
 
 __all__ = ["Binary"]
 
-_WARNING, _FATAL = 1, 4
-"""Statuses: what is above a warning has no value, and after a fatal one nothing can be called."""
+_WARNING = 1
+"""Status of a warning; with a higher status there is no value."""
+
+_FATAL = 4
+"""Status of a fatal error, after which no function may be called."""
 
 _MOST_ITERATIONS = 50
-"""Of the discrete equations at an event."""
+"""Largest number of iterations of the discrete equations at an event."""
 
 _KEPT = 5
-"""Messages of an FMU that are told."""
+"""Number of the last messages of an FMU that errors quote."""
 
 
 class Binary:
     """A loaded FMU for model exchange, in continuous-time mode.
 
-    Where it has event indicators, its discrete equations are solved anew at each row, so that what switches with time,
-    states and inputs of that moment is as it is there. What remembers, such as a hysteresis, or jumps, cannot be asked
-    for at moments in any order and is refused.
+    With event indicators, its discrete equations are solved again at each row, so that variables that switch with time,
+    states and inputs are correct there. A model with memory, such as a hysteresis, or with jumps of its states cannot
+    be evaluated at moments in any order and is refused.
 
     Args:
-        description: of the FMU.
+        description: description of the FMU.
 
     Raises:
         FmuError: no binary for this platform, or one that cannot be loaded.
@@ -62,12 +65,12 @@ class Binary:
         self.timed = True
         self._prepare_functions()
 
-    # what is asked of it
+    # evaluation
 
     def begin(self, parameters: Sequence[float]) -> bool:
-        """Initialise it with these parameters; False where it cannot be."""
-        given = tuple(parameters)
-        if given == self._parameters:
+        """Initialise the FMU with these parameters; False if it fails."""
+        values = tuple(parameters)
+        if values == self._parameters:
             return True
         model, self._parameters = self.model, None
         try:
@@ -76,32 +79,32 @@ class Binary:
             self._begun = True
             if self.description.version == 2:
                 model.setupExperiment(startTime=0.0)
-            references = [one.reference for one in self.description.parameters]
+            references = [variable.reference for variable in self.description.parameters]
             if references:
-                (model.setReal if self.description.version == 2 else model.setFloat64)(references, list(given))
+                (model.setReal if self.description.version == 2 else model.setFloat64)(references, list(values))
             model.enterInitializationMode()
             model.exitInitializationMode()
             self._settle_first()
             model.enterContinuousTimeMode()
-        except Exception as error:  # FMPy: a plain one of FMI 3, one with a status of FMI 2
+        except Exception as error:  # of FMPy: an Exception for FMI 3, an error with a status for FMI 2
             if getattr(error, "status", 0) >= _FATAL:
                 raise self._failed("could not be initialised") from None
             return False
-        self._parameters = given
+        self._parameters = values
         return True
 
     def first_states(self) -> Array:
-        """As it is initialised, (n,)."""
+        """The initial states, (n,)."""
         states = np.zeros(len(self.description.states))
         _call(self._get_states, self.model.component, states.ctypes.data, len(states))
         return states
 
     def values(self, outputs: bool, time: Array, states: Array, inputs: Array) -> Array:
-        """Rates of the states, or outputs, (S, k); NaN where the FMU gives none.
+        """The rates of the states, or the outputs, (S, k); NaN where the FMU fails.
 
         Args:
-            outputs: which of the two.
-            time: (S,).
+            outputs: return outputs instead of rates.
+            time: (S,), in s.
             states: (S, n).
             inputs: (S, m).
         """
@@ -115,7 +118,7 @@ class Binary:
         get, wanted = self._get_rates, self._output_references
         simple = m > 0 and not outputs and not timed and settle is None
         for t, x, u, f in rows:
-            if simple:  # most of all rows
+            if simple:  # the usual case
                 status = set_states(component, x, n) | set_inputs(component, references, m, u, m) | get(component, f, n)
             else:
                 status = set_states(component, x, n)
@@ -136,13 +139,13 @@ class Binary:
         return found
 
     def slopes(self, outputs: bool, time: Array, states: Array, inputs: Array, by: Sequence[int]) -> Array:
-        """Directional derivatives of rates or outputs by the quantities of these references, (S, len(by), k)."""
+        """Derivatives of rates or outputs by the variables of these references, (S, len(by), k)."""
         wanted = self._output_references if outputs else self._rate_references
         count = len(self.description.outputs if outputs else self.description.rates)
         found = np.empty((len(time), len(by), count))
         known = (c_uint * len(by))(*by)
-        one = c_double(1.0)
-        seed = ctypes.addressof(one)
+        unit = c_double(1.0)
+        seed = ctypes.addressof(unit)
         first = ctypes.addressof(known)
         columns = range(first, first + 4 * len(by), 4)
         set_time, set_states, set_inputs, component = self._set_time, self._set_states, self._set_reals, self._component
@@ -173,33 +176,33 @@ class Binary:
         self._recover(bad)
         return found
 
-    # loading it
+    # loading
 
     def _loaded(self) -> Any:
-        told, fmpy = self.description, the_library()
+        description, fmpy = self.description, the_library()
         from fmpy import fmi2, fmi3
 
         binaries = self.folder / "binaries"
-        library = binaries / _platform(told.version) / f"{told.identifier}{fmpy.sharedLibraryExtension}"
+        library = binaries / _platform(description.version) / f"{description.identifier}{fmpy.sharedLibraryExtension}"
         if not library.is_file():
-            raise FmuError(f"{told.path}: {_no_binary(self.folder, _platform(told.version))}")
-        kind = fmi2.FMU2Model if told.version == 2 else fmi3.FMU3Model
+            raise FmuError(f"{description.path}: {_no_binary(self.folder, _platform(description.version))}")
+        kind = fmi2.FMU2Model if description.version == 2 else fmi3.FMU3Model
         try:
             model = kind(
-                guid=told.token,
-                modelIdentifier=told.identifier,
+                guid=description.token,
+                modelIdentifier=description.identifier,
                 unzipDirectory=str(self.folder),
-                instanceName=told.name,
+                instanceName=description.name,
                 libraryPath=str(library),
             )
-            if told.version == 2:
+            if description.version == 2:
                 model.instantiate(callbacks=self._callbacks(fmi2))
             else:
                 model.instantiate(logMessage=self._log_of_3)
         except Exception as error:  # of FMPy, or of loading the binary
             reason = " ".join(str(error).split())
             raise FmuError(
-                f"{told.path}: its binary cannot be used ({reason}{self._said()}). Export it again."
+                f"{description.path}: its binary cannot be used ({reason}{self._quoted_messages()}). Export it again."
             ) from None
         return model
 
@@ -219,26 +222,26 @@ class Binary:
     def _log(self, message: bytes | None) -> None:
         self.messages = [*self.messages[1 - _KEPT :], (message or b"").decode("utf-8", errors="replace").strip()]
 
-    def _said(self) -> str:
-        return f"; it says: {'; '.join(self.messages)}" if self.messages else ""
+    def _quoted_messages(self) -> str:
+        return f"; its messages: {'; '.join(self.messages)}" if self.messages else ""
 
     def _failed(self, what: str) -> SimulationError:
-        return SimulationError(f"{self.description.path}: the FMU {what}{self._said()}.")
+        return SimulationError(f"{self.description.path}: the FMU {what}{self._quoted_messages()}.")
 
     def _recover(self, status: int) -> None:
-        """After an error nothing but a reset is allowed."""
+        """Reset the FMU after an error; no other call is allowed then."""
         if status >= _FATAL:
-            raise self._failed("failed for good")
+            raise self._failed("failed with a fatal error")
         if status > _WARNING + 1:
             parameters, self._parameters = self._parameters, None
             self.begin(parameters or ())
 
     def _prepare_functions(self) -> None:
-        told, library = self.description, self.model.dll
-        address, two = c_void_p, told.version == 2
+        description, library = self.description, self.model.dll
+        address, two = c_void_p, description.version == 2
 
         def function(name: str, *types: Any) -> Any:
-            found = library[f"fmi{told.version}{name}"]
+            found = library[f"fmi{description.version}{name}"]
             found.argtypes, found.restype = types, c_int
             return found
 
@@ -251,10 +254,10 @@ class Binary:
             "GetDerivatives" if two else "GetContinuousStateDerivatives", address, address, c_size_t
         )
         real = "Real" if two else "Float64"
-        # FMI 3.0 takes a second count; one of FMI 2.0 never looks at an argument that it does not have
+        # FMI 3.0 takes a second count, which a function of FMI 2.0 ignores
         self._set_reals = function(f"Set{real}", address, address, c_size_t, address, c_size_t)
         self._get_reals = function(f"Get{real}", address, address, c_size_t, address, c_size_t)
-        if told.derivatives:
+        if description.derivatives:
             ends = (address, address) if two else (address, c_size_t, address, c_size_t)
             self._directional = function(
                 "GetDirectionalDerivative", address, address, c_size_t, address, c_size_t, *ends
@@ -262,7 +265,7 @@ class Binary:
         self._enter_event = function("EnterEventMode", address)
         self._enter_continuous = function("EnterContinuousTimeMode", address)
         self._update = _updater(function, self._component, two)
-        self._kept = [_references(group) for group in (told.inputs, told.outputs, told.rates)]
+        self._kept = [_references(group) for group in (description.inputs, description.outputs, description.rates)]
         self._input_references, self._output_references, self._rate_references = map(ctypes.addressof, self._kept)
 
     # events
@@ -274,7 +277,7 @@ class Binary:
                 return
 
     def _settle(self) -> int:
-        """Solve the discrete equations at this moment; a status."""
+        """Solve the discrete equations at the current moment; returns the status."""
         status: int = self._enter_event(self._component)
         for _ in range(_MOST_ITERATIONS):
             more, again, jumped, ended = self._update()
@@ -282,7 +285,8 @@ class Binary:
             if jumped or ended:
                 raise self._failed(
                     f"{'resets its states' if jumped else 'ends its simulation'} at an event, which a diagnosis cannot "
-                    "follow: let its tool simulate the recording, and give what it wrote with `--simulator-output SIM.csv`"
+                    "follow: let its tool simulate the recording, and give its output with `--simulator-output "
+                    "SIM.csv`"
                 )
             if not again:
                 break
@@ -291,7 +295,7 @@ class Binary:
 
 
 def _updater(function: Callable[..., Any], component: int, two: bool) -> Callable[[], tuple[int, bool, bool, bool]]:
-    """A function that gives a status, and whether it has to be called again, states jumped, or all is over."""
+    """A function that returns the status, and whether to call it again, states have jumped, or the simulation ends."""
     if two:
         from fmpy.fmi2 import fmi2EventInfo
 
@@ -324,18 +328,18 @@ def _updater(function: Callable[..., Any], component: int, two: bool) -> Callabl
 
 
 def _references(quantities: Sequence[Any]) -> Any:
-    return (c_uint * max(1, len(quantities)))(*(one.reference for one in quantities))
+    return (c_uint * max(1, len(quantities)))(*(variable.reference for variable in quantities))
 
 
 def _addresses(rows: Array) -> range:
-    """Of each row of a table that lies in one piece."""
+    """The address of each row of a contiguous table."""
     start, step = rows.ctypes.data, 8 * max(1, rows[0].size) if len(rows) else 8
     return range(start, start + step * len(rows), step)
 
 
 def _call(function: Any, *arguments: Any) -> None:
     if function(*arguments) > _WARNING:
-        raise SimulationError("The FMU refuses to tell its states; export it again.")
+        raise SimulationError("The FMU does not return its states; export it again.")
 
 
 def _platform(version: int) -> str:
@@ -344,26 +348,26 @@ def _platform(version: int) -> str:
 
 
 def _no_binary(folder: Path, platform: str) -> str:
-    """What is there in place of a binary for this platform, and what to do."""
+    """The available binaries in place of the missing binary for this platform, and the remedy."""
     binaries = folder / "binaries"
-    there = sorted(one.name for one in binaries.iterdir() if one.is_dir()) if binaries.is_dir() else []
-    told = f"it has binaries for {', '.join(there)} alone" if there else "it has no binaries"
+    platforms = sorted(path.name for path in binaries.iterdir() if path.is_dir()) if binaries.is_dir() else []
+    available = f"it has binaries for {', '.join(platforms)} only" if platforms else "it has no binaries"
     if (folder / "sources").is_dir():
         return (
-            f"{told}, and none for {platform}, but its sources are in it; `fmpy compile MODEL.fmu` makes one of them."
+            f"{available}, and none for {platform}, but it contains its sources; `fmpy compile MODEL.fmu` compiles them."
         )
-    return f"{told}, and none for {platform}; export it for {platform}, or with its sources."
+    return f"{available}, and none for {platform}; export it for {platform}, or with its sources."
 
 
 def _extracted(description: Description) -> Path:
-    """A folder of the FMU's files, which goes when the process that made it ends."""
+    """A temporary folder with the FMU's files, which is removed when this process ends."""
     folder = Path(tempfile.mkdtemp(prefix="mkc_fmu_"))
     atexit.register(_remove, folder, os.getpid())
     try:
         the_library().extract(str(description.path), str(folder))
     except Exception as error:  # of FMPy or zipfile, over a damaged archive
-        told = " ".join(str(error).split())
-        raise FmuError(f"{description.path}: the FMU cannot be unpacked ({told}). Export it again.") from None
+        reason = " ".join(str(error).split())
+        raise FmuError(f"{description.path}: the FMU cannot be unpacked ({reason}). Export it again.") from None
     return folder
 
 

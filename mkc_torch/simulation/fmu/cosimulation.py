@@ -1,4 +1,4 @@
-"""An FMU for co-simulation alone: simulated by its own solver, and compared as what a simulator wrote."""
+"""An FMU for co-simulation only: simulated by its own solver, and compared like a simulator's output."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["Simulated"]
 
 
 class Simulated:
-    """An FMU with a solver of its own, driven by a recording's inputs; its parameters stay as they are.
+    """An FMU with its own solver, driven by a recording's inputs; its parameters are not fitted.
 
     Args:
-        description: of the FMU.
+        description: description of the FMU.
     """
 
     name = Paired.name
@@ -34,11 +34,11 @@ class Simulated:
 
     @property
     def columns(self) -> frozenset[str]:
-        told = self.description
-        return frozenset({"time", "experiment", *(one.label for one in (*told.inputs, *told.outputs))})
+        variables = (*self.description.inputs, *self.description.outputs)
+        return frozenset({"time", "experiment", *(variable.label for variable in variables)})
 
     def prepare(self, recording: Recording) -> PreparedPaired:
-        """What the FMU makes of the recording's inputs, beside the recording.
+        """The FMU's output for the recording's inputs, together with the recording.
 
         Raises:
             MissingColumnError: the recording lacks ``time`` or an input.
@@ -47,20 +47,20 @@ class Simulated:
         return Paired(self.simulated(recording)).prepare(recording)
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
-        """The same with known parameters on a new recording."""
+        """The FMU's output with corrections for a new recording."""
         return Paired(self.simulated(recording)).correction(state, recording)
 
     def simulated(self, recording: Recording) -> Recording:
-        """The outputs that the recording has too, and the inputs, at its times."""
-        told = self.description
-        outputs = [one.label for one in told.outputs if one.label in recording]
+        """The simulated outputs that are columns of the recording, and the inputs, at its times."""
+        description = self.description
+        outputs = [output.label for output in description.outputs if output.label in recording]
         if not outputs:
             raise SimulationError(
-                f"{told.path}: none of the FMU's outputs is a column of the recording. It has "
-                f"{', '.join(one.label for one in told.outputs) or 'none'}; the recording has "
-                f"{', '.join(recording.names)}. Say which column is which, --columns NAME=COLUMN."
+                f"{description.path}: none of the FMU's outputs is a column of the recording. It has "
+                f"{', '.join(output.label for output in description.outputs) or 'none'}; the recording has "
+                f"{', '.join(recording.names)}. Assign the columns with --columns NAME=COLUMN."
             )
-        inputs = [one.label for one in told.inputs]
+        inputs = [variable.label for variable in description.inputs]
         table = recording.finite("time", *inputs)
         runs = table["experiment"] if "experiment" in table else torch.zeros(len(table))
         parts = [self._run(table, runs == run, inputs, outputs) for run in runs.unique(sorted=True)]
@@ -70,7 +70,7 @@ class Simulated:
         if "experiment" in table:
             columns["experiment"] = torch.cat([part["experiment"] for part in parts])
             labels = {name: label for name, label in table.labels.items() if name == "experiment"}
-        return Recording(columns, name=told.path.stem, labels=labels)
+        return Recording(columns, name=description.path.stem, labels=labels)
 
     def _run(self, table: Recording, rows: Tensor, inputs: list[str], outputs: list[str]) -> dict[str, Tensor]:
         time, order = table["time"][rows].sort()
@@ -95,9 +95,9 @@ class Simulated:
                 output=outputs,
                 logger=lambda *_: None,
             )
-        except Exception as error:  # FMPy has a plain Exception for most of what fails
-            told = " ".join(str(error).split())
-            raise FmuError(f"{self.description.path}: its simulation failed: {told}.") from None
+        except Exception as error:  # FMPy raises a plain Exception for most failures
+            reason = " ".join(str(error).split())
+            raise FmuError(f"{self.description.path}: its simulation failed: {reason}.") from None
         at = torch.from_numpy(np.ascontiguousarray(found["time"])).double()
         columns = {name: torch.from_numpy(np.ascontiguousarray(found[name])).double() for name in outputs}
         columns |= {

@@ -1,4 +1,4 @@
-"""What an FMU's modelDescription.xml says, as a diagnosis needs it, or why it cannot be used."""
+"""The content of an FMU's modelDescription.xml that a diagnosis needs."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _EXTRA = 'FMUs are read by FMPy, which is not installed; install it with `pip in
 
 
 class FmuError(ValueError):
-    """An FMU that cannot be used; the sentence says why, and what to do."""
+    """An FMU that cannot be used; the message states why, and the remedy."""
 
 
 @dataclass(frozen=True)
 class FmuVariable:
-    """A real number of the FMU.
+    """A real variable of an FMU.
 
     Attributes:
-        name: as an attribute, letters, digits and _ alone.
-        label: as the FMU calls it, such as "body.phi[1]".
-        reference: by which the FMU knows it.
-        unit: in the notation of this package.
+        name: name as a Python identifier.
+        label: name in the FMU, such as "body.phi[1]".
+        reference: value reference in the FMU.
+        unit: unit in the notation of this package.
     """
 
     name: str
@@ -43,19 +43,20 @@ class FmuVariable:
 
 @dataclass(frozen=True)
 class Description:
-    """An FMU for model exchange, or for co-simulation alone.
+    """The description of an FMU for model exchange, or for co-simulation only.
 
     Attributes:
-        path: of the file.
-        version: of FMI, 2 or 3.
-        name: of the model, as an identifier.
-        token, identifier: by which its binary is instantiated and found.
-        exchange: whether it is for model exchange: without, its tool's own solver is in it.
-        states, inputs, outputs: continuous real numbers; rates: those of the states, in their order.
-        parameters: the fixed and tunable ones, with what each starts from.
-        events: number of its event indicators.
-        derivatives: whether it gives directional derivatives.
-        timeless: whether it says of all rates and outputs what they depend on, and time is not among it.
+        path: path of the file.
+        version: version of FMI, 2 or 3.
+        name: name of the model, as an identifier.
+        token, identifier: GUID and model identifier, by which its binary is instantiated and found.
+        exchange: whether it is for model exchange; otherwise it contains its tool's solver.
+        states, inputs, outputs: the continuous real variables.
+        rates: the derivatives of the states, in the same order.
+        parameters: the fixed and tunable parameters, with start values and bounds.
+        events: number of event indicators.
+        derivatives: whether it has directional derivatives.
+        timeless: whether it declares the dependencies of all rates and outputs, and none depends on time.
     """
 
     path: Path
@@ -75,10 +76,10 @@ class Description:
 
 
 def the_library() -> Any:
-    """FMPy.
+    """The module fmpy.
 
     Raises:
-        ImportError: it is not installed.
+        ImportError: FMPy is not installed.
     """
     try:
         import fmpy
@@ -88,39 +89,39 @@ def the_library() -> Any:
 
 
 def read_description(path: Path) -> Description:
-    """What an FMU says of itself.
+    """Read the description of an FMU.
 
     Raises:
-        FmuError: no file, a damaged one, one of another version of FMI, one without equations, or parameters without a
-            value to start from.
+        FmuError: no such file, a damaged file, an unsupported version of FMI, no equations, or parameters without start
+            values.
         ImportError: FMPy is not installed.
     """
-    told = _read(path)
-    version = int(told.fmiVersion.partition(".")[0])
-    kind = told.modelExchange or told.coSimulation
+    model = _read(path)
+    version = int(model.fmiVersion.partition(".")[0])
+    kind = model.modelExchange or model.coSimulation
     if kind is None:
         raise FmuError(
             f"{path}: this FMU is for scheduled execution only; export it for model exchange, or for co-simulation."
         )
-    exchange = told.modelExchange is not None
-    variables = told.modelVariables
-    names = _names([one for one in variables if one.type in _REAL])
-    rates = [one.variable for one in told.derivatives if one.variable is not None]
-    states = [one.derivative for one in rates]
+    exchange = model.modelExchange is not None
+    variables = model.modelVariables
+    names = _names([variable for variable in variables if variable.type in _REAL])
+    rates = [unknown.variable for unknown in model.derivatives if unknown.variable is not None]
+    states = [rate.derivative for rate in rates]
     if exchange and not states:
         raise FmuError(
             f"{path}: this FMU has no continuous states, so there is no differential equation in it; let its tool "
-            "simulate the recording, and give what it wrote with `--simulator-output SIM.csv`."
+            "simulate the recording, and give its output with `--simulator-output SIM.csv`."
         )
-    if any(one is None or one.dimensions or one.type not in _REAL for one in [*rates, *states]):
+    if any(item is None or item.dimensions or item.type not in _REAL for item in [*rates, *states]):
         raise FmuError(f"{path}: a state of this FMU is no single real number; export its states one by one.")
-    inputs = [one for one in variables if one.causality == "input" and _single(one)]
-    outputs = [one for one in variables if one.causality == "output" and _single(one) and not _same(one, rates)]
+    inputs = [item for item in variables if item.causality == "input" and _single(item)]
+    outputs = [item for item in variables if item.causality == "output" and _single(item) and not _same(item, rates)]
     return Description(
         path=path,
         version=version,
-        name=re.sub(r"\W", "_", told.modelName or path.stem).lstrip("0123456789") or "Model",
-        token=told.guid,
+        name=re.sub(r"\W", "_", model.modelName or path.stem).lstrip("0123456789") or "Model",
+        token=model.guid,
         identifier=kind.modelIdentifier,
         exchange=exchange,
         states=_quantities(states, names),
@@ -128,11 +129,11 @@ def read_description(path: Path) -> Description:
         inputs=_quantities(inputs, names),
         outputs=_quantities(outputs, names),
         parameters=dict(_parameters(path, variables, names)),
-        events=len(told.eventIndicators) if version == 3 else int(told.numberOfEventIndicators or 0),
+        events=len(model.eventIndicators) if version == 3 else int(model.numberOfEventIndicators or 0),
         derivatives=bool(getattr(kind, "providesDirectionalDerivative", False)
                          or getattr(kind, "providesDirectionalDerivatives", False)),
-        timeless=all(one.dependencies is not None and not any(by.causality == "independent" for by in one.dependencies)
-                     for one in (*told.outputs, *told.derivatives)),
+        timeless=all(item.dependencies is not None and all(by.causality != "independent" for by in item.dependencies)
+                     for item in (*model.outputs, *model.derivatives)),
     )  # fmt: skip
 
 
@@ -145,9 +146,9 @@ def _read(path: Path) -> Any:
         if version not in ("2", "3"):
             raise FmuError(
                 f"{path}: this FMU is of FMI {version}; FMI 2.0 and 3.0 are read. Export it as one of these, or let "
-                "its tool simulate the recording, and give what it wrote with `--simulator-output SIM.csv`."
+                "its tool simulate the recording, and give its output with `--simulator-output SIM.csv`."
             )
-        # from a folder: of an archive that it fails to read it leaves the file open
+        # from a folder: FMPy leaves an archive open if it fails to read it
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(path) as archive:
             archive.extract("modelDescription.xml", folder)
             return fmpy.read_model_description(folder, validate=False)
@@ -157,15 +158,15 @@ def _read(path: Path) -> Any:
         raise FmuError(f"{path}: this is no FMU, or a damaged one: it is no zip archive. Export it again.") from None
     except OSError:
         raise
-    except Exception as error:  # whatever the parser meets
-        told = " ".join(str(error).split())
+    except Exception as error:  # any error of the parser
+        reason = " ".join(str(error).split())
         raise FmuError(
-            f"{path}: its modelDescription.xml cannot be understood ({told[:200]}). Export the FMU again."
+            f"{path}: its modelDescription.xml cannot be parsed ({reason[:200]}). Export the FMU again."
         ) from None
 
 
 def _version(path: Path) -> str:
-    """The major version of FMI, or what stands in its place."""
+    """The major version of FMI if it is supported, else the text of the version."""
     with zipfile.ZipFile(path) as archive:
         if "modelDescription.xml" not in archive.namelist():
             raise FmuError(
@@ -174,7 +175,7 @@ def _version(path: Path) -> str:
         with archive.open("modelDescription.xml") as file:
             head = file.read(4096).decode("utf-8", errors="replace")
     found = re.search(r"fmiVersion\s*=\s*[\"']\s*([^\"']*)", head)
-    text = found[1] if found else "no version that it tells"
+    text = found[1] if found else "no stated version"
     return text.partition(".")[0] if text.startswith(("2.", "3.")) else text
 
 
@@ -187,25 +188,28 @@ def _same(variable: Any, others: Iterable[Any]) -> bool:
 
 
 def _names(variables: Sequence[Any]) -> dict[int, str]:
-    """A name that can be an attribute for each variable, by its identity."""
+    """A Python identifier for each variable: id of the variable to name."""
     found: dict[int, str] = {}
     taken: set[str] = set()
-    for one in variables:
-        plain = re.sub(r"\W+", "_", one.name).strip("_") or "variable"
+    for variable in variables:
+        plain = re.sub(r"\W+", "_", variable.name).strip("_") or "variable"
         name = plain if plain[0].isalpha() or plain[0] == "_" else f"v_{plain}"
         number, first = 2, name
         while name in taken:
             name, number = f"{first}_{number}", number + 1
         taken.add(name)
-        found[id(one)] = name
+        found[id(variable)] = name
     return found
 
 
 def _quantities(variables: Sequence[Any], names: Mapping[int, str]) -> tuple[FmuVariable, ...]:
-    return tuple(FmuVariable(names[id(one)], one.name, one.valueReference, _told(one, "unit")) for one in variables)
+    return tuple(
+        FmuVariable(names[id(item)], item.name, item.valueReference, _attribute(item, "unit")) for item in variables
+    )
 
 
-def _told(variable: Any, what: str) -> str:
+def _attribute(variable: Any, what: str) -> str:
+    """An attribute of a variable or of its declared type; empty if neither has it."""
     value = getattr(variable, what) or getattr(variable.declaredType, what, None)
     return unit_of(value) if what == "unit" else value or ""
 
@@ -213,24 +217,24 @@ def _told(variable: Any, what: str) -> str:
 def _parameters(
     path: Path, variables: Sequence[Any], names: Mapping[int, str]
 ) -> Iterable[tuple[FmuVariable, Parameter]]:
-    for one in variables:
-        if one.causality != "parameter" or one.variability not in ("fixed", "tunable") or not _single(one):
+    for item in variables:
+        if item.causality != "parameter" or item.variability not in ("fixed", "tunable") or not _single(item):
             continue
-        if one.start in (None, ""):
+        if item.start in (None, ""):
             raise FmuError(
-                f"{path}: its parameter {one.name} has no start, which FMI asks for; export it with a value, or make "
+                f"{path}: its parameter {item.name} has no start, which FMI requires; export it with a value, or make "
                 "it a constant."
             )
-        numbers = [_number(path, one.name, _told(one, what) or other) for what, other in
-                   (("min", -math.inf), ("max", math.inf))]  # fmt: skip
-        start = _number(path, one.name, one.start)
-        if numbers[0] == numbers[1]:
-            continue  # it cannot be another
-        (quantity,) = _quantities([one], names)
+        bounds = [_number(path, item.name, _attribute(item, what) or other) for what, other in
+                  (("min", -math.inf), ("max", math.inf))]  # fmt: skip
+        start = _number(path, item.name, item.start)
+        if bounds[0] == bounds[1]:
+            continue  # it has a single possible value
+        (quantity,) = _quantities([item], names)
         try:
-            parameter = Parameter(start, numbers[0], numbers[1], quantity.unit)
+            parameter = Parameter(start, bounds[0], bounds[1], quantity.unit)
         except ValueError as error:
-            raise FmuError(f"{path}: its parameter {one.name} cannot be fitted: {error}") from None
+            raise FmuError(f"{path}: its parameter {item.name} cannot be fitted: {error}") from None
         yield quantity, parameter
 
 
@@ -238,4 +242,4 @@ def _number(path: Path, name: str, text: Any) -> float:
     try:
         return float(text)
     except ValueError:
-        raise FmuError(f"{path}: of its parameter {name} a value is {text!r}, which is no number.") from None
+        raise FmuError(f"{path}: its parameter {name} has the value {text!r}, which is not a number.") from None

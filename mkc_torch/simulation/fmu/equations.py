@@ -1,4 +1,4 @@
-"""An FMU for model exchange as differential equations like a user's own."""
+"""An FMU for model exchange as differential equations, like a user's own."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ if TYPE_CHECKING:
 __all__ = ["FmuDynamics", "fmu_class", "is_of_an_fmu", "load_fmu"]
 
 _PROBES = 7
+"""Number of points at which an FMU is tested."""
 
 
 class FmuDynamics(Dynamics):
-    """The equations of an FMU; :func:`fmu_class` makes a class of one, with its names, parameters and units.
+    """The equations of an FMU; :func:`fmu_class` makes a class of an FMU, with its names, parameters and units.
 
-    All real parameters that are fixed or tunable are fitted, within min and max. A state that an output of the FMU is
-    the value of has that output's name. A recording may call its columns as the FMU does, "body.phi", or by names that
-    can be attributes, "body_phi". What is compared are those outputs and states that are its columns.
+    All fixed and tunable real parameters are fitted, within min and max. A state that equals an output has the output's
+    name. Columns of a recording may have the names in the FMU, "body.phi", or Python identifiers, "body_phi". The
+    outputs and states that are columns of the recording are compared.
 
-    Effects act beside the FMU: on the rates that it gives, on the inputs that it is given and on its outputs.
+    Effects act outside the FMU: on its rates, its inputs and its outputs.
 
     Attributes:
-        evaluation: of the FMU.
-        of_states: names of the FMU's own states; a class derived from this one may have more.
-        shown: outputs that are no states, by their place among the FMU's outputs.
-        labels: what the FMU itself calls states, inputs and outputs.
+        evaluation: evaluation of the FMU.
+        of_states: names of the FMU's states; a derived class may have more states.
+        shown: outputs that are not states: name to index among the FMU's outputs.
+        labels: names of states, inputs and outputs in the FMU.
     """
 
     evaluation: ClassVar[Evaluation]
@@ -54,18 +55,18 @@ class FmuDynamics(Dynamics):
 
     def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
         found = dict(vars(x))
-        asked = [name for name in self.shown if not self.outputs or name in self.outputs]
-        if asked:
+        names = [name for name in self.shown if not self.outputs or name in self.outputs]
+        if names:
             values = self._evaluated(True, time, x, u, p)
-            found |= {name: values[..., self.shown[name]] for name in asked}
+            found |= {name: values[..., self.shown[name]] for name in names}
         return found
 
     def prepare(self, recording: Recording) -> PreparedDynamics:
-        """The simulation of a recording.
+        """The simulation together with a recording.
 
         Raises:
             MissingColumnError: the recording lacks ``time`` or an input.
-            SimulationError: none of the outputs is a column of it.
+            SimulationError: none of the outputs is a column of the recording.
         """
         recording = self._renamed(recording)
         known = (*self.shown, *self.of_states)
@@ -74,7 +75,7 @@ class FmuDynamics(Dynamics):
             labels = ", ".join(dict.fromkeys(self.labels.get(name, name) for name in known))
             raise SimulationError(
                 f"{self.name}: none of the FMU's outputs and states is a column of the recording. It has {labels}; the "
-                f"recording has {', '.join(recording.names)}. Say which column is which, --columns NAME=COLUMN."
+                f"recording has {', '.join(recording.names)}. Assign the columns with --columns NAME=COLUMN."
             )
         own = type(self)()
         own.__dict__.update(self.__dict__)
@@ -82,12 +83,12 @@ class FmuDynamics(Dynamics):
         return PreparedDynamics(own, recording.finite("time", *own.inputs, *measured).sorted_by_time(), measured)
 
     def __reduce__(self) -> Any:
-        if is_of_an_fmu(type(self)):  # such a class has no name by which it could be imported
+        if is_of_an_fmu(type(self)):  # such a class cannot be imported by name
             return load_fmu, (str(self.evaluation.description.path),)
         return object.__reduce__(self)
 
     def _renamed(self, recording: Recording) -> Recording:
-        """Columns that are called as the FMU calls them, by names that can be attributes."""
+        """The recording with Python identifiers in place of the FMU's names of columns."""
         new = {label: name for name, label in self.labels.items() if label in recording and name not in recording}
         if not new:
             return recording
@@ -105,18 +106,18 @@ class FmuDynamics(Dynamics):
         inputs = states.new_zeros(rows, 0)
         if self.inputs:
             inputs = torch.stack([getattr(u, name).expand(rows) for name in self.inputs], -1)
-        known = [getattr(p, one.name) for one in self.evaluation.description.parameters]
+        known = [getattr(p, variable.name) for variable in self.evaluation.description.parameters]
         parameters = torch.stack(known) if known else states.new_zeros(0)
         return evaluated(self.evaluation, outputs, time.expand(rows), states, inputs, parameters)
 
 
 def load_fmu(path: str | Path) -> FmuDynamics | Simulated:
-    """The simulation that is in an FMU, whose binary is run.
+    """Load the simulation in an FMU, whose binary is run.
 
-    One for co-simulation alone brings its own solver: what it simulates is compared as the output of a simulator.
+    An FMU for co-simulation only has its own solver: it is compared like the output of a simulator.
 
     Raises:
-        FmuError: it cannot be used.
+        FmuError: the FMU cannot be used.
         ImportError: FMPy is not installed.
     """
     described = read_description(Path(path))
@@ -124,29 +125,29 @@ def load_fmu(path: str | Path) -> FmuDynamics | Simulated:
 
 
 def fmu_class(path: str | Path, file: str | None = None) -> type[FmuDynamics]:
-    """A class of the equations in an FMU, to derive from as from :class:`mkc_torch.simulation.Dynamics`.
+    """A class of the equations in an FMU, to derive from like :class:`mkc_torch.simulation.Dynamics`.
 
     Args:
-        path: of the FMU.
-        file: ``__file__`` of the one that asks, from whose folder the path goes; None for the folder of the call.
+        path: path of the FMU.
+        file: ``__file__`` of the calling file, to whose folder the path is relative; None for the current folder.
 
     Raises:
-        FmuError: it cannot be used, or is for co-simulation alone.
+        FmuError: the FMU cannot be used, or is for co-simulation only.
         ImportError: FMPy is not installed.
     """
     place = Path(path)
     if file is not None:
         folder = Path(file).resolve().parent
         places = [folder / path, folder / place.name, Path.cwd() / place.name]
-        place = next((one for one in places if one.is_file()), places[0])
+        place = next((path for path in places if path.is_file()), places[0])
     described = read_description(place)
     if not described.exchange:
-        raise FmuError(f"{place}: this FMU is for co-simulation alone; export it for model exchange.")
+        raise FmuError(f"{place}: this FMU is for co-simulation only; export it for model exchange.")
     return _class_of(described)
 
 
 def is_of_an_fmu(kind: type) -> TypeGuard[type[FmuDynamics]]:
-    """Whether a class is that of an FMU, as :func:`fmu_class` makes it, and not one derived from it.
+    """Whether a class was made by :func:`fmu_class`, and not derived from such a class.
 
     Example:
         >>> is_of_an_fmu(dict)
@@ -157,22 +158,24 @@ def is_of_an_fmu(kind: type) -> TypeGuard[type[FmuDynamics]]:
 
 def _class_of(described: Description) -> type[FmuDynamics]:
     evaluation = Evaluation(described)
-    if not evaluation.binary.begin([one.value for one in described.parameters.values()]):
-        said = "; ".join(evaluation.binary.messages)
+    if not evaluation.binary.begin([parameter.value for parameter in described.parameters.values()]):
+        messages = "; ".join(evaluation.binary.messages)
         raise FmuError(
-            f"{described.path}: the FMU cannot be initialised with its own start values{f' ({said})' if said else ''}."
+            f"{described.path}: the FMU cannot be initialised with its own start values"
+            f"{f' ({messages})' if messages else ''}."
         )
     first = evaluation.binary.first_states()
     _refuse_memory(evaluation, first)
     evaluation.binary.timed = not (described.timeless and _is_timeless(evaluation, first))
     names = _names_of_states(evaluation, first)
-    shown = {one.name: k for k, one in enumerate(described.outputs) if one.name not in names.values()}
+    shown = {output.name: k for k, output in enumerate(described.outputs) if output.name not in names.values()}
     states = tuple(names.values())
     quantities = [*described.inputs, *described.outputs]
-    labels = {one.name: one.label for one in quantities}
-    labels |= {names[one]: one.label for one in described.states if names[one] not in labels}
+    labels = {quantity.name: quantity.label for quantity in quantities}
+    labels |= {names[state]: state.label for state in described.states if names[state] not in labels}
     own = zip(described.states, states, strict=True)
-    units = {one.name: one.unit for one in quantities if one.unit} | {name: one.unit for one, name in own if one.unit}
+    units = {quantity.name: quantity.unit for quantity in quantities if quantity.unit}
+    units |= {name: state.unit for state, name in own if state.unit}
     body = {
         "__doc__": f"The equations of {described.path.name}.",
         "evaluation": evaluation,
@@ -180,8 +183,8 @@ def _class_of(described: Description) -> type[FmuDynamics]:
         "shown": shown,
         "labels": labels,
         "states": states,
-        "inputs": tuple(one.name for one in described.inputs),
-        "parameters": {one.name: parameter for one, parameter in described.parameters.items()},
+        "inputs": tuple(variable.name for variable in described.inputs),
+        "parameters": {variable.name: parameter for variable, parameter in described.parameters.items()},
         "units": units,
         "initial": dict(zip(states, first.tolist(), strict=True)),
     }
@@ -189,33 +192,33 @@ def _class_of(described: Description) -> type[FmuDynamics]:
 
 
 def _probes(evaluation: Evaluation, first: NDArray[np.float64]) -> EvaluationPoints:
-    """A few moments about where the FMU starts; the same ones each time."""
+    """A few fixed random points near the FMU's initial states."""
     described = evaluation.description
     scattered = np.random.default_rng(0).uniform(0.1, 1.0, (_PROBES, len(first) + len(described.inputs)))
     n = len(first)
     states = first * (1.0 + 0.1 * scattered[:, :n]) + np.where(first == 0.0, scattered[:, :n], 0.0)
-    values = np.array([one.value for one in described.parameters.values()])
+    values = np.array([parameter.value for parameter in described.parameters.values()])
     return EvaluationPoints(np.arange(_PROBES, dtype=np.float64), states, scattered[:, n:], values)
 
 
 def _is_timeless(evaluation: Evaluation, first: NDArray[np.float64]) -> bool:
-    """Whether another time changes nothing: one that need not be set is set a third of the calls less."""
+    """Whether rates and outputs do not depend on time; without setting the time, a third of the calls is saved."""
     if evaluation.description.events:
         return False
     time, states, inputs, parameters = _probes(evaluation, first).parts
     for outputs in (False, True):
-        one, other = (
-            evaluation.values(outputs, EvaluationPoints(time + more, states, inputs, parameters)) for more in (0, 0.7)
+        early, late = (
+            evaluation.values(outputs, EvaluationPoints(time + shift, states, inputs, parameters)) for shift in (0, 0.7)
         )
-        if not np.array_equal(one, other, equal_nan=True):
+        if not np.array_equal(early, late, equal_nan=True):
             return False
     return True
 
 
 def _names_of_states(evaluation: Evaluation, first: NDArray[np.float64]) -> dict[FmuVariable, str]:
-    """Names of the states: that of an output which is nothing but the state, else its own."""
+    """Names of the states: the name of an output that equals the state, else its own name."""
     described = evaluation.description
-    names = {one: one.name for one in described.states}
+    names = {state: state.name for state in described.states}
     if described.outputs:
         at = _probes(evaluation, first)
         values = evaluation.values(True, at)
@@ -228,7 +231,7 @@ def _names_of_states(evaluation: Evaluation, first: NDArray[np.float64]) -> dict
 
 
 def _refuse_memory(evaluation: Evaluation, first: NDArray[np.float64]) -> None:
-    """Refuses an FMU whose rates depend on what it was asked before: a state of its own that events change."""
+    """Refuse an FMU whose rates depend on previous evaluations: it has a discrete state that events change."""
     if not evaluation.description.events:
         return
     at = _probes(evaluation, first)
@@ -237,7 +240,7 @@ def _refuse_memory(evaluation: Evaluation, first: NDArray[np.float64]) -> None:
     back = evaluation.values(False, EvaluationPoints(time[::-1], states[::-1], inputs[::-1], parameters))[::-1]
     if not np.array_equal(plain, back, equal_nan=True):
         raise FmuError(
-            f"{evaluation.description.path}: the FMU's rates depend on events before, as of a hysteresis or a clock, "
-            "which a diagnosis cannot follow: let its tool simulate the recording, and give what it wrote with "
+            f"{evaluation.description.path}: the FMU's rates depend on earlier events, as of a hysteresis or a clock, "
+            "which a diagnosis cannot follow: let its tool simulate the recording, and give its output with "
             "`--simulator-output SIM.csv`."
         )

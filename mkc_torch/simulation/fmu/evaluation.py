@@ -1,4 +1,4 @@
-"""Values and slopes of an FMU's equations at many moments at once, none of them computed twice in a row."""
+"""Values and derivatives of an FMU's equations at many points, with a cache of the last results."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ Group = Literal["states", "inputs", "parameters"]
 GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
 
 _REMEMBERED = 8
-"""Answers that are kept: Newton's method asks again where it has just been, and a fit where it ended."""
+"""Number of cached results: Newton's method repeats its last points, and a fit its final point."""
 
 _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
-"""Of a central difference, as a share of the size of what is moved: rounding and curvature then do about the same."""
+"""Relative step of a central difference, at which the errors by rounding and by curvature are similar."""
 
 _STRAIGHT = 1e-8
-"""Share by which slopes over steps of two sizes may differ where a curve is held to be straight."""
+"""Relative difference of slopes over two step sizes up to which a function counts as affine."""
 
 _AGREE = 1e-4
-"""Share by which a directional derivative may be off a difference before it is not trusted."""
+"""Relative difference between directional derivative and central difference up to which the former is used."""
 
 
 class EvaluationPoints:
-    """Times (S,), states (S, n), inputs (S, m) and parameters (p,), in one piece each."""
+    """Times (S,), states (S, n), inputs (S, m) and parameters (p,), as contiguous arrays."""
 
     def __init__(self, time: Array, states: Array, inputs: Array, parameters: Array) -> None:
-        self.parts = tuple(np.ascontiguousarray(one, np.float64) for one in (time, states, inputs, parameters))
+        self.parts = tuple(np.ascontiguousarray(part, np.float64) for part in (time, states, inputs, parameters))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, EvaluationPoints) and all(map(np.array_equal, self.parts, other.parts))
@@ -46,14 +46,14 @@ class EvaluationPoints:
     __hash__ = None  # type: ignore[assignment]
 
     def new(self) -> NDArray[np.bool_]:
-        """(S,), whether a moment is another than the one before it: the end of an interval is the next one's start."""
+        """(S,), whether a point differs from the previous one: the end of an interval is the start of the next."""
         table = np.concatenate([self.parts[0][:, None], *self.parts[1:3]], 1)
         new = np.ones(len(table), np.bool_)
         new[1:] = (table[1:] != table[:-1]).any(1)
         return new
 
     def same(self, other: EvaluationPoints) -> NDArray[np.bool_]:
-        """(S,), which of these are the same in another: the ends of intervals, where their middles have moved."""
+        """(S,), which points equal those of ``other``, such as the ends of intervals whose middles have moved."""
         if len(other.parts[0]) != len(self.parts[0]) or not np.array_equal(self.parts[3], other.parts[3]):
             return np.zeros(len(self.parts[0]), np.bool_)
         alike = self.parts[0] == other.parts[0]
@@ -62,15 +62,16 @@ class EvaluationPoints:
         return alike
 
     def rows(self, which: Any) -> tuple[Array, Array, Array]:
+        """Times, states and inputs of some of the points."""
         time, states, inputs, _ = self.parts
         return _rows((time, states, inputs), which)
 
 
 class Evaluation:
-    """An FMU as a function: of time, states, inputs and parameters to rates, or to outputs.
+    """An FMU as a function of time, states, inputs and parameters that returns rates or outputs.
 
     Args:
-        description: of the FMU; its binary is loaded when it is first needed, in each process.
+        description: description of the FMU; its binary is loaded at the first use in each process.
     """
 
     def __init__(self, description: Description) -> None:
@@ -94,18 +95,18 @@ class Evaluation:
         return self._binary
 
     def values(self, outputs: bool, at: EvaluationPoints) -> Array:
-        """Rates of the states, or outputs, (S, k); NaN where the FMU has none."""
+        """The rates of the states, or the outputs, (S, k); NaN where the FMU fails."""
 
         def computed() -> Array:
             new = at.new()
             before, known = self._last.get(outputs, (None, None))
             same = at.same(before) if before is not None else np.zeros_like(new)
-            asked = new & ~same
-            told = self.description
-            found = np.empty((len(new), len(told.outputs if outputs else told.rates)))
+            missing = new & ~same
+            description = self.description
+            found = np.empty((len(new), len(description.outputs if outputs else description.rates)))
             if known is not None and same.any():
                 found[same] = known[same]
-            found[asked] = self._plain(outputs, at.rows(asked), at.parts[3])
+            found[missing] = self._plain(outputs, at.rows(missing), at.parts[3])
             found = found[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
             self._last[outputs] = at, found
             return found
@@ -113,7 +114,7 @@ class Evaluation:
         return self._remembered(("values", outputs), at, computed)
 
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
-        """Of rates or outputs by each of a group, (S, k, size of the group)."""
+        """Derivatives of rates or outputs by each variable of a group, (S, k, size of the group)."""
 
         def computed() -> Array:
             new = at.new()
@@ -134,19 +135,19 @@ class Evaluation:
 
     def _plain(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
         if not self.binary.begin(parameters.tolist()):
-            told = self.description
-            return np.full((len(rows[0]), len(told.outputs if outputs else told.rates)), np.nan)
+            description = self.description
+            return np.full((len(rows[0]), len(description.outputs if outputs else description.rates)), np.nan)
         return self.binary.values(outputs, *rows)
 
     def _columns(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array | None
     ) -> Array:
-        told = self.description
-        quantities = list(getattr(told, group))
+        description = self.description
+        quantities = list(getattr(description, group))
         trusted = [self._is_trusted(outputs, rows, given, group, k) for k in range(len(quantities))]
-        count = len(told.outputs if outputs else told.rates)
+        count = len(description.outputs if outputs else description.rates)
         found = np.empty((len(rows[0]), count, len(quantities)))
-        by = [k for k, one in enumerate(trusted) if one]
+        by = [k for k, usable in enumerate(trusted) if usable]
         if by and self.binary.begin(given.tolist()):
             references = [quantities[k].reference for k in by]
             found[:, :, by] = self.binary.slopes(outputs, *rows, references).swapaxes(1, 2)
@@ -162,30 +163,30 @@ class Evaluation:
         return found
 
     def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
-        """Whether rates go straight with a parameter, tried once at a few moments: one step then tells the slope.
+        """Whether rates are affine in a parameter, tested once at a few points: a single step then gives the derivative.
 
-        Where they do not after all, elsewhere, the step is still a small one.
+        Where they are not affine at other points, the step is still small.
         """
         if (outputs, place) not in self._affine:
             few = _rows(rows, slice(None, None, max(1, len(rows[0]) // 16)))
             base = self._plain(outputs, few, given)
             step = self._step_within(given, place)
-            one, other = (self._beyond(outputs, few, given, place, base, step * more) for more in (1.0, 30.0))
+            near, far = (self._beyond(outputs, few, given, place, base, step * more) for more in (1.0, 30.0))
             rounding = 8.0 * np.finfo(np.float64).eps * np.abs(base).max(initial=0.0) / abs(step)
-            close = np.abs(one - other) <= _STRAIGHT * np.abs(other).max(initial=0.0) + rounding
+            close = np.abs(near - far) <= _STRAIGHT * np.abs(far).max(initial=0.0) + rounding
             self._affine[outputs, place] = bool(close.all())
         return self._affine[outputs, place]
 
     def _beyond(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int, base: Array, step: float
     ) -> Array:
-        """The slope by a parameter, (S, k), by one step from where it is."""
+        """The derivative by a parameter, (S, k), by a one-sided difference."""
         moved = given.copy()
         moved[place] += step
         return (self._plain(outputs, rows, moved) - base) / (moved[place] - given[place])
 
     def _step_within(self, given: Array, place: int) -> float:
-        """A step of a parameter that stays below its greatest value."""
+        """A step of a parameter within its upper bound."""
         parameter = list(self.description.parameters.values())[place]
         step = _STEP * (abs(given[place]) or abs(parameter.value) or 1.0)
         return step if given[place] + 30.0 * step <= parameter.upper else -step
@@ -193,11 +194,11 @@ class Evaluation:
     def _is_trusted(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
     ) -> bool:
-        """Whether the FMU's own derivative is there and agrees with a difference, tried once at a few moments."""
-        told = self.description
-        if not told.derivatives or (group == "parameters" and told.version == 2):
-            return False  # FMI 2.0 has them by states and inputs alone
-        reference = list(getattr(told, group))[place].reference
+        """Whether the FMU's directional derivative exists and agrees with a difference, tested once at a few points."""
+        description = self.description
+        if not description.derivatives or (group == "parameters" and description.version == 2):
+            return False  # FMI 2.0 has them only by states and inputs
+        reference = list(getattr(description, group))[place].reference
         if (outputs, reference) not in self._trusted:
             every = max(1, len(rows[0]) // 4)
             few = _rows(rows, slice(None, None, every))
@@ -212,7 +213,7 @@ class Evaluation:
     def _difference(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
     ) -> Array:
-        """The slope by one quantity, (S, k), by a central difference."""
+        """The derivative by a variable, (S, k), by a central difference."""
         time, states, inputs = rows
         if group == "parameters":
             step = abs(self._step_within(given, place))
@@ -220,7 +221,7 @@ class Evaluation:
             ends = [given.copy(), given.copy()]
             ends[0][place] = max(given[place] - step, parameter.lower)
             ends[1][place] = min(given[place] + step, parameter.upper)
-            low, high = (self._plain(outputs, rows, one) for one in ends)
+            low, high = (self._plain(outputs, rows, end) for end in ends)
             return (high - low) / (ends[1][place] - ends[0][place])
         table = states if group == "states" else inputs
         step = _step(table[:, place])
@@ -235,11 +236,11 @@ class Evaluation:
 
 
 def _rows(parts: tuple[Array, Array, Array], which: Any) -> tuple[Array, Array, Array]:
-    time, states, inputs = (np.ascontiguousarray(one[which]) for one in parts)
+    time, states, inputs = (np.ascontiguousarray(part[which]) for part in parts)
     return time, states, inputs
 
 
 def _step(values: Sequence[float] | Array) -> float:
-    """One step for a whole column: a size that is typical of it, for a value near 0 says nothing of its scale."""
+    """A step for a whole column by its mean absolute value, because a value near 0 has no scale."""
     size = float(np.abs(values).mean()) if len(values) else 1.0
     return _STEP * (size if 0.0 < size < np.inf else 1.0)

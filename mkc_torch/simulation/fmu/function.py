@@ -1,8 +1,8 @@
-"""An FMU as a function of torch: its values, with first derivatives in reverse mode, forward mode and under ``vmap``.
+"""An FMU as a torch function with first derivatives in reverse mode, in forward mode and under ``vmap``.
 
-The slopes by states, inputs and parameters are numbers that are asked for where a derivative is; they have no
-derivative of their own. A derivative in reverse mode of a derivative in reverse mode by what it is weighed with is
-exact, for it is linear in these weights; one by states, inputs or parameters is refused in reverse mode.
+The derivatives by states, inputs and parameters are computed where a derivative is needed, and have no derivatives
+themselves. A vector-Jacobian product is linear in its vector, and so its derivative by the vector is exact; its
+derivative by states, inputs or parameters is refused in reverse mode.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = ["evaluated"]
 def evaluated(
     evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
 ) -> Tensor:
-    """Rates (S, n), or outputs (S, k), of an FMU.
+    """The rates (S, n), or the outputs (S, k), of an FMU.
 
     Args:
-        evaluation: of the FMU.
-        outputs: which of the two.
-        time: (S,) in s.
+        evaluation: evaluation of the FMU.
+        outputs: return outputs instead of rates.
+        time: (S,), in s.
         states, inputs: (S, n), (S, m).
         parameters: (p,).
     """
@@ -74,7 +74,7 @@ class _Values(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, *parts: Tensor) -> Any:
-        return _over_batch(info, in_dims[2:], lambda *one: _values(evaluation, outputs, *one), parts), 0
+        return _over_batch(info, in_dims[2:], lambda *args: _values(evaluation, outputs, *args), parts), 0
 
 
 class _Slopes(torch.autograd.Function):
@@ -96,16 +96,16 @@ class _Slopes(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:  # noqa: ARG004
-        raise RuntimeError("An FMU has first derivatives only; the second ones of its equations are not known.")
+        raise RuntimeError("An FMU has first derivatives only; the second derivatives of its equations are not known.")
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        known = next(one for one in tangents if isinstance(one, Tensor))
+        known = next(tangent for tangent in tangents if isinstance(tangent, Tensor))
         return known.new_zeros(ctx.shape)
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, group: Group, *parts: Tensor) -> Any:
-        return _over_batch(info, in_dims[3:], lambda *one: _slopes(evaluation, outputs, group, *one), parts), 0
+        return _over_batch(info, in_dims[3:], lambda *args: _slopes(evaluation, outputs, group, *args), parts), 0
 
 
 _values: Callable[..., Tensor] = _Values.apply
@@ -113,12 +113,12 @@ _slopes: Callable[..., Tensor] = _Slopes.apply
 
 
 for _function in (_Values.forward, _Slopes.forward):
-    # torch asks for it at every call, and it takes longer to find than a few rows to compute
+    # torch inspects the signature at every call, which takes longer than the evaluation of a few rows
     setattr(_function, "__signature__", inspect.signature(_function))  # noqa: B010 - no type knows of it
 
 
 def _kept_slopes(ctx: Any, group: Group) -> Tensor:
-    """The slopes at a context's moments: a Jacobian asks for them once for each of its rows."""
+    """The derivatives at a context's points; a Jacobian uses them for each of its rows."""
     found: Tensor | None = ctx.kept.get(group)
     if found is None:
         found = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
@@ -128,25 +128,25 @@ def _kept_slopes(ctx: Any, group: Group) -> Tensor:
 
 
 def _over_batch(info: Any, in_dims: Any, function: Any, parts: tuple[Tensor, ...]) -> Tensor:
-    """All rows of a batch at once where it has the same parameters throughout, else one after the other."""
+    """Evaluate a batch at once where its parameters are the same, else one problem after another."""
     size = info.batch_size
-    first = [one if dim is None else one.movedim(dim, 0) for one, dim in zip(parts, in_dims, strict=True)]
+    first = [part if dim is None else part.movedim(dim, 0) for part, dim in zip(parts, in_dims, strict=True)]
     batched = [dim is not None for dim in in_dims]
     if batched[3]:
-        each = [one.unbind(0) if many else [one] * size for one, many in zip(first, batched, strict=True)]
-        return torch.stack([function(*one) for one in zip(*each, strict=True)])
+        each = [part.unbind(0) if many else [part] * size for part, many in zip(first, batched, strict=True)]
+        return torch.stack([function(*problem) for problem in zip(*each, strict=True)])
     rows = [
-        one.flatten(0, 1) if many else one.expand(size, *one.shape).flatten(0, 1)
-        for one, many in zip(first[:3], batched[:3], strict=True)
+        part.flatten(0, 1) if many else part.expand(size, *part.shape).flatten(0, 1)
+        for part, many in zip(first[:3], batched[:3], strict=True)
     ]
     found: Tensor = function(*rows, first[3]).unflatten(0, (size, -1))
     return found
 
 
 def _moments(time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor) -> EvaluationPoints:
-    return EvaluationPoints(*(one.detach().cpu().double().numpy() for one in (time, states, inputs, parameters)))
+    return EvaluationPoints(*(part.detach().cpu().double().numpy() for part in (time, states, inputs, parameters)))
 
 
 def _tensor(values: Any, like: Tensor) -> Tensor:
-    # answers are remembered, and what is done in place to one is not to change the other
+    # a copy, because the values are cached and the caller may change them in place
     return torch.from_numpy(values.copy()).to(like)

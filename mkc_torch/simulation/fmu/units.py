@@ -1,4 +1,4 @@
-"""Units as FMUs write them, as this package does."""
+"""Conversion of units from the notation of FMUs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _POWER = re.compile(r"(?<=[A-Za-zΩµ°])\^?\(?(-?\d+)\)?")
 
 
 def unit_of(text: str | None) -> str:
-    """A unit in the notation of Modelica, "kg.m2/s", in the one of this package; empty for none.
+    """A unit in Modelica's notation, "kg.m2/s", in the notation of this package; empty for None.
 
     Example:
         >>> unit_of("kg.m2/s"), unit_of("m/s2"), unit_of("N.m"), unit_of("degC"), unit_of("1"), unit_of(None)

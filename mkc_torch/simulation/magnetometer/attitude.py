@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.aided.rotation import from_quaternion, rotated
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
-from mkc_torch.nonlinear import GaussianPrior, NoFitError, make_dual
+from mkc_torch.nonlinear import GaussianPrior, NoFitError
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
@@ -55,7 +56,7 @@ class AttitudeView(View):
         super().__init__(recording)
         self.to_world = from_quaternion(recording.stack(*QUATERNION))
         self.ports = {
-            "sensor": Port(AXES, self.unit, wanders=True),
+            "sensor": Port(AXES, self.unit, allows_drift=True),
             "field": Port(("east", "north", "up"), self.unit),
         }
         jumps = _jumps(recording, self.to_world)

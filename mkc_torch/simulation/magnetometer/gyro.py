@@ -48,7 +48,7 @@ class GyroView(View):
     def __init__(self, recording: Recording) -> None:
         super().__init__(recording)
         self.ports = {
-            "sensor": Port(AXES, self.unit, wanders=True, pointwise=False),
+            "sensor": Port(AXES, self.unit, allows_drift=True, pointwise=False),
             "field": Port(("strength",), self.unit, pointwise=False),
         }
         self.prior = _prior()

@@ -49,7 +49,7 @@ class NormView(View):
     def __init__(self, recording: Recording, *, sphere: bool = False) -> None:
         super().__init__(recording)
         self.ports = {
-            "sensor": Port(AXES, self.unit, wanders=True),
+            "sensor": Port(AXES, self.unit, allows_drift=True),
             "field": Port(("strength",), self.unit),
         }
         self.alone = True

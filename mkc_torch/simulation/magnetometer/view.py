@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.linear import LeastTrimmedSquares
-from mkc_torch.nonlinear import NoFitError, make_dual
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.protocol import Changes, ClosedForm, FreeChange, Nearby, Port

@@ -164,7 +164,7 @@ def test_ros_knows_no_current_and_says_so():
 def test_a_calibration_in_unknown_units_is_refused_with_what_to_do(kind, unit):
     """Where the field's strength was given too: the readings' unit is what an autopilot needs."""
     for field_unit in (unit, "µT"):
-        with pytest.raises(ExportError, match=r"--unit\s+mag=gauss"):
+        with pytest.raises(ExportError, match="--convert mag=gauss"):
             exported(kind, SensorCorrection("a", unit, (1.0, 2.0, 3.0), EYE, field_unit))
 
 

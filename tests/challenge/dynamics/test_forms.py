@@ -135,9 +135,9 @@ def test_drag_in_flight_is_along_the_velocity(one, other):
 @given(st.floats(0.01, 3.0), st.floats(-3, 3))
 def test_contact_takes_energy_and_only_pushes(depth, speed):
     form = forces.contact(1, 0, 1.0, (1.0, -1.0))
-    pushed = added(form, [1.0 + depth, speed])[1]
-    assert pushed <= 0.0
-    assert added(form, [-1.0 - depth, -speed])[1] == pytest.approx(-pushed)
+    force = added(form, [1.0 + depth, speed])[1]
+    assert force <= 0.0
+    assert added(form, [-1.0 - depth, -speed])[1] == pytest.approx(-force)
     assert added(form, [0.5, speed])[1] == 0.0
     assert added(form, [1.0 + depth, abs(speed)])[1] <= added(form, [1.0 + depth, -abs(speed)])[1]
 

@@ -33,10 +33,10 @@ def test_agrees_with_an_adaptive_method(name):
         u = np.array([np.interp(t, time, one[:, 0]) for one in trial.inputs])
         return plant.rate(x[:, None], u[:, None], plant.values)[:, 0]
 
-    answer = solve_ivp(rate, (0.0, time[-1]), trial.begin[:, 0], t_eval=time, rtol=1e-9, atol=1e-10,
+    stated_diagnosis = solve_ivp(rate, (0.0, time[-1]), trial.begin[:, 0], t_eval=time, rtol=1e-9, atol=1e-10,
                        max_step=trial.step)  # fmt: skip
-    scale = np.abs(answer.y).max(1, keepdims=True)
-    assert np.abs(found[..., 0] - answer.y).max() < 1e-5 * scale.max()
+    scale = np.abs(stated_diagnosis.y).max(1, keepdims=True)
+    assert np.abs(found[..., 0] - stated_diagnosis.y).max() < 1e-5 * scale.max()
 
 
 def test_sizes_side_by_side_are_those_one_by_one():

@@ -15,8 +15,8 @@ def free():
     return Plant("free", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)  # noqa: ARG005
 
 
-def trial(push, begin=0.0, step=0.02):
-    return RunSet(step, np.asarray(push, dtype=float)[None, :, None], np.array([[begin]]))
+def trial(force, begin=0.0, step=0.02):
+    return RunSet(step, np.asarray(force, dtype=float)[None, :, None], np.array([[begin]]))
 
 
 def store(constant=0.5):
@@ -38,9 +38,9 @@ def test_nothing_moves_that_begins_at_rest(hidden):
 @pytest.mark.parametrize("hidden", [store(), mass(damping=0.3)])
 def test_what_goes_in_is_shared_in_the_end(hidden):
     """A push at the beginning, and then none: both move alike, by the push over one and the share."""
-    push = np.where(np.arange(600) < 20, 1.0, 0.0)
-    alone = simulate(free(), trial(push)).outputs[0, -1, 0]
-    together = simulate(free(), trial(push), hidden, 0.5).outputs[0, -1, 0]
+    force = np.where(np.arange(600) < 20, 1.0, 0.0)
+    alone = simulate(free(), trial(force)).outputs[0, -1, 0]
+    together = simulate(free(), trial(force), hidden, 0.5).outputs[0, -1, 0]
     assert together == pytest.approx(alone / 1.5, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The proof in worlds from end to end, with a diagnosis that costs nothing."""
+"""The proof in scenarios from end to end, with a diagnosis that costs nothing."""
 
 import json
 import re
@@ -8,10 +8,10 @@ import pytest
 pytest.importorskip("polars")
 pytest.importorskip("jinja2")
 
-from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
+from mkc_torch.challenge.dynamics.scenarios import dynamics_scenarios
 from mkc_torch.challenge.key import digest
-from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
-from mkc_torch.challenge.scenarios import run_worlds
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_scenarios
+from mkc_torch.challenge.scenarios import run_scenarios
 from mkc_torch.challenge.scenarios.run import count
 
 
@@ -33,15 +33,15 @@ def cheap(paths, folder):
         (folder / f"{broken}.error.txt").write_text("too few samples: record more\n")
 
 
-FAMILIES = {"dynamics": dynamics_worlds(), "magnetometer": magnetometer_worlds(15.0)}
+FAMILIES = {"dynamics": dynamics_scenarios(), "magnetometer": magnetometer_scenarios(15.0)}
 
 
 @pytest.fixture(scope="module", params=[pytest.param("dynamics", marks=pytest.mark.e2e), "magnetometer"])
 def done(request, tmp_path_factory):
-    output = tmp_path_factory.mktemp("worlds") / "out"
+    output = tmp_path_factory.mktemp("scenarios") / "out"
     told = []
-    result = run_worlds(
-        cheap, FAMILIES[request.param], per_world=2, hidden=1, seed=3, output=output,
+    result = run_scenarios(
+        cheap, FAMILIES[request.param], per_scenario=2, hidden=1, seed=3, output=output,
         progress=lambda stage, done, total: told.append((stage, done, total)),
     )  # fmt: skip
     return FAMILIES[request.param], result, output, told
@@ -52,34 +52,34 @@ def test_the_hash_matches_the_key_and_the_key_is_written_last(done):
     assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
 
 
-def test_every_world_has_its_recordings(done):
-    worlds, result, output, told = done
-    assert [w.name for w in result.worlds] == [w.name for w in worlds.worlds]
-    assert {w.empty for w in result.worlds} == {2}
-    assert [w.hidden for w in result.worlds] == [int(w.hides) for w in worlds.worlds]
-    total = count(worlds, (), 2, 1)
+def test_every_scenario_has_its_recordings(done):
+    scenarios, result, output, told = done
+    assert [w.name for w in result.scenarios] == [w.name for w in scenarios.scenarios]
+    assert {w.empty for w in result.scenarios} == {2}
+    assert [w.hidden for w in result.scenarios] == [int(w.hides) for w in scenarios.scenarios]
+    total = count(scenarios, (), 2, 1)
     assert len(list((output / "recordings").iterdir())) == total == len(result.cases)
     assert {stage for stage, number, of in told if number == of == total} == {"draw"}
-    assert sum(sum(w.verdicts.values()) for w in result.worlds) == 2 * len(worlds.worlds)
+    assert sum(sum(w.verdicts.values()) for w in result.scenarios) == 2 * len(scenarios.scenarios)
 
 
-def test_neither_names_nor_simulations_tell_the_world(done):
-    worlds, result, output, _ = done
-    known = {world.name for world in worlds.worlds}
+def test_neither_names_nor_simulations_tell_the_scenario(done):
+    scenarios, result, output, _ = done
+    known = {scenario.name for scenario in scenarios.scenarios}
     for path in (output / "recordings").iterdir():
         assert re.fullmatch(r"[a-z_]+_\d{5}", path.stem)
         assert path.stem.rpartition("_")[0] not in known
     for path in (output / "simulations").iterdir():
         text = path.read_text(encoding="utf-8").lower()
         assert not any(word in text for word in ("wrong", "other", "useless", "far", "mistake"))
-    order = [case.key.world for case in result.cases]
+    order = [case.key.scenario for case in result.cases]
     assert order != sorted(order)
 
 
 def test_each_differential_equation_has_a_simulation_of_its_own(done):
-    worlds, result, output, _ = done
+    scenarios, result, output, _ = done
     given = {path.stem for path in (output / "simulations").iterdir()}
-    if worlds.family == "dynamics":
+    if scenarios.family == "dynamics":
         assert given == {case.key.name for case in result.cases}
     else:
         views = {case.key.name for case in result.cases if case.key.useless not in ("", "unrelated field")}
@@ -89,14 +89,14 @@ def test_each_differential_equation_has_a_simulation_of_its_own(done):
 def test_what_failed_is_told_with_its_reason_and_raises_no_alarm(done):
     _, result, output, _ = done
     record = json.loads((output / "score.json").read_text(encoding="utf-8"))
-    failed = [name for world in result.worlds for name in world.failed]
+    failed = [name for scenario in result.scenarios for name in scenario.failed]
     assert set(record["failed"]) == set(failed)
     assert "too few samples" in "".join(record["failed"].values())
-    assert all(world.false_alarms.count == 0 for world in result.worlds)
+    assert all(scenario.false_alarms.count == 0 for scenario in result.scenarios)
     assert record["settings"]["seed"] == 3
-    assert len(record["worlds"]) == len(result.worlds)
+    assert len(record["scenarios"]) == len(result.scenarios)
     assert "aims are held" in (output / "challenge.html").read_text(encoding="utf-8")
-    assert "| world | asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
+    assert "| scenario | asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
 
 
 def quiet(paths, folder):
@@ -104,9 +104,9 @@ def quiet(paths, folder):
 
 
 def test_a_larger_run_contains_a_smaller_one(tmp_path):
-    worlds = FAMILIES["magnetometer"]
+    scenarios = FAMILIES["magnetometer"]
     small, large = (
-        run_worlds(quiet, worlds, only=["white"], per_world=n, hidden=0, seed=3, output=tmp_path / str(n))
+        run_scenarios(quiet, scenarios, only=["white"], per_scenario=n, hidden=0, seed=3, output=tmp_path / str(n))
         for n in (1, 3)
     )
     (one,) = small.cases
@@ -123,18 +123,18 @@ def test_a_larger_run_contains_a_smaller_one(tmp_path):
 
 @pytest.mark.process
 def test_two_processes_draw_the_same(tmp_path):
-    worlds = FAMILIES["dynamics"]
+    scenarios = FAMILIES["dynamics"]
     for workers in (1, 2):
-        run_worlds(
-            quiet, worlds, only=["gusts", "useless"], per_world=1, hidden=0, seed=3, output=tmp_path / str(workers),
+        run_scenarios(
+            quiet, scenarios, only=["gusts", "useless"], per_scenario=1, hidden=0, seed=3, output=tmp_path / str(workers),
             workers=workers,
         )  # fmt: skip
     assert (tmp_path / "1" / "key_hash.txt").read_text() == (tmp_path / "2" / "key_hash.txt").read_text()
 
 
-def test_a_world_that_is_not_there_and_a_run_of_nothing_are_refused(tmp_path):
+def test_a_scenario_that_is_not_there_and_a_run_of_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"one of white, coloured, wander, .* but got 'held'"):
-        run_worlds(quiet, FAMILIES["magnetometer"], only=["held"], output=tmp_path / "a")
+        run_scenarios(quiet, FAMILIES["magnetometer"], only=["held"], output=tmp_path / "a")
     with pytest.raises(ValueError, match="at least"):
-        run_worlds(quiet, FAMILIES["magnetometer"], per_world=0, output=tmp_path / "a")
+        run_scenarios(quiet, FAMILIES["magnetometer"], per_scenario=0, output=tmp_path / "a")
     assert not (tmp_path / "a").exists()

@@ -1,4 +1,4 @@
-"""The score of worlds on diagnoses made up for it."""
+"""The score of scenarios on diagnoses made up for it."""
 
 import dataclasses
 import json
@@ -9,22 +9,22 @@ import pytest
 from mkc_torch.challenge import aims
 from mkc_torch.challenge.key import KeyEffect, KeyRival
 from mkc_torch.challenge.scenario import KeyDisturbance, Scenario, ScenarioKey, Scenarios
-from mkc_torch.challenge.scenarios.page import held, worlds_page, worlds_summary
-from mkc_torch.challenge.scenarios.score import LEAST_PUSH, score_worlds
+from mkc_torch.challenge.scenarios.page import held, scenarios_page, scenarios_summary
+from mkc_torch.challenge.scenarios.score import LEAST_DISTURBANCE, score_scenarios
 from tests.challenge.test_key import example
 
-SETTINGS = {"family": "dynamics", "seed": 1, "key_sha256": "0" * 64, "empty_per_world": 1, "hidden_per_world": 1}
+SETTINGS = {"family": "dynamics", "seed": 1, "key_sha256": "0" * 64, "empty_per_scenario": 1, "hidden_per_scenario": 1}
 
 
 def never(*_):
     raise AssertionError
 
 
-WORLDS = Scenarios(
+SCENARIOS = Scenarios(
     "dynamics",
     (
         Scenario("white", "white noise", never, aims.WHITE),
-        Scenario("pushed_white", "white force noise", never, aims.PUSHED),
+        Scenario("pushed_white", "white force noise", never, aims.DISTURBED_STATE),
         Scenario("lasting", "one run", never, aims.LASTING, right_to_say="unexplained", half=True, apart=True),
         Scenario("useless", "of no use", never, aims.USELESS, hides=False),
     ),
@@ -32,14 +32,14 @@ WORLDS = Scenarios(
 )
 
 
-def key(name, world="white", *, push=0.0, useless="", kind="empty", effect="backlash", z=20.0, z_sep=15.0):
+def key(name, scenario="white", *, disturbance=0.0, useless="", kind="empty", effect="backlash", z=20.0, z_sep=15.0):
     rival = KeyRival("dead_zone", (), z_sep)
     truth = KeyEffect(effect, "", (), "", None, 1.0, (), z, z_sep, rival, (), ("input voltage",))
     plain = dataclasses.replace(
         example(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
     )
-    told = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", push) if push else None
-    return ScenarioKey(world, 0, plain, told, useless)
+    told = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", disturbance) if disturbance else None
+    return ScenarioKey(scenario, 0, plain, told, useless)
 
 
 def says(verdict, *findings, driven=None):
@@ -49,7 +49,7 @@ def says(verdict, *findings, driven=None):
     return told
 
 
-def finding(effect, grade="left out"):
+def finding(effect, grade="left_out"):
     return {"effect": effect, "grade": grade, "drivers": [], "channels": ["input voltage"], "alternatives": []}
 
 
@@ -57,24 +57,24 @@ def counts(share):
     return share.count, share.total
 
 
-def world(result, name):
-    return next(world for world in result.worlds if world.name == name)
+def scenario(result, name):
+    return next(scenario for scenario in result.scenarios if scenario.name == name)
 
 
 def aim(scored, measure):
     return next(m for m in scored.measured if m.threshold.measure == measure)
 
 
-def test_empty_recordings_of_an_ordinary_world():
+def test_empty_recordings_of_an_ordinary_scenario():
     answers = {
         "quiet": says("adequate"),
-        "wandering": says("unexplained", finding("input_delay", "not confirmed")),
+        "wandering": says("unexplained", finding("input_delay", "unconfirmed")),
         "alarm": says("explained", finding("input_delay")),
-        "small": says("explained", finding("sensor_lag", "real but small")),
+        "small": says("explained", finding("sensor_lag", "small")),
         "old": says("explained", {"effect": "backlash"}),
         "unfit": says("unfit"),
     }
-    scored = world(score_worlds(WORLDS, [key(name) for name in (*answers, "refused")], answers), "white")
+    scored = scenario(score_scenarios(SCENARIOS, [key(name) for name in (*answers, "refused")], answers), "white")
     assert scored.empty == 7
     assert counts(scored.false_alarms) == (3, 6)  # the refused one is in its own column alone
     assert scored.alarms == {"input_delay": 1, "sensor_lag": 1, "backlash": 1}
@@ -90,15 +90,15 @@ def test_empty_recordings_of_an_ordinary_world():
 def test_pushed_states_are_located_by_process_noise_forcing_or_a_finding():
     answers = {
         "noise": says("unexplained", driven="speed"),
-        "forcing": says("unexplained") | {"forcing": [{"state": "speed"}]},
-        "finding": says("unexplained", finding("unknown", "not confirmed") | {"channels": ["rate of speed"]}),
+        "forcing": says("unexplained") | {"disturbance": [{"state": "speed"}]},
+        "finding": says("unexplained", finding("unknown", "unconfirmed") | {"channels": ["rate of speed"]}),
         "wrong": says("unexplained", driven="angle"),
         "adequate": says("adequate", driven="speed"),
         "nowhere": says("unexplained"),
         "weak": says("adequate"),
     }
-    keys = [key(name, "pushed_white", push=LEAST_PUSH - 0.1 if name == "weak" else 3.0) for name in answers]
-    scored = world(score_worlds(WORLDS, keys, answers), "pushed_white")
+    keys = [key(name, "pushed_white", disturbance=LEAST_DISTURBANCE - 0.1 if name == "weak" else 3.0) for name in answers]
+    scored = scenario(score_scenarios(SCENARIOS, keys, answers), "pushed_white")
     assert counts(scored.unexplained_located) == (3, 6)
     assert counts(scored.located) == (4, 6)
     assert counts(scored.false_alarms) == (0, 7)
@@ -109,31 +109,31 @@ def test_pushed_states_are_located_by_process_noise_forcing_or_a_finding():
 
 
 def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
-    disturbed = dataclasses.replace(key("a", "pushed_white"), push=KeyDisturbance("wander", "sensor", 1.0, "µT", 4.0))
-    scored = world(score_worlds(WORLDS, [disturbed], {"a": says("unexplained")}), "pushed_white")
+    disturbed = dataclasses.replace(key("a", "pushed_white"), disturbance=KeyDisturbance("wander", "sensor", 1.0, "µT", 4.0))
+    scored = scenario(score_scenarios(SCENARIOS, [disturbed], {"a": says("unexplained")}), "pushed_white")
     assert scored.unexplained_located.total == 0
 
 
 def test_useless_simulations_have_to_be_unfit_and_never_adequate():
     keys = [key(name, "useless", useless="wrong sign" if name < "c" else "another system") for name in "abcd"]
     answers = {"a": says("unfit"), "b": says("adequate"), "c": says("unfit"), "d": None}
-    result = score_worlds(WORLDS, keys, answers)
-    scored = world(result, "useless")
+    result = score_scenarios(SCENARIOS, keys, answers)
+    scored = scenario(result, "useless")
     assert counts(scored.unfit) == (2, 4)
     assert scored.reasons["wrong sign"] == {"unfit": 1, "adequate": 1, "explained": 0, "unexplained": 0, "failed": 0}
     assert scored.reasons["another system"]["failed"] == 1
     assert [m.holds for m in scored.measured if m.threshold.measure in ("unfit", "adequate")] == [False, False]
     assert result.total.empty == 0  # none of them is of use
-    good = score_worlds(WORLDS, keys, dict.fromkeys("abcd", says("unfit")))
-    assert all(m.holds for m in world(good, "useless").measured if m.threshold.measure != "empty")
+    good = score_scenarios(SCENARIOS, keys, dict.fromkeys("abcd", says("unfit")))
+    assert all(m.holds for m in scenario(good, "useless").measured if m.threshold.measure != "empty")
 
 
 def test_names_of_what_is_hidden():
     answers = {
         "right": says("explained", finding("backlash")),
         "wrong": says("explained", finding("dead_zone")),
-        "nearest": says("unexplained", finding("backlash", "nearest in the catalogue")),
-        "unsure": says("unexplained", finding("backlash", "not confirmed")),
+        "nearest": says("unexplained", finding("backlash", "nearest")),
+        "unsure": says("unexplained", finding("backlash", "unconfirmed")),
         "unnamed": says("explained", finding("unknown")),
         "weak": says("adequate"),
         "unfit": says("unfit"),
@@ -141,14 +141,14 @@ def test_names_of_what_is_hidden():
     }
     sizes = {"weak": {"z": 5.0, "z_sep": 5.0}, "close": {"z_sep": 3.0}}
     keys = [
-        key(name, kind="single", push=3.0 if name in ("right", "wrong") else 0.0, **sizes.get(name, {}))
+        key(name, kind="single", disturbance=3.0 if name in ("right", "wrong") else 0.0, **sizes.get(name, {}))
         for name in answers
     ]
-    scored = world(score_worlds(WORLDS, keys, answers), "white")
+    scored = scenario(score_scenarios(SCENARIOS, keys, answers), "white")
     assert (scored.hidden, scored.strong) == (8, 6)
     assert counts(scored.named) == (1, 6)
-    assert counts(scored.named_pushed) == (1, 2)
-    assert counts(scored.named_quiet) == (0, 4)
+    assert counts(scored.named_disturbed) == (1, 2)
+    assert counts(scored.named_undisturbed) == (0, 4)
     assert counts(scored.wrong) == (1, 6)
     assert counts(scored.nearest) == (1, 6)
     assert counts(scored.useful_unfit) == (2, 7)  # with z of at least ten, told from its rivals or not
@@ -160,15 +160,15 @@ def test_outside_the_catalogue_only_a_wrong_name_is_wrong():
         "claimed": says("explained", finding("dead_zone")),
         "own": says("explained", finding("vibration")),
         "unknown": says("explained", finding("unknown")),
-        "nearest": says("unexplained", finding("dead_zone", "nearest in the catalogue")),
+        "nearest": says("unexplained", finding("dead_zone", "nearest")),
         "unseen": says("adequate"),
         "weak": says("explained", finding("dead_zone")),
     }
     keys = [key(n, kind="outside", effect="vibration", z=4.0 if n == "weak" else 15.0) for n in answers]
-    result = score_worlds(WORLDS, keys, answers)
-    assert counts(world(result, "white").outside_wrong) == (1, 5)
-    assert counts(world(result, "white").outside_nearest) == (3, 5)
-    assert world(result, "white").strong == 0
+    result = score_scenarios(SCENARIOS, keys, answers)
+    assert counts(scenario(result, "white").outside_wrong) == (1, 5)
+    assert counts(scenario(result, "white").outside_nearest) == (3, 5)
+    assert scenario(result, "white").strong == 0
     assert held(aim(result.total, "outside_wrong")) == "not held"
 
 
@@ -188,21 +188,21 @@ def test_where_one_run_cannot_tell_a_name_alone_is_counted_apart():
         "right": says("explained", finding("backlash")),
         "mistaken": says("explained", finding("dead_zone")),
     }
-    keys = [key(n, "lasting", push=3.0, kind="single" if n in ("right", "mistaken") else "empty") for n in answers]
-    result = score_worlds(WORLDS, keys, answers)
-    scored = world(result, "lasting")
+    keys = [key(n, "lasting", disturbance=3.0, kind="single" if n in ("right", "mistaken") else "empty") for n in answers]
+    result = score_scenarios(SCENARIOS, keys, answers)
+    scored = scenario(result, "lasting")
     assert counts(scored.alone) == (2, 7)  # "alone" and "mistaken"
     assert counts(scored.undecided) == (2, 8)  # "rival" and "open"
     assert held(aim(scored, "alone")) == "not held"
     assert (scored.apart, scored.right_to_say) == (True, "unexplained")
     assert (result.total.empty, result.total.hidden) == (0, 0)
     pytest.importorskip("jinja2")
-    page, text = worlds_page(result, SETTINGS), worlds_summary(result, SETTINGS)
+    page, text = scenarios_page(result, SETTINGS), scenarios_summary(result, SETTINGS)
     for words in ("a name alone, not the hidden one", "said that it cannot be told", "(2 of 7; 3.7-71.0 %)"):
         assert words in page
         assert words in text
-    quiet = score_worlds(WORLDS, [key("a")], {"a": says("adequate")})
-    assert "cannot be told" not in worlds_page(quiet, SETTINGS)
+    quiet = score_scenarios(SCENARIOS, [key("a")], {"a": says("adequate")})
+    assert "cannot be told" not in scenarios_page(quiet, SETTINGS)
 
 
 def test_a_sensor_that_errs_slowly_is_told_by_its_own_noise():
@@ -214,11 +214,11 @@ def test_a_sensor_that_errs_slowly_is_told_by_its_own_noise():
     }
     keys = [
         dataclasses.replace(
-            key(name), push=KeyDisturbance("slow_sensor", "sensor", 1.0, "m", 1.5 if name == "small" else 4.0)
+            key(name), disturbance=KeyDisturbance("slow_sensor", "sensor", 1.0, "m", 1.5 if name == "small" else 4.0)
         )
         for name in answers
     ]
-    assert counts(world(score_worlds(WORLDS, keys, answers), "white").sensor_told) == (1, 2)
+    assert counts(scenario(score_scenarios(SCENARIOS, keys, answers), "white").sensor_reported) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -232,17 +232,17 @@ def test_how_many_hide_something(half, asked, hidden):
 def all_kinds():
     keys = [
         key("a"),
-        key("b", "pushed_white", push=3.0),
+        key("b", "pushed_white", disturbance=3.0),
         key("c", "useless", useless="wrong <sign>"),
         key("d", kind="single"),
     ]
     answers = {"a": says("adequate"), "b": says("unexplained", driven="speed"), "c": says("unfit")}
-    return score_worlds(WORLDS, keys, answers)
+    return score_scenarios(SCENARIOS, keys, answers)
 
 
-def test_the_total_is_of_useful_worlds():
+def test_the_total_is_of_useful_scenarios():
     result = all_kinds()
-    assert [w.name for w in result.worlds] == ["white", "pushed_white", "useless"]
+    assert [w.name for w in result.scenarios] == ["white", "pushed_white", "useless"]
     assert (result.total.empty, result.total.hidden) == (2, 1)
     assert [m.threshold for m in result.total.measured] == list(aims.TOTALS)
 
@@ -251,16 +251,16 @@ def test_numbers_are_json_with_a_row_for_each_case():
     numbers = all_kinds().numbers()
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
     assert [case["verdict"] for case in numbers["cases"]] == ["adequate", "unexplained", "unfit", "failed"]
-    assert numbers["cases"][1]["push"]["at"] == numbers["cases"][1]["driven"] == "speed"
-    assert numbers["worlds"][1]["holds"]["unexplained_located"] is True
-    assert numbers["worlds"][0]["holds"]["named"] is False
-    assert numbers["worlds"][1]["holds"]["named"] is None
+    assert numbers["cases"][1]["disturbance"]["at"] == numbers["cases"][1]["driven"] == "speed"
+    assert numbers["scenarios"][1]["holds"]["unexplained_located"] is True
+    assert numbers["scenarios"][0]["holds"]["named"] is False
+    assert numbers["scenarios"][1]["holds"]["named"] is None
 
 
-def test_each_world_is_a_row_of_the_page_and_of_the_summary():
+def test_each_scenario_is_a_row_of_the_page_and_of_the_summary():
     pytest.importorskip("jinja2")
     result = all_kinds()  # the strong one that failed was not named
-    page, text = worlds_page(result, SETTINGS), worlds_summary(result, SETTINGS)
+    page, text = scenarios_page(result, SETTINGS), scenarios_summary(result, SETTINGS)
     for name in ("white", "pushed_white", "useless", "all useful"):
         assert f'<th scope="row">{name}</th>' in page
         assert f"| {name} |" in text
@@ -272,7 +272,7 @@ def test_each_world_is_a_row_of_the_page_and_of_the_summary():
     assert "<script" not in page
 
 
-def test_only_worlds_with_a_key_are_scored():
-    result = score_worlds(WORLDS, [], {})
-    assert result.worlds == ()
+def test_only_scenarios_with_a_key_are_scored():
+    result = score_scenarios(SCENARIOS, [], {})
+    assert result.scenarios == ()
     assert math.isnan(result.total.false_alarms.value)

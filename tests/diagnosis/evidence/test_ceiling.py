@@ -229,7 +229,7 @@ def scores(gain, columns=("load",)):
         (-0.05, 0.0, ("load",), ()),
     ],
 )
-def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, told):
+def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, text):
     monkeypatch.setattr("mkc_torch.diagnosis.evidence.remaining.ceiling", lambda *_: scores(by_time, ()))
     fit = SimpleNamespace(model=SimpleNamespace(terms=()))
     assert (
@@ -242,7 +242,7 @@ def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time
             0,
             EvidenceSettings(),
         )
-        == told
+        == text
     )
 
 

@@ -50,7 +50,7 @@ def searching(covariance, seed, size=3.0):
     drawn = size * (torch.randn(K, C, generator=generator, dtype=torch.float64) @ root.mT).flatten() / k
     series = tangents @ drawn + torch.randn(SAMPLES, generator=generator, dtype=torch.float64)
     search = LinearSearch(torch.ones(SAMPLES, 1, dtype=torch.float64), [], tangents, scales, NoiseSettings().walk_first)
-    linearised = SimpleNamespace(search=search, series=series, wanders=search.noise_fit(series).gain > 0)
+    linearised = SimpleNamespace(search=search, series=series, has_drift=search.noise_fit(series).gain > 0)
     return linearised, slow, tangents @ drawn
 
 
@@ -78,7 +78,7 @@ def test_channels_apart_have_p_values_that_are_no_smaller_than_uniform(variances
 def test_nothing_is_asked_of_one_channel_or_of_noise_that_does_not_wander():
     linearised, slow, _ = searching(np.eye(3), 0)
     assert common_cause(linearised, None) is None
-    assert common_cause(SimpleNamespace(wanders=False), slow) is None
+    assert common_cause(SimpleNamespace(has_drift=False), slow) is None
 
 
 def test_the_other_way_to_say_it():
@@ -152,9 +152,9 @@ def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
     recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=column)
     found = diagnose(Magnetometer("norm"), recording)
     assert (found.findings[0].effect, found.findings[0].drivers) == ("driver_offset", ("aux",))
-    told = [warning for warning in found.warnings if "stand in" in warning]
-    assert len(told) == (0 if whole else 1)
-    assert all(warning.startswith("What aux leaves of the offset goes on") for warning in told)
+    sentences = [warning for warning in found.warnings if "stand in" in warning]
+    assert len(sentences) == (0 if whole else 1)
+    assert all(warning.startswith("What aux leaves of the offset goes on") for warning in sentences)
 
 
 @pytest.mark.e2e

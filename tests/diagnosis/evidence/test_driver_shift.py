@@ -31,10 +31,10 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
     recording = tumbling(N, noise=0.4, sensor=GAIN * driver[:, None], attitude=True, gyro=True, **columns)
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording)
-    roles = frozenset(role for one in CATALOGUE for role in one.roles)
+    roles = frozenset(role for element in CATALOGUE for role in element.roles)
     drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
-    terms = candidate_terms(prepared, drivers, [one for one in CATALOGUE if one.id == (searched or effect)])
+    terms = candidate_terms(prepared, drivers, [item for item in CATALOGUE if item.id == (searched or effect)])
     located = run_search(
         base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0), settings=Settings()
     )

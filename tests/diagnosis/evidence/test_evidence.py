@@ -99,29 +99,29 @@ def test_each_is_asked_of_what_it_is_for(answers):
 
 def test_each_has_an_id_of_its_own(answers):
     for said in (answers.of_all, *answers.of_findings):
-        ids = [told.test for told in said]
+        ids = [result.test for result in said]
         assert len(set(ids)) == len(ids)
         assert all(re.fullmatch("[a-z][a-z0-9_]*", one) for one in ids)
 
 
 def test_what_is_said_is_json_under_names_that_the_schema_knows(answers):
-    for told in everything(answers):
-        json.dumps(_json([told.content, told.keys]), allow_nan=False)
+    for result in everything(answers):
+        json.dumps(_json([result.content, result.keys]), allow_nan=False)
     schema = json_schema()
-    assert {key for told in answers.of_all for key in told.keys} <= set(schema["properties"])
-    of_findings = {key for said in answers.of_findings for told in said for key in told.keys}
+    assert {key for result in answers.of_all for key in result.keys} <= set(schema["properties"])
+    of_findings = {key for said in answers.of_findings for result in said for key in result.keys}
     assert of_findings <= set(schema["$defs"]["finding"]["properties"])
 
 
 def test_texts_are_sentences_and_lines(answers):
-    for told in everything(answers):
+    for result in everything(answers):
         assert all(
-            sentence[0].isupper() and sentence.endswith(".") for sentence in told.warnings if "_" not in sentence
+            sentence[0].isupper() and sentence.endswith(".") for sentence in result.warnings if "_" not in sentence
         )
-        assert all(row.label and row.text and not row.text.endswith(".") for row in told.rows)
-        if told.table is not None:
-            assert all(len(cells) == len(told.table.columns) for cells in told.table.rows)
-            assert not told.table.note or told.table.note.endswith(".")
+        assert all(row.label and row.text and not row.text.endswith(".") for row in result.rows)
+        if result.table is not None:
+            assert all(len(cells) == len(result.table.columns) for cells in result.table.rows)
+            assert not result.table.note or result.table.note.endswith(".")
 
 
 def test_warnings_are_in_the_order_of_the_tests(answers):
@@ -134,23 +134,23 @@ def test_warnings_are_in_the_order_of_the_tests(answers):
 
 
 def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
-    before = [(one, one.clone()) for one in tensors((case, done), {})]
+    before = [(tensor, tensor.clone()) for tensor in tensors((case, done), {})]
     random = torch.random.get_rng_state()
     again = run_tests(case, done)
-    assert [told.rows for told in everything(again)] == [told.rows for told in everything(answers)]
-    assert [_json(told.keys) for told in everything(again)] == [_json(told.keys) for told in everything(answers)]
+    assert [result.rows for result in everything(again)] == [result.rows for result in everything(answers)]
+    assert [_json(result.keys) for result in everything(again)] == [_json(result.keys) for result in everything(answers)]
     assert again.warnings == answers.warnings
     assert torch.equal(torch.random.get_rng_state(), random)
     assert before
-    assert all(torch.equal(one, copy) for one, copy in before)
+    assert all(torch.equal(item, copy) for item, copy in before)
 
 
 def test_the_order_of_the_parts_makes_no_difference(case, answers):
     works = precompute(case)
     backwards = [work() for work in reversed(works)][::-1]
     again = run_tests(case, backwards)
-    assert [_json([told.content, told.keys]) for told in everything(again)] == [
-        _json([told.content, told.keys]) for told in everything(answers)
+    assert [_json([result.content, result.keys]) for result in everything(again)] == [
+        _json([result.content, result.keys]) for result in everything(answers)
     ]
 
 
@@ -166,5 +166,5 @@ def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
     mine = [EvidenceTest(test, ahead), EvidenceTest(test, ahead, each_finding=True), EvidenceTest(test)]
     works = precompute(replace(case, seed=3), mine)
     answers = run_tests(replace(case, seed=3), [work() for work in works], mine)
-    assert [told.value[:2] for told in answers.of_all] == [((3, 0), 0), (None, 0)]
-    assert [told.value[:2] for (told,) in answers.of_findings] == [((3, k), k) for k in range(len(case.found))]
+    assert [result.value[:2] for result in answers.of_all] == [((3, 0), 0), (None, 0)]
+    assert [result.value[:2] for (result,) in answers.of_findings] == [((3, k), k) for k in range(len(case.found))]

@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.evidence import held_out_gain
 from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
@@ -41,7 +41,7 @@ def fits():
     for name in ("small", "large"):
         model = done[-1].model.with_term(Term(OFFSET, known[name], OFFSET.shapes(prepared.time)[0]))
         start = torch.cat([done[-1].parameters, done[-1].parameters.new_zeros(model.size - done[-1].model.size)])
-        done.append(fitted_beside(done[0], model, start))
+        done.append(fitted_with_effect(done[0], model, start))
     return done
 
 
@@ -63,7 +63,7 @@ def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside
     without_small, (none, _, both) = beside
     without = without_small(none, none, both)
     blocks = blocks_of(N, 1, ConfirmationSettings())
-    alone = fitted_beside(
+    alone = fitted_with_effect(
         fits[0], fits[0].model.with_term(fits[2].model.terms[1]), torch.cat([fits[0].parameters, torch.zeros(3)])
     )
     torch.testing.assert_close(without.residual, held_out(alone, blocks).residual, atol=0.02, rtol=0.0)

@@ -11,7 +11,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.onset import _CRITICAL, onset_interval
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.linearized import SearchProblem
@@ -37,7 +37,7 @@ def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
     model = base.model.with_term(Term(effect, None, {"onset": TRUE} if shape is None else shape))
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
-    best = fitted_beside(base, model, start)
+    best = fitted_with_effect(base, model, start)
     tangents = tangents_of(best.model, best.parameters, NoiseSettings(), best.model.terms)
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     pseudo, counts = best.pseudo(NoiseSettings())

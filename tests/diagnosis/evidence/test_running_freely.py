@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.open_loop import open_loop_evidence
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import refit_open_loop, with_noise_of_fit
+from mkc_torch.diagnosis.model.process_noise import refit_open_loop, has_process_noise
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
@@ -33,7 +33,7 @@ def located(fit):
 def under_pushes():
     """A simulation alone and with a drag, both under pushes."""
     base = at_the_truth("white", 1)
-    (term,) = [one for one in candidates(base, (QuadraticDrag(),)) if one.port == "rate of rate"]
+    (term,) = [candidate for candidate in candidates(base, (QuadraticDrag(),)) if candidate.port == "rate of rate"]
     model = base.model.with_term(term)
     one = dataclasses.replace(base, model=model, parameters=torch.cat([base.parameters, base.parameters.new_zeros(1)]))
     return base, located(one)
@@ -56,8 +56,8 @@ def test_fits_under_pushes_are_fitted_to_their_free_runs_and_judged_by_these():
     again = open_loop_evidence(base, alone, (one,), (KEPT, KEPT), BLOCKS)
     assert again.base is alone
     (found,) = again.found
-    assert with_noise_of_fit(one.fit)
-    assert not with_noise_of_fit(found.fit)
+    assert has_process_noise(one.fit)
+    assert not has_process_noise(found.fit)
     # all else that is known of it is kept
     assert (found.term, found.p_value, found.beyond) == (one.term, one.p_value, one.beyond)
     assert found.fit.log_likelihood >= alone.log_likelihood - 1.0

@@ -50,15 +50,15 @@ def content():
 @pytest.mark.parametrize("channels", [1, 4])
 def test_diagnoses_of_every_size_are_written(findings, channels):
     content = written(make_diagnosis(findings, channels=channels, samples=300))
-    assert content["schema"] == "mkc-diagnosis/2"
+    assert content["schema"] == "mkc-diagnosis/3"
     assert len(content["findings"]) == findings
     assert len(content["noise"]["sigma"]) == channels
 
 
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
-        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "follows", "reasons", "noise",
-        "search", "findings", "forcing", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
+        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "goodness_of_fit", "reasons", "noise",
+        "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
     }  # fmt: skip
     assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
     assert set(content["findings"][0]) == {
@@ -70,10 +70,10 @@ def test_keys_are_those_of_the_format(content):
 
 def test_the_ceiling_is_written_as_the_other_models_are():
     diagnosis = make_diagnosis(1, channels=4)
-    told = written(diagnosis)["ceiling"]
-    assert told["rmse"] == diagnosis.ceiling.rmse
-    assert told["log_likelihood"] == diagnosis.ceiling.log_likelihood
-    assert len(told["sigma"]) == len(told["d"]) == 4
+    stored = written(diagnosis)["ceiling"]
+    assert stored["rmse"] == diagnosis.ceiling.rmse
+    assert stored["log_likelihood"] == diagnosis.ceiling.log_likelihood
+    assert len(stored["sigma"]) == len(stored["d"]) == 4
 
 
 def test_what_is_for_the_report_alone_is_not_written():
@@ -104,19 +104,19 @@ def test_what_shifted_copies_of_a_driver_gain_is_written():
 def test_what_an_equation_needs_is_written():
     parameter = EffectParameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
     changes = {
-        "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
+        "parameters": (parameter,), "event_times": (61.1, 77.8), "advice": "Do it.",
         "references": (Reference("current", 10.5, "A"),),
     }  # fmt: skip
     said = intermittency.said(True), onset.said((60.9, 61.2))
     (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
-    assert finding["moments"] == [61.1, 77.8]
+    assert finding["event_times"] == [61.1, 77.8]
     assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
     assert finding["advice"] == "Do it."
     assert finding["comes_and_goes"] is True
     assert finding["onset_interval"] == [60.9, 61.2]
-    bare = dict.fromkeys(("moments", "references"), ()) | {"advice": ""}
-    assert not {"moments", "references", "advice"} & set(
+    bare = dict.fromkeys(("event_times", "references"), ()) | {"advice": ""}
+    assert not {"event_times", "references", "advice"} & set(
         written(with_finding(make_diagnosis(1), **bare))["findings"][0]
     )
 
@@ -126,12 +126,12 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     tails = (ChannelTails(31.5, 0.041, 0.006),)
     noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", tails=tails)
-    told = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check], EvidenceSettings())))[
+    stored = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check], EvidenceSettings())))[
         "noise"
     ]
-    assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
-    assert told["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
-    assert told["density_check"] == [
+    assert (stored["unit"], stored["units"]) == ("µT", {"wander": "µT"})
+    assert stored["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
+    assert stored["density_check"] == [
         {
             "channel": "norm", "distance": 0.02, "student_t_distance": 0.03, "degrees_of_freedom": 4.0,
             "allowed": 0.05,
@@ -153,7 +153,8 @@ def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order(
         "rmse_after": 0.9,
         "unit": "µT",
         "outputs": {},
-        "left": "",
+        "diverged_blocks": [],
+        "blocks": 0,
     }
     expected = {"my_test": {"lag": 0.4, "by": [{"channel": "norm", "held_out": held_out}]}}
     assert content["evidence"] == content["findings"][0]["evidence"] == expected
@@ -171,7 +172,7 @@ def test_evidence_of_another_form_is_refused(content, evidence):
 
 def test_components_are_as_many_as_the_numbers():
     parameter = EffectParameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
-    with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` are not as many as the numbers"):
+    with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` differs in length"):
         diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(parameter,)))
 
 
@@ -195,9 +196,9 @@ def test_numbers_round_trip_exactly():
 
 def test_numpy_numbers_are_numbers():
     parameter = EffectParameter("a", np.float64(0.3), np.float64("nan"), "")
-    (told,) = written(with_finding(make_diagnosis(1), parameters=(parameter,)))["findings"][0]["parameters"]
-    assert told["value"] == 0.3
-    assert told["standard_error"] is None
+    (stored,) = written(with_finding(make_diagnosis(1), parameters=(parameter,)))["findings"][0]["parameters"]
+    assert stored["value"] == 0.3
+    assert stored["standard_error"] is None
 
 
 def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
@@ -210,9 +211,9 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
     (rival, *_) = diagnosis.findings[0].alternatives
     gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
     said = held_out_gain.said(held_out, "")
-    told = written(with_finding(diagnosis, said, parameters=(errors,), alternatives=(gap,)))
-    (finding,) = told["findings"]
-    assert told["ceiling"] is None
+    stored = written(with_finding(diagnosis, said, parameters=(errors,), alternatives=(gap,)))
+    (finding,) = stored["findings"]
+    assert stored["ceiling"] is None
     assert finding["parameters"][0]["standard_error"] == [None, 0.1]
     assert finding["held_out"]["confidence_interval"] == [None, 0.2]
     assert finding["alternatives"][0]["log_likelihood_gap"] is None
@@ -227,22 +228,22 @@ def test_numbers_that_are_not_finite_are_refused_with_their_place():
 
 
 def test_a_quick_look_has_no_p_value():
-    told = written(with_finding(make_diagnosis(1, p_value=None, quick=True), p_value=None))
-    assert (told["p_value"], told["findings"][0]["p_value"], told["search"]["quick"]) == (None, None, True)
-    for bad in (told | {"p_value": 0.01}, told | {"search": told["search"] | {"quick": False}}):
+    stored = written(with_finding(make_diagnosis(1, p_value=None, quick=True), p_value=None))
+    assert (stored["p_value"], stored["findings"][0]["p_value"], stored["search"]["quick"]) == (None, None, True)
+    for bad in (stored | {"p_value": 0.01}, stored | {"search": stored["search"] | {"quick": False}}):
         with pytest.raises(DiagnosisFileError):
             validate(bad)
 
 
 def test_a_stopped_search_says_why_and_what_was_not_done():
-    told = written(make_diagnosis(0, p_value=None, stop=Stop("time limit", 60.2, ("the search for effects",))))
-    assert told["search"]["stopped"] == {
+    stored = written(make_diagnosis(0, p_value=None, stop=Stop("time limit", 60.2, ("the search for effects",))))
+    assert stored["search"]["stopped"] == {
         "reason": "time limit", "seconds": 60.2, "not_done": ["the search for effects"],
     }  # fmt: skip
     assert written(make_diagnosis(0))["search"]["stopped"] is None
-    del told["search"]["stopped"]["not_done"]
+    del stored["search"]["stopped"]["not_done"]
     with pytest.raises(DiagnosisFileError, match="not_done"):
-        validate(told)
+        validate(stored)
 
 
 def test_missing_evidence_needs_its_reason():
@@ -260,9 +261,9 @@ def test_a_verdict_agrees_with_its_findings():
 
 
 BAD = [
-    (("schema",), "mkc-diagnosis/3"),
-    (("follows",), {"angle": {"unit": "rad"}}),
-    (("noise", "between"), {"torque": "stepped"}),
+    (("schema",), "mkc-diagnosis/2"),
+    (("goodness_of_fit",), {"angle": {"unit": "rad"}}),
+    (("noise", "input_hold"), {"torque": "stepped"}),
     (("search", "starts"), 0),
     (("remaining", "white"), "yes"),
     (("findings", 0, "grade"), "splendid"),
@@ -306,7 +307,7 @@ def test_bad_content_is_refused(content, path, value):
     for step in above:
         place = place[step]
     place[key] = value
-    with pytest.raises(DiagnosisFileError, match="this is no diagnosis: "):
+    with pytest.raises(DiagnosisFileError, match="mkc-diagnosis/3"):
         validate(content)
 
 

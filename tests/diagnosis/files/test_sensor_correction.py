@@ -68,8 +68,8 @@ def test_offset_matrix_current_and_what_lasts_are_exported_whole(terms):
     for field in by_files(correction, of, of["current"].numpy()):
         assert np.abs(field - applied(model, of)).max() < CLOSE
     assert (correction.current is not None) == (CABLE in terms)
-    told = " ".join(correction.left_out)
-    assert ("hard_iron_step is bound to the time" in told) == (STEP in terms)
+    text = " ".join(correction.left_out)
+    assert ("hard_iron_step is bound to the time" in text) == (STEP in terms)
 
 
 def test_a_current_in_other_units_is_one_in_amperes():

@@ -9,7 +9,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
-from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_unfit, make_world, nearest, with_evidence
+from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_unfit, make_environment, nearest, with_evidence
 
 
 def advised(findings=1, *, alternatives=(), **changes):
@@ -62,14 +62,14 @@ def test_what_is_not_plausible_is_not_built_in():
 @pytest.mark.parametrize(
     ("formula", "told"), [("2 |x|^1.5 sign(x)", "the formula 2 |x|^1.5 sign(x)"), ("", "the curve")]
 )
-def test_what_is_only_nearest_is_not_built_in(formula, told):
+def test_what_is_only_nearest_is_not_built_in(formula, text):
     made = make_diagnosis(1, samples=50)
     heat = dataclasses.replace(
         made.findings[0], effect="thermal_loss", advice="Add radiation with this coefficient.", alternatives=()
     )
     (only,) = advice_of(dataclasses.replace(made, findings=(nearest(heat, formula=formula),)))
     assert only.startswith("Do not build thermal_loss in: what this recording shows has another form.")
-    assert told in only
+    assert text in only
     assert "Add radiation" not in only
 
 
@@ -79,19 +79,19 @@ def test_a_simulation_that_does_not_follow_is_mended_first():
 
 
 def test_a_contradiction_never_says_that_the_simulation_can_be_used():
-    lost = make_diagnosis(0, samples=50, world=make_world(follows=LOST, pushes=()))
+    lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=()))
     assert lost.verdict == "adequate"
     assert "Use the simulation as it is" not in " ".join(lost.advice)
-    followed = make_diagnosis(0, samples=50, world=make_world(pushes=()))
+    followed = make_diagnosis(0, samples=50, environment=make_environment(process_noise=()))
     assert followed.advice == ("Use the simulation as it is, within what this recording covers.",)
 
 
 def test_what_pushes_a_state_is_looked_for_and_counted_on():
-    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world()).advice
+    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment()).advice
     assert only.startswith("Look for what drives the rate of `rate`")
     assert "count on 0.23 rad/s² there" in only
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
-    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world(pushes=(slow,))).advice
+    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))).advice
     assert only.startswith("Find out what moves the sensor of `angle` slowly")
 
 
@@ -166,9 +166,9 @@ def test_where_nothing_shows_the_simulation_is_to_be_used():
         ({"remaining": ("load", "rpm")}, "Find out what else goes along with load, rpm"),
     ],
 )
-def test_where_something_shows_it_is_not(changes, told):
+def test_where_something_shows_it_is_not(changes, text):
     (sentence,) = advice_of(make_diagnosis(0, samples=50, **changes))
-    assert sentence.startswith(told)
+    assert sentence.startswith(text)
 
 
 def test_effects_of_the_catalogue_say_what_another_recording_shows():
@@ -178,7 +178,7 @@ def test_effects_of_the_catalogue_say_what_another_recording_shows():
 def test_two_findings_of_one_name_are_told_apart_by_their_place():
     made = make_diagnosis(1, samples=50)
     first = dataclasses.replace(made.findings[0], alternatives=(), channels=("rate of speed",))
-    second = dataclasses.replace(first, grade="not confirmed", channels=("rate of climb",))
-    told = " ".join(advice_of(dataclasses.replace(made, findings=(first, second))))
-    assert "corrects for hard_iron_step on the rate of speed:" in told
-    assert "Do not correct for hard_iron_step on the rate of climb yet" in told
+    second = dataclasses.replace(first, grade="unconfirmed", channels=("rate of climb",))
+    text = " ".join(advice_of(dataclasses.replace(made, findings=(first, second))))
+    assert "corrects for hard_iron_step on the rate of speed:" in text
+    assert "Do not correct for hard_iron_step on the rate of climb yet" in text

@@ -47,11 +47,11 @@ def doubted(tank, name, **shape):
 
 def test_a_number_at_the_end_of_its_range_is_told(tank):
     largest = tank.ports["rate of level"].sizes["own"].largest
-    (told,) = doubted(tank, "overflow", rim=0.98 * largest, exponent=1.7)
-    assert told.startswith("overflow: its rim ended at ")
-    assert "cm, the greatest that is tried" in told
-    (told,) = doubted(tank, "hidden_lag", time_constant=0.4 * 19.9)
-    assert "its time constant ended at 7.96 s, the greatest that is tried" in told
+    (text,) = doubted(tank, "overflow", rim=0.98 * largest, exponent=1.7)
+    assert text.startswith("overflow: its rim ended at ")
+    assert "cm, the greatest that is tried" in text
+    (text,) = doubted(tank, "hidden_lag", time_constant=0.4 * 19.9)
+    assert "its time constant ended at 7.96 s, the greatest that is tried" in text
     assert doubted(tank, "hidden_lag", time_constant=3.0) == ()
 
 
@@ -63,24 +63,24 @@ def test_an_end_that_is_a_value_like_any_other_is_not(tank):
 
 
 def test_an_amplitude_at_its_end_or_ten_times_what_is_plausible_cannot_be(tank):
-    def told(effect, gamma, place):
+    def text(effect, gamma, place):
         term = Term(effect, None, effect.shapes(tank.time)[0], place)
         return far_from_plausible(term, torch.tensor([gamma]).double(), term.context(tank, None))
 
     assert (
-        told(HiddenLag(), 30.0, "lagged rate of level")
+        text(HiddenLag(), 30.0, "lagged rate of level")
         == "Its share ended at 30, the most that is tried: nothing holds it."
     )
-    assert told(HiddenLag(), 29.0, "lagged rate of level") == ""
-    assert told(EFFECTS["dead_zone"], 1.0, "input pump") == ""  # all of a dead zone
+    assert text(HiddenLag(), 29.0, "lagged rate of level") == ""
+    assert text(EFFECTS["dead_zone"], 1.0, "input pump") == ""  # all of a dead zone
 
     class Known(HiddenLag):
         plausible = 0.1
 
     term = Term(Known(), None, Known().shapes(tank.time)[0], "lagged rate of level")
     assert times_plausible(term, torch.tensor([2.0]).double(), term.context(tank, None)) == pytest.approx(20.0)
-    assert told(Known(), 2.0, "lagged rate of level").startswith("Its share is 20 times the largest that is plausible")
-    assert told(Known(), 0.9, "lagged rate of level") == ""
+    assert text(Known(), 2.0, "lagged rate of level").startswith("Its share is 20 times the largest that is plausible")
+    assert text(Known(), 0.9, "lagged rate of level") == ""
 
 
 def test_what_cannot_be_is_not_confirmed_and_says_why():
@@ -88,7 +88,7 @@ def test_what_cannot_be_is_not_confirmed_and_says_why():
     why = "Its share ended at 30, the most that is tried: nothing holds it."
     odd = dataclasses.replace(made.findings[0], cannot_be=True, plausible=False, plausibility=why, alternatives=())
     odd = dataclasses.replace(odd, grade=grade_of(odd))
-    assert (made.findings[0].grade, odd.grade) == ("left out", "not confirmed")
+    assert (made.findings[0].grade, odd.grade) == ("left_out", "unconfirmed")
     diagnosis = dataclasses.replace(made, findings=(odd,))
     assert grade(odd) == "not confirmed, as its size cannot be right"
     assert headline(diagnosis).startswith("Found, but of a size that cannot be right: hard-iron step")

@@ -28,21 +28,21 @@ def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", uni
         (lambda x: 2.0 * x, (-9.0, -1.0), "2 speed m/s² (0 % off)"),
     ],
 )
-def test_known_functions_are_told(make, range_, told):
-    assert formulas(curve(make, *range_)) == (f"δ(rate of speed) = {told}",)
+def test_known_functions_are_told(make, range_, text):
+    assert formulas(curve(make, *range_)) == (f"δ(rate of speed) = {text}",)
 
 
 def test_no_more_terms_than_the_band_asks_for():
     slightly_bent = curve(lambda x: x + 0.02 * x**3, band=0.2)
-    (told,) = formulas(slightly_bent)
-    assert "speed³" not in told
+    (text,) = formulas(slightly_bent)
+    assert "speed³" not in text
     (closer,) = formulas(curve(lambda x: x + 0.02 * x**3, band=1e-4))
     assert "0.02 speed³" in closer
 
 
 def test_what_no_formula_gives_says_how_far_it_is_off():
-    (told,) = formulas(curve(lambda x: torch.sin(6.0 * x), band=1e-3))
-    off = int(told.rpartition("(")[2].split(" %")[0])
+    (text,) = formulas(curve(lambda x: torch.sin(6.0 * x), band=1e-3))
+    off = int(text.rpartition("(")[2].split(" %")[0])
     assert off > 20
 
 

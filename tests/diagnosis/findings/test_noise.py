@@ -28,7 +28,7 @@ def told(step, correlation):
 
 
 def test_an_offset_that_wanders_is_told_with_its_unit():
-    noise = told(0.08, 0.0)
+    noise = text(0.08, 0.0)
     assert noise.model == "random_walk"
     size = f"{noise.parameters['wander']:.2g} µT in all"
     assert noise.description.endswith(f"noise around an offset that wanders like a random walk, by {size}")
@@ -37,7 +37,7 @@ def test_an_offset_that_wanders_is_told_with_its_unit():
 
 
 def test_noise_with_a_memory_is_coloured_and_without_one_white():
-    coloured, white = told(0.0, 0.7), told(0.0, 0.0)
+    coloured, white = text(0.0, 0.7), text(0.0, 0.0)
     assert (coloured.model, white.model) == ("ar", "white")
     # the noise is Gaussian, though the fitted σ need not be infinite
     assert (coloured.description, white.description) == ("Gaussian coloured noise", "Gaussian white noise")

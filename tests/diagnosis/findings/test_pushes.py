@@ -51,9 +51,9 @@ def test_a_push_of_a_rate_has_its_unit_and_one_of_an_output_that_of_the_output()
     prepared = Pendulum().prepare(swung("white", 1)[0])
     noise = noise_of(TRUTH["slow"], WANDER, errors=(0.2, 0.05), gains=(311.0, 12.0))
     rate, angle = pushes_of(prepared, noise)
-    assert (rate.place, rate.at_rate, rate.lasting, rate.size, rate.nats) == ("rate", True, 1.0, 0.3, 311.0)
+    assert (rate.place, rate.at_rate, rate.correlation_time, rate.size, rate.log_likelihood_gain) == ("rate", True, 1.0, 0.3, 311.0)
     assert rate.unit == prepared.ports["rate of rate"].unit == "rad/s/s"
-    assert (angle.place, angle.at_rate, angle.unit, angle.nats) == ("angle", False, "rad", 12.0)
+    assert (angle.place, angle.at_rate, angle.unit, angle.log_likelihood_gain) == ("angle", False, "rad", 12.0)
     # errors are of the logarithm
     assert (rate.standard_error, angle.standard_error) == (pytest.approx(0.06), pytest.approx(0.0005))
 
@@ -106,8 +106,8 @@ def test_a_push_by_itself_is_said_to_be_independent_of_the_input(push, seed):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_push_that_goes_along_with_an_input_is_said_to_with_its_lag(seed):
-    (told,) = forcing("torque", seed)[0].sentences[1:]
-    assert told.startswith("It goes along with torque, 0.3 s after it (correlation 0.9")
+    (text,) = forcing("torque", seed)[0].sentences[1:]
+    assert text.startswith("It goes along with torque, 0.3 s after it (correlation 0.9")
 
 
 def test_it_is_told_along_each_state_and_input_with_units():
@@ -117,18 +117,18 @@ def test_it_is_told_along_each_state_and_input_with_units():
         ("rate", "rad/s", "rad/s/s"),
         ("torque", "", "rad/s/s"),
     ]
-    for one in found.curves:
-        assert one.channels == ("rate of rate",)
-        assert bool((one.x.diff() >= 0).all())
-        assert one.value.shape == one.band.shape == (len(one.x), 1)
-        assert bool((one.band > 0).all())
+    for curve in found.curves:
+        assert curve.channels == ("rate of rate",)
+        assert bool((curve.x.diff() >= 0).all())
+        assert curve.value.shape == curve.band.shape == (len(curve.x), 1)
+        assert bool((curve.band > 0).all())
 
 
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_a_push_by_itself_is_nought_along_what_it_does_not_depend_on_within_the_band(push):
     """Of 240 means with a band of 95 %; a course is smooth, so samples beside each other say little anew."""
-    known = [one for seed in (1, 2, 3, 4) for one in forcing(push, seed)[0].curves]
-    inside = torch.cat([one.value.abs() <= one.band for one in known]).double().mean()
+    known = [curve for seed in (1, 2, 3, 4) for curve in forcing(push, seed)[0].curves]
+    inside = torch.cat([item.value.abs() <= item.band for item in known]).double().mean()
     assert 0.9 <= float(inside) <= 0.99
 
 
@@ -139,14 +139,14 @@ def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
     first = pushes_of(world.fit.model.prepared, world.noise)[0]
     true = TRUTH[push]
     assert (first.place, first.at_rate, first.unit) == ("rate", True, "rad/s/s")
-    assert (first.lasting > 0.0) == (true.lasting > 0.0)
+    assert (first.correlation_time > 0.0) == (true.lasting > 0.0)
     assert true.size / 2.0 < first.size < 2.0 * true.size
-    assert first.nats > 100.0
+    assert first.log_likelihood_gain > 100.0
     found = forcing_of(world.fit, world.noise)[0]
     assert correlation(found.value, swung(push)[1]) > (0.9 if push == "slow" else 0.35)
 
 
 def test_nothing_pushes_where_nothing_does():
     world = swung_in_the_world()
-    assert not world.pushed
+    assert not world.has_disturbances
     assert pushes_of(world.fit.model.prepared, world.noise) == ()

@@ -46,41 +46,41 @@ def reached(sentence):
 
 @pytest.mark.e2e
 def test_an_input_of_the_other_sign_is_told():
-    told = told_of(at(swung(effect=-1.0, N=N)[0]))
-    assert told[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
-    assert reached(told[0]) == pytest.approx(NOISE, rel=0.2)
+    text = told_of(at(swung(effect=-1.0, N=N)[0]))
+    assert text[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
+    assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
     # with its sign turned round it matters
-    assert not any("does not matter" in one for one in told)
+    assert not any("does not matter" in item for item in text)
 
 
 @pytest.mark.e2e
 def test_an_input_that_acts_late_is_told_with_its_delay():
-    told = told_of(at(swung(late=5, N=N)[0]))
-    assert told[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
-    assert reached(told[0]) == pytest.approx(NOISE, rel=0.2)
+    text = told_of(at(swung(late=5, N=N)[0]))
+    assert text[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
+    assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
 
 
 @pytest.mark.e2e
 def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
-    told = told_of(at(swung(N=N)[0], system=UpsideDown))
-    assert told[0].startswith("With `stiffness` = -")
-    assert ", which its range forbids, it follows angle to 0.00" in told[0]
-    value = float(told[0].split("`stiffness` = ")[1].split(",")[0])
+    text = told_of(at(swung(N=N)[0], system=UpsideDown))
+    assert text[0].startswith("With `stiffness` = -")
+    assert ", which its range forbids, it follows angle to 0.00" in text[0]
+    value = float(text[0].split("`stiffness` = ")[1].split(",")[0])
     assert value == pytest.approx(-9.0, abs=0.1)
 
 
 @pytest.mark.e2e
 def test_an_input_that_does_nothing_does_not_matter():
     recording, _ = swung(effect=0.0, N=N)
-    told = told_of(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
-    assert "`torque` does not matter: held at its mean the simulation follows angle as well." in told
+    text = told_of(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
+    assert "`torque` does not matter: held at its mean the simulation follows angle as well." in text
 
 
 @pytest.mark.e2e
 def test_an_input_that_acts_matters():
     """With a fifth of the stiffness missing."""
-    told = told_of(at(swung(N=N)[0], stiffness=7.0))
-    assert not any("does not matter" in one for one in told)
+    text = told_of(at(swung(N=N)[0], stiffness=7.0))
+    assert not any("does not matter" in item for item in text)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +114,8 @@ def test_what_is_no_differential_equation_has_no_range_to_end_at_and_is_told_to_
     line = Line(100)
     fit = fitted(JointModel(line), line.start())
     assert at_ends(fit) == ()
-    (told,) = reasons_of([fit], (make_follows(),))
-    assert "signs, units and the order of columns" in told
+    (text,) = reasons_of([fit], (make_follows(),))
+    assert "signs, units and the order of columns" in text
 
 
 @pytest.fixture
@@ -125,18 +125,18 @@ def _no_trials(monkeypatch):
 
 @pytest.mark.usefixtures("_no_trials")
 def test_an_end_of_a_range_is_told_with_its_value():
-    (told,) = told_of(at(swung(N=N)[0], damping=0.0))
-    assert told.startswith("The fit drives `damping` to the end of its range, 0:")
+    (text,) = told_of(at(swung(N=N)[0], damping=0.0))
+    assert text.startswith("The fit drives `damping` to the end of its range, 0:")
 
 
 @pytest.mark.usefixtures("_no_trials")
 @pytest.mark.parametrize(("damping", "words"), [(1e-4, "nearly 0"), (30.0, "at 1e+02 times the value it began with")])
 def test_a_parameter_that_vanishes_or_runs_away_is_told(damping, words):
-    (told,) = told_of(at(swung(N=N)[0], damping=damping))
-    assert told.startswith(f"The free run follows best with `damping` {words}")
+    (text,) = told_of(at(swung(N=N)[0], damping=damping))
+    assert text.startswith(f"The free run follows best with `damping` {words}")
 
 
 @pytest.mark.usefixtures("_no_trials")
 def test_where_nothing_mends_it_that_is_said_with_what_to_compare():
-    (told,) = told_of(at(swung(N=N)[0]))
-    assert told.startswith("No other start, sign or delay of an input mends it: compare the recording's columns")
+    (text,) = told_of(at(swung(N=N)[0]))
+    assert text.startswith("No other start, sign or delay of an input mends it: compare the recording's columns")

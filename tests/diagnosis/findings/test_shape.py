@@ -50,7 +50,7 @@ def sailed(power, seed):
 
     exact = solve_ivp(rate, (0.0, time[-1]), [0.5], t_eval=time, rtol=1e-8, atol=1e-9, max_step=STEP)
     columns = {"time": time, "thrust": thrust, "speed": exact.y[0] + NOISE * random.standard_normal(N)}
-    return Recording({name: torch.from_numpy(one) for name, one in columns.items()}, name="boat")
+    return Recording({name: torch.from_numpy(column) for name, column in columns.items()}, name="boat")
 
 
 def named(recording, effect):
@@ -58,7 +58,7 @@ def named(recording, effect):
     prepared = Boat().prepare(recording)
     curves = [UnknownRate("own")]
     terms = candidate_terms(prepared, (), [effect, *curves])
-    (term,) = [one for one in terms if one.effect is effect]
+    (term,) = [other_term for other_term in terms if other_term.effect is effect]
     model = JointModel(prepared, (term,))
     start = torch.cat([prepared.start(), torch.full((1,), 0.3, dtype=torch.float64)])
     return fitted(model, start), terms
@@ -73,8 +73,8 @@ def shape(recording, effect, **settings):
 def test_a_name_of_the_right_shape_is_not_doubted_in_ten_draws():
     found = [shape(sailed(2.0, seed), QuadraticDrag()) for seed in SEEDS]
     assert [one.curve for one in found] == [None] * len(found)
-    assert [one.formula for one in found] == [""] * len(found)
-    assert min(one.p_value for one in found) > 0.01
+    assert [element.formula for element in found] == [""] * len(found)
+    assert min(item.p_value for item in found) > 0.01
 
 
 def test_a_name_of_another_shape_is_the_nearest_with_a_formula_that_is_neither_a_line_nor_a_cube():
@@ -103,7 +103,7 @@ def test_how_much_better_a_curve_has_to_be_is_set():
 
 def test_a_curve_claims_no_shape_and_without_curves_there_is_nothing_to_compare_with():
     fit, terms = named(sailed(2.0, 0), QuadraticDrag())
-    assert shape_of(fit, 0, [one for one in terms if not one.effect.is_curve], EvidenceSettings()) is None
+    assert shape_of(fit, 0, [term for term in terms if not term.effect.is_curve], EvidenceSettings()) is None
     curve = named(sailed(2.0, 0), QuadraticDrag())[1][-1]
     assert curve.effect.is_curve
     model = JointModel(fit.model.prepared, (curve,))

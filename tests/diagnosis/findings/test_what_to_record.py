@@ -27,8 +27,8 @@ def diagnosed(temperature, current=CURRENT):
     return result, finding.alternatives[0]
 
 
-def more(told):
-    return float(told.split(" times as many samples")[0].split()[-1])
+def more(text):
+    return float(text.split(" times as many samples")[0].split()[-1])
 
 
 def test_the_state_in_which_they_part_is_told():

@@ -29,4 +29,4 @@ def finding(*numbers):
 def test_what_has_no_size_is_not_confirmed_whatever_blocks_show(numbers, none):
     found = finding(*numbers)
     assert is_zero_within_error(found) is none
-    assert grade_of(found) == ("not confirmed" if none else "left out")
+    assert grade_of(found) == ("unconfirmed" if none else "left_out")

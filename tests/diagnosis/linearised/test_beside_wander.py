@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.noise.bursts import of_all, out_of_bursts, together
+from mkc_torch.diagnosis.noise.bursts import out_of_bursts, rejected_in_all, without_one_sided
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -108,16 +108,16 @@ def test_neighbours_to_one_side_together_do_not_count():
     for n in range(1, 3000):
         slow[n] += 0.98 * slow[n - 1]
     every = torch.ones_like(draws)
-    assert float(together(draws, every, NoiseSettings()).mean()) == 1.0
-    assert float(together(slow, every, NoiseSettings()).mean()) > 0.99
+    assert float(without_one_sided(draws, every, NoiseSettings()).mean()) == 1.0
+    assert float(without_one_sided(slow, every, NoiseSettings()).mean()) > 0.99
     draws[1000:1030, 1] += 1.5
     draws[2000:2600, 0] *= 1.5
-    found = together(draws, every, NoiseSettings())
+    found = without_one_sided(draws, every, NoiseSettings())
     assert float(found[1002:1028, 1].sum()) == 0.0
     assert float(found[:, 0].min()) == 1.0 == float(found[:970, 1].min()) == float(found[1060:, 1].min())
     rejected = every.clone()
     rejected[1000:1030, 1] = 0.0
-    assert float(together(draws, rejected, NoiseSettings())[:, 1].min()) == 1.0
+    assert float(without_one_sided(draws, rejected, NoiseSettings())[:, 1].min()) == 1.0
 
 
 def test_what_is_in_the_midst_of_outliers_is_one():
@@ -134,13 +134,13 @@ def test_what_is_in_the_midst_of_outliers_is_one():
 def test_outliers_that_come_together_count_in_no_channel():
     draws = torch.from_numpy(np.random.default_rng(4).random((2000, 3)))
     apart = (draws > 0.15).double()
-    assert torch.equal(of_all(apart, NoiseSettings()), apart)
-    together = apart.clone()
-    together[:, 1] *= apart[:, 0]
-    together[:, 2] *= (draws[:, 0] > 0.1).double()
-    assert torch.equal(of_all(together, NoiseSettings()), together.amin(1, keepdim=True).expand(-1, 3))
-    assert torch.equal(of_all(apart[:, :1], NoiseSettings()), apart[:, :1])
-    assert torch.equal(of_all(torch.ones_like(apart), NoiseSettings()), torch.ones_like(apart))
+    assert torch.equal(rejected_in_all(apart, NoiseSettings()), apart)
+    without_one_sided = apart.clone()
+    without_one_sided[:, 1] *= apart[:, 0]
+    without_one_sided[:, 2] *= (draws[:, 0] > 0.1).double()
+    assert torch.equal(rejected_in_all(without_one_sided, NoiseSettings()), without_one_sided.amin(1, keepdim=True).expand(-1, 3))
+    assert torch.equal(rejected_in_all(apart[:, :1], NoiseSettings()), apart[:, :1])
+    assert torch.equal(rejected_in_all(torch.ones_like(apart), NoiseSettings()), torch.ones_like(apart))
 
 
 def slow_in_the_world(seed, keep=0.998, size=0.8):
@@ -158,7 +158,7 @@ def test_the_colour_beside_a_wander_is_the_likeliest(seed):
     fit, tangents, local = local_of(walk([0.05] * 3, seed) + slow_in_the_world(seed), "attitude")
     found = local.noise
     beside = replace(tangents.bare, slow=local.slow)
-    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, spectrum=found.colour_beside())
+    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, spectrum=found.stationary_spectrum())
     assert step.evidence < found.evidence + 10.0
     slow = found.spectrum.root.square()
     assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
@@ -205,9 +205,9 @@ def test_another_colour_is_the_search_that_begins_with_it():
         torch.ones_like(fit.residual),
     )
     found = linearise(model, fit.parameters, values, counts, tangents, white=True)
-    spectrum = found.colour_beside()
+    spectrum = found.stationary_spectrum()
     built = linearise(model, fit.parameters, values, counts, tangents, spectrum=spectrum)
-    told = found.recoloured(spectrum)
+    told = found.under(spectrum)
     torch.testing.assert_close(told.series, built.series)
     assert told.evidence == pytest.approx(built.evidence)
     assert told.evidence > found.evidence + 10.0

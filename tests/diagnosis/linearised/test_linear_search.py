@@ -104,7 +104,7 @@ def test_without_wander_gains_are_the_likelihood_ratios_of_least_squares(plain):
 def test_beside_the_likeliest_candidate_is_left_what_least_squares_leaves(plain):
     series = randn(M, 4, seed=8) + torch.cat([2.0 * CANDIDATES[1][:, :1], CANDIDATES[0], 0 * WANDER[:, :2]], -1)
     possible = torch.tensor([True, True, True, False])
-    left, beside, dof = plain.beside_likeliest(series, possible)
+    left, beside, dof = plain.residuals_of_best(series, possible)
     torch.testing.assert_close(left, series - NUISANCE @ torch.linalg.lstsq(NUISANCE, series).solution)
     assert dof[:2].tolist() == [3.0, 1.0]
     score = 0.5 * plain.gains(series).ratio - plain.dof.unsqueeze(-1)

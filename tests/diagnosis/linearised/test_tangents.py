@@ -37,7 +37,7 @@ class Vertical(Offset):
 
 def test_a_parameter_without_a_slope_is_named():
     model = JointModel(Edge())
-    with pytest.raises(NoFitError, match="no finite slope by level, slope at the fitted values"):
+    with pytest.raises(NoFitError, match="no finite derivative by level, slope"):
         tangents_of(model, torch.tensor([1.0, 0.0], dtype=torch.float64), NoiseSettings())
 
 

@@ -140,7 +140,7 @@ def by_differences(model, parameters, port, courses, step=1e-5):
     """Residual tangents of changes at a port, by central differences around what the effects add there."""
     columns = []
     for k in range(courses.shape[-1]):
-        ends = [model.pushed(parameters, port, sign * step * courses[..., k]) for sign in (1.0, -1.0)]
+        ends = [model.residual_with_change(parameters, port, sign * step * courses[..., k]) for sign in (1.0, -1.0)]
         columns.append((ends[0] - ends[1]) / (2.0 * step))
     return torch.stack(columns, -1)
 

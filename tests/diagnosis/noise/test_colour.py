@@ -16,9 +16,9 @@ from mkc_torch.diagnosis.noise.spectrum import (
     NoiseSpectrum,
     _levinson,
     autoregressive,
-    colour_of,
     enters_at_port,
-    port_colour,
+    port_autoregression,
+    spectrum_of,
 )
 from mkc_torch.functional import mkc_energy
 from tests.simulation.tumbling import turns
@@ -116,7 +116,7 @@ def test_draws_do_not_close_in_a_circle():
 @pytest.mark.parametrize("phi", [[], [0.8], [0.97], [1.2, -0.5]])
 def test_the_colour_makes_an_autoregression_white(phi):
     noise = torch.stack([coloured(phi, 4000, seed) for seed in (1, 2)], -1)
-    noise_spectrum = colour_of(dct(noise).square())
+    noise_spectrum = spectrum_of(dct(noise).square())
     white = noise_spectrum.whiten(noise).unflatten(0, (4000, 2))
     assert float(white.square().mean()) == pytest.approx(1.0, abs=0.03)
     # the periodogram is flat in eight bands, the slowest of them narrow
@@ -130,15 +130,15 @@ def test_the_colour_makes_an_autoregression_white(phi):
 
 
 def test_the_colour_knows_the_autoregression():
-    found = colour_of(dct(coloured(AR2.numpy(), 6000).unsqueeze(-1)).square())
+    found = spectrum_of(dct(coloured(AR2.numpy(), 6000).unsqueeze(-1)).square())
     assert found.order == 2
     torch.testing.assert_close(found.coefficients[0], AR2, rtol=0.0, atol=0.05)
-    assert colour_of(dct(randn(6000, 2)).square()).order == 0
+    assert spectrum_of(dct(randn(6000, 2)).square()).order == 0
 
 
 def test_channels_have_a_colour_each():
     noise = torch.stack([coloured([0.9], 4000), 5.0 * randn(4000, seed=3)], -1)
-    noise_spectrum = colour_of(dct(noise).square())
+    noise_spectrum = spectrum_of(dct(noise).square())
     assert [len(phi) for phi in noise_spectrum.coefficients] == [1, 0]
     white = noise_spectrum.whiten(noise).unflatten(0, (4000, 2))
     torch.testing.assert_close(white.square().mean(0), torch.ones(2, dtype=torch.float64), rtol=0.0, atol=0.05)
@@ -151,7 +151,7 @@ def whitened_walks():
     for seed in range(40):
         noise = randn(4000, 1, seed=100 + seed) + 0.01 * randn(4000, 1, seed=200 + seed).cumsum(0)
         noise = noise - noise.mean()
-        power += colour_of(dct(noise).square()).whiten(noise).square() / 40
+        power += spectrum_of(dct(noise).square()).whiten(noise).square() / 40
     assert float(dct(noise)[1:4].square().mean()) > 10.0
     return power
 
@@ -166,7 +166,7 @@ def test_the_slowest_noise_is_followed_too(whitened_walks):
 
 
 def test_a_silent_channel_has_no_colour():
-    noise_spectrum = colour_of(torch.zeros(500, 1, dtype=torch.float64))
+    noise_spectrum = spectrum_of(torch.zeros(500, 1, dtype=torch.float64))
     assert noise_spectrum.order == 0
 
 
@@ -188,9 +188,9 @@ def turning(rate, N=12_000):
 
 def test_noise_of_a_turning_port_is_read_through_the_turns():
     residual, direction = turning(0.1)
-    assert colour_of(dct(residual).square()).order > 1
-    assert port_colour(residual, direction).tolist() == [pytest.approx(0.9, abs=0.02)]
-    assert len(port_colour(randn(2000, 1), direction[:2000])) == 0
+    assert spectrum_of(dct(residual).square()).order > 1
+    assert port_autoregression(residual, direction).tolist() == [pytest.approx(0.9, abs=0.02)]
+    assert len(port_autoregression(randn(2000, 1), direction[:2000])) == 0
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_covariances_that_no_series_has_are_gone_by_as_far_as_they_can_be(covari
 
 
 def test_noise_of_a_port_that_turns_fast_has_a_stationary_colour():
-    phi = port_colour(*turning(0.4))
+    phi = port_autoregression(*turning(0.4))
     poles = np.abs(np.roots([1.0, *(-phi).tolist()]))
     assert poles.size == 0 or poles.max() < 1.0
 
@@ -278,4 +278,4 @@ def test_an_offset_is_no_colour():
     power = torch.randn(400, 2, generator=torch.Generator().manual_seed(12), dtype=torch.float64).square()
     shifted = power.clone()
     shifted[0] = 1e5
-    torch.testing.assert_close(colour_of(shifted).root, colour_of(power).root)
+    torch.testing.assert_close(spectrum_of(shifted).root, spectrum_of(power).root)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.linearized import SearchProblem
@@ -40,7 +40,7 @@ def with_shape(base, effect, shape):
     model = base.model.with_term(Term(effect, None, shape))
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
-    best = fitted_beside(base, model, start)
+    best = fitted_with_effect(base, model, start)
     tangents = tangents_of(best.model, best.parameters, NoiseSettings(), best.model.terms)
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     pseudo, counts = best.pseudo(NoiseSettings())
@@ -76,7 +76,7 @@ def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
     best, look = with_shape(burst, STEP, {"onset": FIRST / RATE + 0.02})
 
     def lost(*args, **kwargs):
-        return dataclasses.replace(fitted_beside(*args, **kwargs), converged=False)
+        return dataclasses.replace(fitted_with_effect(*args, **kwargs), converged=False)
 
     monkeypatch.setattr(closing_in, "fitted_beside", lost)
     assert with_spectrum(best, look) is best

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.noise.innovations import either_way, innovation_gain
+from mkc_torch.diagnosis.noise.innovations import agreed_innovation_gain, innovation_gain
 
 N = 1500
 
@@ -25,15 +25,15 @@ def test_a_fit_that_follows_the_wander_loses_to_one_that_has_what_is_fast():
     follows = knows - 0.3 * slow + FAST
     white = 0.5 * N * float((knows.square().mean() / follows.square().mean()).log())
     assert white > 100.0
-    assert either_way(follows, knows) > 25.0
-    assert either_way(knows, follows) < -25.0
+    assert agreed_innovation_gain(follows, knows) > 25.0
+    assert agreed_innovation_gain(knows, follows) < -25.0
 
 
 def test_it_is_the_least_gain_of_both_noises_or_nothing():
     one, other = wanders(0) + FAST, wanders(0)
     gains = innovation_gain(one, other), -innovation_gain(other, one)
-    assert either_way(one, other) == pytest.approx(min(gains))
-    assert either_way(other, one) == pytest.approx(-min(gains))
+    assert agreed_innovation_gain(one, other) == pytest.approx(min(gains))
+    assert agreed_innovation_gain(other, one) == pytest.approx(-min(gains))
 
 
 def test_where_each_is_the_better_one_in_its_own_noise_neither_is():
@@ -41,7 +41,7 @@ def test_where_each_is_the_better_one_in_its_own_noise_neither_is():
     slow = torch.nn.functional.avg_pool1d(noise.mT, 301, 1, 150, count_include_pad=False).mT
     follows = noise - slow + FAST
     assert innovation_gain(follows, noise) > 0.0 < innovation_gain(noise, follows)
-    assert either_way(follows, noise) == 0.0
+    assert agreed_innovation_gain(follows, noise) == 0.0
 
 
 def test_gains_of_channels_add_up():
@@ -52,7 +52,7 @@ def test_gains_of_channels_add_up():
 
 def test_a_unit_changes_nothing_and_wild_samples_little():
     one, other = wanders(3) + FAST, wanders(3)
-    assert either_way(1e3 * one, 1e3 * other) == pytest.approx(either_way(one, other))
+    assert agreed_innovation_gain(1e3 * one, 1e3 * other) == pytest.approx(agreed_innovation_gain(one, other))
     wild = torch.zeros_like(one)
     wild[700], wild[300] = 1e6, -20.0
-    assert either_way(one + wild, other + wild) == pytest.approx(either_way(one, other), rel=0.1)
+    assert agreed_innovation_gain(one + wild, other + wild) == pytest.approx(agreed_innovation_gain(one, other), rel=0.1)

@@ -123,7 +123,7 @@ def test_the_search_is_done_again_with_the_simulation_under_a_likelier_noise(mon
         bases.append(base)
         found = once(base, terms, *rest)
         likelier = dataclasses.replace(base) if len(bases) == 1 else None
-        return dataclasses.replace(found, first=dataclasses.replace(found.first, alone=likelier))
+        return dataclasses.replace(found, first=dataclasses.replace(found.first, without_candidate=likelier))
 
     monkeypatch.setattr(of_diagnosis, "begun", begun)
     told = []

@@ -42,8 +42,8 @@ def test_a_single_effect_is_never_dropped():
 
 def test_each_disturbance_of_a_fit_has_its_price():
     fit, settings = with_effects("quadratic_drag"), Settings()
-    count = len(noise_of_fit(fit, {}).disturbed.disturbances)
+    count = len(noise_of_fit(fit, {}).selected.disturbances)
     assert count > 0
-    assert fit.log_likelihood - priced(fit, settings) == pytest.approx(count * settings.noise.pushed)
-    free = dataclasses.replace(settings, noise=dataclasses.replace(settings.noise, pushed=0.0))
+    assert fit.log_likelihood - priced(fit, settings) == pytest.approx(count * settings.noise.disturbance_gain)
+    free = dataclasses.replace(settings, noise=dataclasses.replace(settings.noise, disturbance_gain=0.0))
     assert priced(fit, free) == pytest.approx(fit.log_likelihood)

@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.run import run_search
-from mkc_torch.diagnosis.search.screening import p_value_beside
+from mkc_torch.diagnosis.search.screening import screening_p_value
 from mkc_torch.diagnosis.settings import DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -51,7 +51,7 @@ def located(*effects, seed=0):
 
 def p_value(found, others=lambda term: term.columns != ("current",)):
     generator = torch.Generator().manual_seed(0)
-    return p_value_beside(found, [others(term) for term in found.scene.terms], 99, generator)
+    return screening_p_value(found, [others(term) for term in found.scene.terms], 99, generator)
 
 
 def test_another_effect_is_seen():
@@ -94,7 +94,7 @@ def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(mo
         return run_search(*arguments, **options)
 
     def looked(*arguments, **options):
-        seen.append(p_value_beside(*arguments, **options))
+        seen.append(screening_p_value(*arguments, **options))
         return seen[-1]
 
     monkeypatch.setattr(rounds, "locate", counted)

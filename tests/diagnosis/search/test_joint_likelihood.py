@@ -118,5 +118,5 @@ def test_process_noise_is_no_larger_than_the_rates_of_the_recording():
     models = NoiseGrid(scene.counted, found.without).singles()
     values = least.likelihoods(models).without[:, 0]
     # white noise alone is always allowed
-    assert [bool(np.isfinite(value)) for value in values] == [not model.pushes for model in models]
+    assert [bool(np.isfinite(value)) for value in values] == [not model.components for model in models]
     assert np.isfinite(scene.likelihoods(models).without[:, 0]).sum() > 1

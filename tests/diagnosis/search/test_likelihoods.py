@@ -40,7 +40,7 @@ def test_under_white_noise_they_are_those_of_restricted_least_squares():
     np.testing.assert_allclose(found.without[0], level - 0.5 * n * np.log(left(own) / n))
     for number, place in enumerate((slice(0, 1), slice(1, 3))):
         both = np.concatenate([own, candidates[:, place]], 1)
-        np.testing.assert_allclose(found.beside[0, number], level - 0.5 * n * np.log(left(both) / n))
+        np.testing.assert_allclose(found.with_candidate[0, number], level - 0.5 * n * np.log(left(both) / n))
     np.testing.assert_array_equal(found.rank, [1, 2])
 
 
@@ -58,7 +58,7 @@ def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
     flow, _, own, candidates, columns = scene(sizes=(1,), one_sided=(True,))
     y = sign * 5.0 * candidates[:, :1] + 0.1 * own[:, :1]
     found = log_likelihoods(flow, [WHITE], series(y), columns)
-    gain = found.beside[0, 0, 0] - found.without[0, 0]
+    gain = found.with_candidate[0, 0, 0] - found.without[0, 0]
     assert (gain > 10.0) == (sign < 0)
     assert sign < 0 or gain == 0.0
 
@@ -70,7 +70,7 @@ def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
     monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the least, 16 samples
     monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # a model at a time
     blocks = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
-    for name in ("without", "beside", "sizes", "rank", "scale"):
+    for name in ("without", "with_candidate", "sizes", "rank", "scale"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
 
 
@@ -79,7 +79,7 @@ def test_a_candidate_that_changes_nothing_gains_nothing():
     columns = Columns(series(np.concatenate([own, 0.0 * candidates], 1)), 2, (1, 2), (False, False))
     found = log_likelihoods(flow, [WHITE], series(y), columns)
     np.testing.assert_array_equal(found.rank, [0, 0])
-    np.testing.assert_allclose(found.beside[0], found.without[0][None].repeat(2, 0))
+    np.testing.assert_allclose(found.with_candidate[0], found.without[0][None].repeat(2, 0))
 
 
 def test_each_disturbance_has_its_price():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.search.localised import telling_stretch
+from mkc_torch.diagnosis.search.localised import localised_stretch
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, RATE, tumbling, turns
@@ -76,7 +76,7 @@ def stretch():
 
 def test_the_stretch_holds_the_evidence(stretch):
     trace, counts, nuisance = stretch
-    first, end = telling_stretch(trace, counts, trace, nuisance, Settings())
+    first, end = localised_stretch(trace, counts, trace, nuisance, Settings())
     assert first <= 400
     assert end >= 430
     assert end - first == 40
@@ -86,24 +86,24 @@ def test_evidence_that_is_spread_is_in_no_stretch(stretch):
     trace, counts, nuisance = stretch
     for begin in (100, 250):
         trace[begin : begin + 30, 0] = 1.0
-    assert telling_stretch(trace, counts, trace, nuisance, Settings()) is None
+    assert localised_stretch(trace, counts, trace, nuisance, Settings()) is None
 
 
 def test_without_other_bursts_a_stretch_is_evidence(stretch):
     trace, _, nuisance = stretch
-    assert telling_stretch(trace, torch.ones_like(trace), trace, nuisance, Settings()) is None
+    assert localised_stretch(trace, torch.ones_like(trace), trace, nuisance, Settings()) is None
     beside = torch.ones_like(trace)
     beside[395:405] = 0.0  # its own edge
-    assert telling_stretch(trace, beside, trace, nuisance, Settings()) is None
+    assert localised_stretch(trace, beside, trace, nuisance, Settings()) is None
 
 
 def test_what_the_simulation_itself_explains_is_no_evidence(stretch):
     trace, counts, nuisance = stretch
     offset = counts * (trace + 2.0)
-    assert telling_stretch(offset, counts, offset, nuisance, Settings()) is not None
-    assert telling_stretch(offset, counts, offset, nuisance[..., :0], Settings()) is None
+    assert localised_stretch(offset, counts, offset, nuisance, Settings()) is not None
+    assert localised_stretch(offset, counts, offset, nuisance[..., :0], Settings()) is None
 
 
 def test_a_trace_against_the_residual_is_no_evidence(stretch):
     trace, counts, nuisance = stretch
-    assert telling_stretch(-trace, counts, trace, nuisance, Settings()) is None
+    assert localised_stretch(-trace, counts, trace, nuisance, Settings()) is None

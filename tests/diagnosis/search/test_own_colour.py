@@ -8,8 +8,8 @@ import torch
 from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
 from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
 from mkc_torch.diagnosis.noise.imputation import Imputation
-from mkc_torch.diagnosis.noise.spectrum import colour_of, whittle
-from mkc_torch.diagnosis.search.whittle_gain import own_colour_gains
+from mkc_torch.diagnosis.noise.spectrum import spectrum_of, whittle
+from mkc_torch.diagnosis.search.whittle_gain import own_spectrum_gains
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 N, M = 800, 2
@@ -36,7 +36,7 @@ SCALE = torch.tensor([1.0, 30.0]).double()
 
 def searching(size, seed=3):
     values = SCALE * (randn(N, M, seed=seed) + size * EFFECT)
-    spectrum = colour_of(values.square())
+    spectrum = spectrum_of(values.square())
     nuisance, effect, rival = (
         spectrum.scaled(SCALE.unsqueeze(-1) * one) for one in (OFFSET, EFFECT.unsqueeze(-1), RIVAL.unsqueeze(-1))
     )
@@ -57,7 +57,7 @@ def test_an_effect_that_hides_in_the_colour_is_seen_beside_its_own(seed):
     drawn = linearised.search.white(400, torch.Generator().manual_seed(4))
     series = torch.cat([linearised.series.unsqueeze(-1), drawn], -1)
     by_search = 0.5 * linearised.search.gains(series).ratio.amax(0) - 1.0
-    by_colour = own_colour_gains(linearised, series, BOTH)
+    by_colour = own_spectrum_gains(linearised, series, BOTH)
     assert float(by_colour[0]) > 1.5 * float(by_search[0])
     assert float(by_colour[0]) > float(by_colour[1:].max()) + 5.0
     assert float(by_colour[1:].median()) < 3.0
@@ -71,14 +71,14 @@ def test_the_gain_is_the_ratio_of_the_likelihoods_with_colours_of_their_own():
     values[0], columns[0] = 0.0, 0.0  # the offset takes the constant
     size = (values * columns).sum() / columns.square().sum()
     both = [sum(whittle(one.square()[:, j : j + 1]) for j in range(M)) for one in (values - size * columns, values)]
-    found = own_colour_gains(linearised, linearised.series.unsqueeze(-1), BOTH)
+    found = own_spectrum_gains(linearised, linearised.series.unsqueeze(-1), BOTH)
     assert float(found) == pytest.approx(float(both[0] - both[1]) - 1.0, rel=1e-9)
     assert float(found) > 10.0
 
 
 def test_a_candidate_that_is_not_possible_has_no_part():
     linearised = searching(0.5)
-    found = own_colour_gains(linearised, linearised.series.unsqueeze(-1), torch.tensor([True, False]))
+    found = own_spectrum_gains(linearised, linearised.series.unsqueeze(-1), torch.tensor([True, False]))
     assert float(found) < 3.0
 
 
@@ -86,7 +86,7 @@ def test_units_of_the_channels_do_not_matter(monkeypatch):
     first = searching(0.3)
     monkeypatch.setattr(sys.modules[__name__], "SCALE", torch.tensor([1e6, 1e-6]).double())
     other = searching(0.3)
-    gains = [own_colour_gains(one, one.series.unsqueeze(-1), BOTH) for one in (first, other)]
+    gains = [own_spectrum_gains(one, one.series.unsqueeze(-1), BOTH) for one in (first, other)]
     torch.testing.assert_close(*gains)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mkc_torch.diagnosis.linearised.linear_search import SearchGains, log_survival
 from mkc_torch.diagnosis.search import p_value as judge
-from mkc_torch.diagnosis.search.p_value import either
+from mkc_torch.diagnosis.search.p_value import best_rank_p_value
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 DRAWS = 99
@@ -39,7 +39,7 @@ def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search, series=torch.zeros(1))
     possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
-    return judge.judged(
+    return judge.surrogate_p_value(
         linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None, NoiseSettings()
     )
 
@@ -92,6 +92,6 @@ def test_either_statistic_may_speak_and_the_p_value_keeps_its_level(seed, count,
     both = torch.randn(2, count, generator=torch.Generator().manual_seed(seed))
     both[1] += 3.0 * common * both[0]
     both = both.round() if ties else both
-    p_values = torch.tensor([either(*both.roll(-place, -1)) for place in range(count)])
+    p_values = torch.tensor([best_rank_p_value(*both.roll(-place, -1)) for place in range(count)])
     for level in p_values.unique().tolist():
         assert float((p_values <= level).double().mean()) <= level + 1e-6

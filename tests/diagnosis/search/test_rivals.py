@@ -55,7 +55,7 @@ def judged(monkeypatch):
         monkeypatch.setattr(rivals, "_tried", tried)
         monkeypatch.setattr(rivals, "at_once", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
-        scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, bends=lambda term: term.port == BENT)
+        scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, is_nonlinear=lambda term: term.port == BENT)
         found, told = by_joint_fits(
             best, ranking, SimpleNamespace(scene=scene, settings=Settings()), Indifferent(**new), known
         )

@@ -28,7 +28,7 @@ def differentiated(loss, logits, target, upstream=1.0):
     leaf = logits.clone().requires_grad_()
     value = loss(leaf, target)
     grad = torch.full_like(value, upstream) if isinstance(upstream, float) else upstream.to(value)
-    return [one.detach().cpu().double() for one in (value, *torch.autograd.grad(value, leaf, grad))]
+    return [entry.detach().cpu().double() for entry in (value, *torch.autograd.grad(value, leaf, grad))]
 
 
 def assert_agrees(device, logits, target, upstream=1.0, **options):
@@ -39,8 +39,8 @@ def assert_agrees(device, logits, target, upstream=1.0, **options):
     found = differentiated(loss, logits.to(device), target.to(device), upstream)
     expected = differentiated(reference, logits.double(), target, upstream)
     tolerance = TOLERANCE[logits.dtype]
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -80,13 +80,13 @@ def test_each_row_may_have_its_own_upstream_gradient_and_logits_gaps_in_memory(d
 @pytest.mark.parametrize("classes", [3, 4500])
 def test_what_ignored_rows_hold_reaches_nothing(device, reduction, classes):
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
-    logits, target = (one.to(device) for one in data(4, classes, torch.float32))
+    logits, target = (value.to(device) for value in data(4, classes, torch.float32))
     expected = differentiated(loss, logits, target)
     logits[target == -100] = NAN
     assert all(map(torch.equal, differentiated(loss, logits, target), expected))
     assert (expected[1][target.cpu() == -100] == 0).all()
     nothing = differentiated(loss, logits, torch.full_like(target, -100))
-    assert all((one == 0).all() for one in nothing)
+    assert all((value == 0).all() for value in nothing)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
@@ -110,7 +110,7 @@ def test_impossible_classes(device, sigma, classes):
 @pytest.mark.parametrize("classes", [3, 4500])
 def test_nan_and_infinite_logits_and_labels_out_of_range_come_out_as_nan(device, bad, sigma, classes):
     loss = GeneralizedCrossEntropyLoss(sigma, reduction="none", impl="triton").to(device)
-    logits, target = (one.to(device) for one in data(4, classes, torch.float32))
+    logits, target = (entry.to(device) for entry in data(4, classes, torch.float32))
     logits[0, 2] = bad
     target[2] = classes
     value, slope = differentiated(loss, logits, target)
@@ -134,13 +134,13 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
             assert torch.equal(first, kept)
             (slope,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
             bends = torch.autograd.grad((slope**2).sum(), leaf)
-            results.append([one.cpu() for one in (first, second, slope, *bends)])
+            results.append([entry.cpu() for entry in (first, second, slope, *bends)])
         torch.testing.assert_close(*results, rtol=1e-10, atol=1e-12)
 
 
 def test_a_new_sigma_leaves_the_gradient_of_a_pass_before_as_it_was(device):
     loss = GeneralizedCrossEntropyLoss(impl="triton").to(device)
-    logits, target = (one.to(device) for one in data(6, 3, torch.float32))
+    logits, target = (entry.to(device) for entry in data(6, 3, torch.float32))
     _, expected = differentiated(loss, logits, target)
     value = loss(logits.requires_grad_(), target)
     loss.sigma = 0.6
@@ -150,7 +150,7 @@ def test_a_new_sigma_leaves_the_gradient_of_a_pass_before_as_it_was(device):
 
 def test_other_targets_shapes_and_transforms_take_the_formulas(device):
     own, other = (GeneralizedCrossEntropyLoss(impl=impl).double().to(device) for impl in ("triton", "eager"))
-    logits, target = (one.to(device) for one in data(6, 4))
+    logits, target = (value.to(device) for value in data(6, 4))
     target = target.clamp(min=0)
     for given in (
         (logits, torch.softmax(logits, 1)),
@@ -174,7 +174,7 @@ def test_other_targets_shapes_and_transforms_take_the_formulas(device):
 def test_operators_are_well_formed(device, dtype, weighted):
     from mkc_torch.losses.kernels import label_operators as operators
 
-    logits, target = (one.to(device) for one in data(5, 4, dtype))
+    logits, target = (value.to(device) for value in data(5, 4, dtype))
     weight = torch.tensor([1.0, 0.5, 2.0, 0.1], device=device) if weighted else None
     kappa = torch.tensor(0.7, device=device)
     given = (logits.clone().requires_grad_(), target, kappa, weight, -100)
@@ -191,8 +191,8 @@ def test_compiled_is_eager(device, reduction, dtype):
     torch.compiler.reset()
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    logits, target = (one.to(device) for one in data(20, 4, dtype))
-    found, expected = (differentiated(one, logits, target, 100.0) for one in (compiled, loss))
+    logits, target = (value.to(device) for value in data(20, 4, dtype))
+    found, expected = (differentiated(value, logits, target, 100.0) for value in (compiled, loss))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
 
 

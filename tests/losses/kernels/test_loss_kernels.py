@@ -46,7 +46,7 @@ def step(loss, x, y, weight=None, upstream=1.0):
     value = loss(x, y, weight)
     value.backward(torch.full_like(value, upstream))
     grads = [x.grad, y.grad, *(p.grad for p in loss.parameters())]
-    return [one.detach().cpu().double() for one in (value, *grads)]
+    return [grad.detach().cpu().double() for grad in (value, *grads)]
 
 
 def assert_agrees(
@@ -62,9 +62,9 @@ def assert_agrees(
         own_weight = None if weight is None else weight.to(device, dtype)
         found = step(kernel, x.to(device), y.to(device), own_weight, upstream)
         expected = step(eager, x.double(), y.double(), None if weight is None else weight.to(dtype).double(), upstream)
-        for one, other in zip(found, expected, strict=True):
+        for entry, other in zip(found, expected, strict=True):
             largest = max(float(other.abs().max()), 1e-2)
-            torch.testing.assert_close(one, other, rtol=0.0, atol=TOLERANCE[dtype] * largest)
+            torch.testing.assert_close(entry, other, rtol=0.0, atol=TOLERANCE[dtype] * largest)
     if dtype in (torch.float32, torch.float64):
         for name, value in eager.state_dict().items():
             other = kernel.state_dict()[name].cpu().double()
@@ -115,8 +115,8 @@ def test_the_schedule_is_annealed_as_by_torch(device):
         x, y = data((64, 1), seed=seed)
         y[::4] += 20.0
         found, expected = (step(loss, x.to(device), y.to(device)) for loss in (kernel, eager))
-        for one, other in zip(found, expected, strict=True):
-            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8)
+        for value, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(value, other, rtol=1e-6, atol=1e-8)
     assert 0.0 < kernel.schedule.share.item() <= 1.0
     assert torch.equal(kernel.schedule.share, eager.schedule.share)
 
@@ -124,7 +124,7 @@ def test_the_schedule_is_annealed_as_by_torch(device):
 @pytest.mark.parametrize("mode", ["learned", "as it comes"])
 def test_two_backward_passes_of_one_graph_give_the_same_bits(device, mode):
     loss = MKCLoss(2, impl="triton", **MODES[mode]).to(device)
-    x, y = (one.to(device) for one in data((30, 2), torch.float32))
+    x, y = (entry.to(device) for entry in data((30, 2), torch.float32))
     leaves = [x.requires_grad_(), *loss.parameters()]
     value = loss(x, y)
     first = torch.autograd.grad(value, leaves, torch.tensor(3.0, device=device), retain_graph=True)
@@ -149,25 +149,25 @@ def test_second_derivatives_are_those_of_torch(device, mode):
 @pytest.mark.parametrize("mode", ["learned", "as it comes"])
 def test_what_is_not_finite_shows_in_the_gradient_and_stays_out_of_the_state(device, mode, value):
     loss = MKCLoss(1, impl="triton", **MODES[mode]).to(device)
-    x, y = (one.to(device) for one in data((30, 1), torch.float32))
+    x, y = (entry.to(device) for entry in data((30, 1), torch.float32))
     y[3] = value
     assert not step(loss, x, y)[1].isfinite().all()
     assert all(buffer.isfinite().all() for buffer in loss.buffers())
 
 
 def test_what_is_masked_reaches_neither_value_nor_gradient_nor_state(device):
-    x, y = (one.to(device) for one in data((30, 2), torch.float32))
+    x, y = (value.to(device) for value in data((30, 2), torch.float32))
     mask = torch.rand(30, 2, generator=torch.Generator().manual_seed(1)).to(device) < 0.7
     clean, dirty = (MKCLoss(2, impl="triton").to(device) for _ in range(2))
     found = step(clean, x, y, mask)
     other = step(dirty, torch.where(mask, x, NAN), torch.where(mask, y, INF), mask)
-    for one, spoilt in zip(found, other, strict=True):
-        torch.testing.assert_close(one, spoilt)
+    for value, spoilt in zip(found, other, strict=True):
+        torch.testing.assert_close(value, spoilt)
     assert all(torch.equal(a, b) for a, b in zip(clean.buffers(), dirty.buffers(), strict=True))
 
 
 def test_a_loss_that_has_seen_nothing_takes_its_scale_from_the_batch_it_evaluates(device):
-    x, y = (one.to(device) for one in data((60, 2), torch.float32))
+    x, y = (value.to(device) for value in data((60, 2), torch.float32))
     kernel, eager = (MKCLoss(2, impl=impl).to(device).eval() for impl in ("triton", "eager"))
     torch.testing.assert_close(kernel(x, 100.0 * y), eager(x, 100.0 * y))
     assert int(kernel.residual_scale.batches.sum()) == 0
@@ -183,9 +183,9 @@ def test_compiled_training_is_eager_training_over_sizes(device, mode, reduction)
     own = copy.deepcopy(eager)
     compiled = torch.compile(own, fullgraph=True, backend="aot_eager")
     for count in (20, 20, 31):
-        x, y = (one.to(device) for one in data((count, 3), torch.float32, seed=count))
-        for one, other in zip(step(eager, x, y), step(_Named(compiled, own), x, y), strict=True):
-            torch.testing.assert_close(one, other)
+        x, y = (value.to(device) for value in data((count, 3), torch.float32, seed=count))
+        for value, other in zip(step(eager, x, y), step(_Named(compiled, own), x, y), strict=True):
+            torch.testing.assert_close(value, other)
     assert all(torch.equal(a, b) for a, b in zip(eager.buffers(), own.buffers(), strict=True))
 
 
@@ -207,9 +207,9 @@ def test_operators_are_well_formed(device, mode):
     from mkc_torch.losses.kernels.loss import options_of, request_of
 
     loss = MKCLoss(3, impl="triton", **MODES[mode]).to(device)
-    x, y = (one.to(device) for one in data((20, 3), torch.float32))
+    x, y = (value.to(device) for value in data((20, 3), torch.float32))
     request, options = request_of(loss, x.device), list(options_of(loss))
-    copies = [None if one is None else one.detach().clone() for one in (*request[:4], *request.running)]
+    copies = [None if value is None else value.detach().clone() for value in (*request[:4], *request.running)]
     table = torch.zeros(len(TABLE), 3, device=device)
     given = (table, x, y, None, 1, *copies, options, request.updates, *request[-2:])
     torch.library.opcheck(operators.channel_table, given)

@@ -32,10 +32,10 @@ def weights(kind, *shape):
 
 def differentiated(loss, tensors, weight, upstream=1.0):
     """Value, and gradients by input, target, sigma and d."""
-    leaves = [one.clone().requires_grad_() for one in tensors]
+    leaves = [tensor.clone().requires_grad_() for tensor in tensors]
     value = loss(*leaves, weight)
     grad = torch.full_like(value, upstream) if isinstance(upstream, float) else upstream.to(value)
-    return [one.detach().cpu().double() for one in (value, *torch.autograd.grad(value, leaves, grad))]
+    return [entry.detach().cpu().double() for entry in (value, *torch.autograd.grad(value, leaves, grad))]
 
 
 def assert_agrees(device, tensors, weight=None, bound=30.0, upstream=1.0, **options):
@@ -43,19 +43,19 @@ def assert_agrees(device, tensors, weight=None, bound=30.0, upstream=1.0, **opti
     dtype = torch.promote_types(tensors[0].dtype, torch.float32)
     found = differentiated(
         HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=dtype), impl="triton", **options).to(device),
-        [one.to(device) for one in tensors],
+        [tensor.to(device) for tensor in tensors],
         None if weight is None else weight.to(device),
         upstream,
     )
     expected = differentiated(
         HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=torch.float64), impl="eager", **options),
-        [one.double() for one in tensors],
+        [tensor.double() for tensor in tensors],
         weight,
         upstream,
     )
     tolerance = TOLERANCE[tensors[0].dtype]
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -80,7 +80,7 @@ def test_bounds_of_channels(device, shape, channel_dim, reduction):
     bound = torch.tensor([9.0, 40.0, 90.0])
     tensors = data(*shape, dtype=torch.float32)
     assert_agrees(device, tensors, bound=bound, channel_dim=channel_dim, reduction=reduction)
-    last = [one.movedim(channel_dim, -1).contiguous().movedim(-1, channel_dim) for one in tensors]
+    last = [tensor.movedim(channel_dim, -1).contiguous().movedim(-1, channel_dim) for tensor in tensors]
     mixed = [last[0], tensors[1], last[2], tensors[3]]
     weight = weights("weighted", *shape).select(channel_dim, 0)
     assert_agrees(device, mixed, weight, bound=bound, channel_dim=channel_dim, reduction=reduction)
@@ -111,28 +111,28 @@ def test_what_is_masked_reaches_neither_value_nor_gradient(device, reduction, po
     loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
     mask = torch.ones(5, 3, dtype=torch.bool, device=device)
     mask[1, 2] = mask[4, 0] = False
-    tensors = [one.to(device) for one in data(5, 3, dtype=torch.float32)]
+    tensors = [value.to(device) for value in data(5, 3, dtype=torch.float32)]
     expected = differentiated(loss, tensors, mask)
-    for one in tensors:
-        one[~mask] = poison
+    for tensor in tensors:
+        tensor[~mask] = poison
     found = differentiated(loss, tensors, mask)
     assert all(map(torch.equal, found, expected))
-    assert all((one[~mask.cpu()] == 0).all() for one in found[1:])
+    assert all((value[~mask.cpu()] == 0).all() for value in found[1:])
     nothing = differentiated(loss, tensors, torch.zeros(5, device=device))
-    assert all((one == 0).all() for one in nothing)
+    assert all((value == 0).all() for value in nothing)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
 @pytest.mark.parametrize("which", range(4))
 def test_nan_comes_out_as_nan(device, which):
-    tensors = [one.to(device) for one in data(5, 3, dtype=torch.float32)]
+    tensors = [entry.to(device) for entry in data(5, 3, dtype=torch.float32)]
     tensors[which][2, 1] = NAN
     value, *slopes = differentiated(
         HeteroscedasticMKCLoss(100.0, reduction="none", impl="triton").to(device), tensors, None
     )
-    for one in (value, *slopes):
-        assert one[2, 1].isnan()
-        assert one.isnan().sum() == 1
+    for slope in (value, *slopes):
+        assert slope[2, 1].isnan()
+        assert slope.isnan().sum() == 1
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # NumPy's, in the interpreter
@@ -144,7 +144,7 @@ def test_an_extreme_outlier_leaves_finite_gradients(device, size, sigma):
     value, *slopes = differentiated(HeteroscedasticMKCLoss(50.0, impl="triton").to(device), tensors, None)
     if sigma < INF:
         assert value.isfinite()
-        assert all(one.isfinite().all() for one in slopes)
+        assert all(slope.isfinite().all() for slope in slopes)
     assert slopes[2].isfinite().all()
 
 
@@ -154,21 +154,21 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
         results = []
         for impl, where in (("triton", device), ("eager", torch.device("cpu"))):
             loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl=impl).double().to(where)
-            leaves = [one.to(where).requires_grad_() for one in tensors]
+            leaves = [tensor.to(where).requires_grad_() for tensor in tensors]
             value = loss(*leaves)
             first = torch.autograd.grad(3.0 * value.sum(), leaves, retain_graph=True)
-            kept = [one.clone() for one in first]
+            kept = [entry.clone() for entry in first]
             second = torch.autograd.grad(2.0 * value.sum(), leaves, retain_graph=True)
             assert all(map(torch.equal, first, kept))
             slopes = torch.autograd.grad(value.sum(), leaves, create_graph=True)
-            bends = torch.autograd.grad(sum((one**2).sum() for one in slopes), leaves)
-            results.append([one.cpu() for one in (*first, *second, *slopes, *bends)])
+            bends = torch.autograd.grad(sum((slope**2).sum() for slope in slopes), leaves)
+            results.append([entry.cpu() for entry in (*first, *second, *slopes, *bends)])
         torch.testing.assert_close(*results, rtol=1e-9, atol=1e-11)
 
 
 def test_gradients_that_are_not_wanted_are_not_made(device):
     loss = HeteroscedasticMKCLoss(30.0, impl="triton").to(device)
-    x, y, sigma, d = (one.to(device) for one in data(5, 3, dtype=torch.float32))
+    x, y, sigma, d = (value.to(device) for value in data(5, 3, dtype=torch.float32))
     expected = differentiated(loss, [x, y, sigma, d], None)
     d.requires_grad_()
     (found,) = torch.autograd.grad(loss(x, y, sigma, d), d)
@@ -182,7 +182,7 @@ def test_gradients_that_are_not_wanted_are_not_made(device):
 
 def test_shared_scales_transforms_and_differentiable_weights_take_the_formulas(device):
     own, other = (HeteroscedasticMKCLoss(30.0, impl=impl).double().to(device) for impl in ("triton", "eager"))
-    x, y, sigma, d = (one.to(device) for one in data(5, 3))
+    x, y, sigma, d = (value.to(device) for value in data(5, 3))
     assert torch.equal(own(x, y, sigma[:, :1], d), other(x, y, sigma[:, :1], d))
     weight = torch.ones_like(x).requires_grad_()
     found, expected = (torch.autograd.grad(loss(x, y, sigma, d, weight), weight) for loss in (own, other))
@@ -195,7 +195,7 @@ def test_shared_scales_transforms_and_differentiable_weights_take_the_formulas(d
 
 
 def operands(dtype, weighted, device):
-    tensors = [one.to(device).requires_grad_() for one in data(4, 3, dtype=dtype)]
+    tensors = [value.to(device).requires_grad_() for value in data(4, 3, dtype=dtype)]
     weight = weights(weighted, 4, 3)
     bound = torch.tensor([9.0, 40.0, 90.0], device=device)
     return (*tensors, None if weight is None else weight.to(device), bound, 1)
@@ -210,7 +210,7 @@ def test_operators_are_well_formed(device, dtype, weighted):
     torch.library.opcheck(operators.sample_values, given)
     torch.library.opcheck(operators.reduced_sample_loss, (*given, True, [True, True, True]))
     grad = torch.tensor(2.0, device=device)
-    detached = [one.detach() if isinstance(one, torch.Tensor) else one for one in given]
+    detached = [value.detach() if isinstance(value, torch.Tensor) else value for value in given]
     torch.library.opcheck(operators.sample_slopes, (*detached, True, [True, False, True], grad))
 
 
@@ -222,11 +222,11 @@ def test_compiled_is_eager(device, reduction, dtype):
     torch.compiler.reset()
     loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    tensors = [one.to(device) for one in data(20, 3, dtype=dtype)]
+    tensors = [value.to(device) for value in data(20, 3, dtype=dtype)]
     weight = weights("weighted", 20, 3).to(device)
     upstream = 100.0 if dtype == torch.float16 else 1.7
     for given in (None, weight):
-        found, expected = (differentiated(one, tensors, given, upstream) for one in (compiled, loss))
+        found, expected = (differentiated(value, tensors, given, upstream) for value in (compiled, loss))
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
 
 

@@ -1,4 +1,4 @@
-"""A damped oscillator that is pushed: its flow by the matrix exponential, and recordings whose pushes are known."""
+"""A damped oscillator with process noise: its exact flow, and recordings with known disturbances."""
 
 from dataclasses import replace
 
@@ -33,12 +33,12 @@ def oscillator(**attributes):
 
 
 def theta_of(prepared):
-    """The true parameters, with runs that begin at rest."""
+    """The true parameters; each run starts at 0 with speed 0."""
     return torch.tensor([STIFFNESS, DAMPING] + [0.0] * prepared.beginnings, dtype=torch.float64)
 
 
 def held(slope, step):
-    """What a step makes of states, and of a push of the last rate that is held: (n, n) and (n, 1)."""
+    """Exact transition, (n, n), and response to a constant disturbance of the last rate, (n, 1), over a step."""
     n = len(slope)
     joined = np.zeros((n + 1, n + 1))
     joined[:n, :n], joined[n - 1, n] = slope, 1.0
@@ -47,7 +47,7 @@ def held(slope, step):
 
 
 def flow(count, seen=((1.0, 0.0),), runs=1, step=STEP):
-    """The oscillator at rest, its speed's rate pushed: so many samples in each of so many runs, and no residual yet."""
+    """The flow of the oscillator at 0, disturbed at its speed's rate: ``count`` samples a run, and residual 0."""
     seen = np.atleast_2d(seen)
     A, B = held(SLOPE, step)
     N = count * runs
@@ -65,7 +65,7 @@ def flow(count, seen=((1.0, 0.0),), runs=1, step=STEP):
 
 
 def course(random, flow, lasting, size):
-    """A random push at the samples, (N,), that forgets itself in a time or at once; anew in each run."""
+    """A random disturbance at the samples, (N,), white or with a time constant, independent in each run."""
     shock = size * random.standard_normal(len(flow.new))
     value = shock.copy()
     for row, step in enumerate(flow.step):
@@ -75,16 +75,16 @@ def course(random, flow, lasting, size):
     return value
 
 
-def pushed(flow, push):
-    """States that begin at rest and are pushed from each sample to the next, (N, n)."""
-    states = np.zeros((len(flow.new), flow.carried.shape[1]))
+def disturbed_states(flow, disturbance):
+    """States that start at 0 under a disturbance that is constant between samples, (N, n)."""
+    states = np.zeros((len(flow.new), flow.transition.shape[1]))
     for row in range(len(flow.step)):
-        states[row + 1] = flow.carried[row] @ states[row] + flow.pushed[row] @ np.atleast_1d(push[row])
+        states[row + 1] = flow.transition[row] @ states[row] + flow.noise_input[row] @ np.atleast_1d(disturbance[row])
     return states
 
 
-def answering(flow, states, noise=0.0):
-    """The flow with the residual that such states and such a noise leave."""
+def with_residual(flow, states, noise=0.0):
+    """The flow with the residual of these states and this noise."""
     return replace(flow, new=np.einsum("nij,nj->ni", flow.seen, states) + noise)
 
 
@@ -95,4 +95,4 @@ def recorded(flow, runs=1, **columns):
     table = {"time": torch.from_numpy(np.tile(np.arange(count) * step, runs))}
     if runs > 1:
         table["experiment"] = torch.arange(runs).repeat_interleave(count)
-    return Recording(table | {name: torch.as_tensor(np.ascontiguousarray(one)) for name, one in columns.items()})
+    return Recording(table | {name: torch.as_tensor(np.ascontiguousarray(values)) for name, values in columns.items()})

@@ -1,4 +1,4 @@
-"""The classical method of fourth order, step by step: an oracle that shares nothing with collocation."""
+"""The classical method of fourth order, step by step: a reference that is independent of collocation."""
 
 from itertools import pairwise
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def runge_kutta(rate, first, time, parts=20):
-    """States at the times, (N, n), of ``rate(t, y)``; each interval in so many steps."""
+    """States at the times, (N, n), of ``rate(t, y)``; with ``parts`` steps an interval."""
     states = [np.asarray(first, dtype=float)]
     for early, late in pairwise(time):
         y, h = states[-1], (late - early) / parts

@@ -11,21 +11,21 @@ from mkc_torch.simulation.protocol import SignalTimes
 
 
 def clock_of(time, begins, share):
-    """A moment in each interval of a run, so far from its beginning."""
+    """A time in each interval of a run, at this share of the interval."""
     before = torch.arange(len(time) - 1)[~begins[1:]]
     shares = torch.full((len(before),), share, dtype=torch.float64)
     return SignalTimes(torch.lerp(time[before], time[before + 1], shares), before, before + 1, shares)
 
 
 def runs_of(*lengths, seed=0):
-    """Irregular times of several runs, and where they begin."""
+    """Irregular times of several runs, and the mask of their starts."""
     random = np.random.default_rng(seed)
     time = torch.from_numpy(np.concatenate([np.cumsum(random.uniform(0.5, 1.5, n)) for n in lengths]))
     return time, torch.cat([torch.arange(n) == 0 for n in lengths])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.75])
-def test_held_is_the_sample_before_and_linear_the_line_between(share):
+def test_held_and_linear_interpolation_match_their_definitions(share):
     time, begins = runs_of(7, 9)
     values = torch.stack([time.sin(), time.square()], -1)
     clock = clock_of(time, begins, share)
@@ -43,12 +43,12 @@ def test_held_is_the_sample_before_and_linear_the_line_between(share):
     share=st.floats(0.0, 1.0),
 )
 @settings(max_examples=25, deadline=None, derandomize=True)
-def test_polynomials_of_fifth_degree_are_found_smoothly_in_each_run(coefficients, lengths, share):
+def test_smooth_interpolation_reproduces_polynomials_of_fifth_degree_in_each_run(coefficients, lengths, share):
     time, begins = runs_of(*lengths)
     run = begins.long().cumsum(0)
 
     def course(t, number):
-        # another one in each run, and far from the neighbours'
+        # a different polynomial in each run, far from those of its neighbours
         x = t / 5.0
         return sum(c * x**k for k, c in enumerate(coefficients)) * number + 1e3 * number
 
@@ -58,7 +58,7 @@ def test_polynomials_of_fifth_degree_are_found_smoothly_in_each_run(coefficients
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-6)
 
 
-def test_at_the_samples_it_is_the_samples():
+def test_interpolation_at_the_samples_returns_the_samples():
     time, begins = runs_of(12, 8)
     values = torch.randn(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for how in ("held", "linear", "smooth"):
@@ -67,7 +67,7 @@ def test_at_the_samples_it_is_the_samples():
 
 
 @pytest.mark.parametrize("length", [2, 3, 5])
-def test_a_run_of_fewer_than_six_samples_has_lines(length):
+def test_runs_of_fewer_than_six_samples_are_interpolated_linearly(length):
     time, begins = runs_of(10, length, 10)
     values = (time / 5.0).pow(3).unsqueeze(-1)
     clock = clock_of(time, begins, 0.5)

@@ -1,4 +1,4 @@
-"""First fits from parameters that are far off, over horizons so short that no trajectory gets lost."""
+"""First fits over short horizons from poor guesses of the parameters."""
 
 import copy
 
@@ -29,22 +29,22 @@ def rate(_, y):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A pendulum that swings for twenty seconds, prepared."""
+    """A prepared pendulum that swings for 20 s."""
     angle = runge_kutta(rate, FIRST, 0.05 * np.arange(400), parts=5)[:, 0]
     return Pendulum().prepare(recorded(ALONG, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("stiffness", "damping"), [(90.0, 1.5), (90.0, 0.015), (0.9, 1.5)])
-def test_parameters_ten_times_off_are_brought_home(pendulum, stiffness, damping):
+def test_parameters_off_by_a_factor_of_ten_are_recovered(pendulum, stiffness, damping):
     guess = torch.cat([torch.tensor([stiffness, damping], dtype=torch.float64), pendulum.given[2:]])
     found = multiple_shooting_start(pendulum, guess)
     assert float(found[0]) == pytest.approx(STIFFNESS, rel=0.05)
     assert float(found[1]) == pytest.approx(DAMPING, abs=0.1)
     assert found[2:].tolist() == pytest.approx(FIRST, abs=0.15)
-    # a free run from there keeps step to the end
+    # the open loop stays in phase to the end
     assert float(pendulum.residual(found, {}).abs().max()) < 0.5
-    # or is lost on the way, by a last bit
+    # NaN counts too: rounding decides whether it diverges
     assert not float(pendulum.residual(guess, {}).abs().max()) <= 1.5
 
 
@@ -59,7 +59,7 @@ def test_bounds_are_kept(pendulum):
     assert float(found[1]) >= 0.3
 
 
-def test_there_is_none_where_no_rate_moves_an_output():
+def test_no_fit_where_no_rate_moves_an_output():
     def output(self, time, x, u, p):  # noqa: ARG001
         return {"position": 0.0 * x.position + p.stiffness}
 
@@ -68,18 +68,20 @@ def test_there_is_none_where_no_rate_moves_an_output():
     assert strong_observer(prepared, theta_of(prepared), 10.0) is None
 
 
-def test_there_is_none_where_the_equations_cannot_be_looked_at(pendulum):
+def test_no_fit_where_the_equations_are_not_finite(pendulum):
     nowhere = torch.tensor([np.nan, 1.0, *FIRST], dtype=torch.float64)
     assert strong_observer(pendulum, nowhere, 10.0) is None
     assert multiple_shooting_start(pendulum, nowhere) is None
 
 
-def test_a_stronger_observer_follows_a_recording_closer(pendulum):
+def test_a_stronger_observer_has_smaller_prediction_errors(pendulum):
     guess = torch.tensor([30.0, 1.0, *FIRST], dtype=torch.float64)
     left = []
     for size in (1.0, 10.0, 100.0):
         observer = strong_observer(pendulum, guess, size)
-        assert [(one.place, one.at_rate, one.lasting) for one in observer.disturbances] == [("speed", True, 0.0)]
+        assert [
+            (disturbance.place, disturbance.at_rate, disturbance.lasting) for disturbance in observer.disturbances
+        ] == [("speed", True, 0.0)]
         predicted = pendulum.observed(observer).simulated(guess, {})
         left.append(float((pendulum.measured - predicted).std()))
     assert left[0] > 2.0 * left[1] > 10.0 * left[2]
@@ -88,12 +90,12 @@ def test_a_stronger_observer_follows_a_recording_closer(pendulum):
 
 
 class TestFloor:
-    """White noise by third differences."""
+    """The noise floor by third differences."""
 
     @pytest.mark.parametrize("runs", [1, 4])
-    def test_of_a_smooth_course(self, runs):
+    def test_the_noise_of_a_smooth_signal_is_recovered(self, runs):
         time = np.tile(0.05 * np.arange(400 // runs), runs)
-        # where a run ends the level jumps
+        # the level jumps between runs
         smooth = np.sin(time) + 100.0 * np.repeat(np.arange(runs), 400 // runs)
         noise = np.random.default_rng(1).standard_normal(400)
         prepared = oscillator(step=0.05).prepare(
@@ -101,6 +103,6 @@ class TestFloor:
         )
         assert floor_of(prepared).tolist() == pytest.approx([0.02], rel=0.15)
 
-    def test_never_nothing(self):
+    def test_the_floor_is_positive_without_noise(self):
         prepared = oscillator(step=0.05).prepare(recorded(flow(40), position=np.arange(40.0)))
         assert floor_of(prepared).item() == pytest.approx(1e-6 * np.arange(40.0).std(ddof=1))

@@ -1,4 +1,4 @@
-"""Sizes at the peak of the likelihood: what is fitted, what is held, and where they stay as they were."""
+"""Maximum-likelihood sizes: fitted numbers, fixed numbers, and rejected maxima."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,10 @@ import pytest
 from mkc_torch.simulation.dynamics.most_likely_sizes import most_likely_sizes
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.peak import peak
-from tests.simulation.dynamics.test_disturbances import LASTING, NOISE, PUSH, SLOW, WHITE, world
+from tests.simulation.dynamics.test_disturbances import LASTING, NOISE, PROCESS, SLOW, WHITE, noisy_flow
 
 
-def test_a_narrow_ridge_that_bends_is_followed_to_its_end():
+def test_a_narrow_curved_ridge_is_followed_to_its_maximum():
     def ridge(x):
         return -5e2 * (x[:, 1] - x[:, 0] ** 2 - 0.2 * x[:, 0]) ** 2 - 40.0 * (x[:, 0] - 0.4) ** 2
 
@@ -19,30 +19,30 @@ def test_a_narrow_ridge_that_bends_is_followed_to_its_end():
 
 
 @pytest.mark.parametrize(("truth", "time"), [(WHITE, 0.0), (SLOW, LASTING)], ids=["white", "slow"])
-def test_a_start_that_is_off_ends_where_a_true_one_does(truth, time):
-    along = world(truth, count=2000)
+def test_the_result_does_not_depend_on_the_start(truth, time):
+    along = noisy_flow(truth, count=2000)
     ends = [
-        most_likely_sizes(along, NoiseModel((by * NOISE,), ((0, 1.4 * by * PUSH, time),), (False,)), None)
+        most_likely_sizes(along, NoiseModel((by * NOISE,), ((0, 1.4 * by * PROCESS, time),), (False,)), None)
         for by in (1.0, 0.8)
     ]
-    sizes = [(noise.pushes[0][1], noise.sensor[0], *error) for noise, error in ends]
+    sizes = [(noise.components[0][1], noise.sensor[0], *error) for noise, error in ends]
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
     assert abs(np.log(sizes[0][0] / sizes[1][0])) < 0.1 * sizes[0][2]
-    assert abs(np.log(sizes[0][0] / PUSH)) < 3.0 * sizes[0][2]
+    assert abs(np.log(sizes[0][0] / PROCESS)) < 3.0 * sizes[0][2]
 
 
-def test_declared_noise_is_held_and_nothing_is_fitted_without_a_push():
-    along = world(WHITE, count=2000)
-    noise, (error,) = most_likely_sizes(along, NoiseModel((1.3 * NOISE,), ((0, PUSH, 0.0),), (True,)), None)
+def test_declared_noise_is_fixed_and_models_without_disturbances_are_unchanged():
+    along = noisy_flow(WHITE, count=2000)
+    noise, (error,) = most_likely_sizes(along, NoiseModel((1.3 * NOISE,), ((0, PROCESS, 0.0),), (True,)), None)
     assert noise.sensor == (1.3 * NOISE,)
     assert error < 0.1
     alone = NoiseModel((NOISE,))
     assert most_likely_sizes(along, alone, None) == (alone, ())
 
 
-def test_an_implausible_size_stays_as_it_was_and_has_an_error():
-    along = world(WHITE, count=2000)
-    before = NoiseModel((NOISE,), ((0, 0.8 * PUSH, 0.0),), (False,))
-    noise, (error,) = most_likely_sizes(along, before, np.array([0.9 * PUSH, 1.0]))
+def test_an_implausible_maximum_keeps_the_size_and_returns_its_error():
+    along = noisy_flow(WHITE, count=2000)
+    before = NoiseModel((NOISE,), ((0, 0.8 * PROCESS, 0.0),), (False,))
+    noise, (error,) = most_likely_sizes(along, before, np.array([0.9 * PROCESS, 1.0]))
     assert noise == before
     assert 0.0 < error < 0.1

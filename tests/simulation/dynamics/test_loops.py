@@ -1,4 +1,4 @@
-"""Loops over samples give the same numbers in Python, as machine code, and in NumPy."""
+"""Loops over samples agree in Python, machine code and NumPy."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ import pytest
 from mkc_torch.simulation.dynamics import kalman, whitening
 from mkc_torch.simulation.dynamics.compiled import affine
 from mkc_torch.simulation.dynamics.compiled.affine import Affine
-from mkc_torch.simulation.dynamics.kalman import run, start_of
+from mkc_torch.simulation.dynamics.kalman import run_filter, start_of
 from mkc_torch.simulation.dynamics.loops.kalman_filter import filter_samples
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
@@ -23,7 +23,7 @@ WAYS = {"machine code": machine_code, "Python": lambda loop: loop, "NumPy": lamb
 
 
 def in_each_way(monkeypatch, module, compute):
-    """What is computed by machine code, by the loop in Python, and by NumPy."""
+    """The results by machine code, by the loop in Python, and by NumPy."""
     found = []
     for way in WAYS.values():
         with monkeypatch.context() as patch:
@@ -35,8 +35,8 @@ def in_each_way(monkeypatch, module, compute):
 def assert_alike(found):
     first, *others = found
     for other in others:
-        for one, expected in zip(other, first, strict=True):
-            np.testing.assert_allclose(one, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max(initial=1e-300))
+        for array, expected in zip(other, first, strict=True):
+            np.testing.assert_allclose(array, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max(initial=1e-300))
 
 
 @pytest.fixture
@@ -50,12 +50,12 @@ def test_numba_is_installed_with_the_tests():
 
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize("given", [True, False])
-def test_filters(along, keep, given, monkeypatch):
+def test_filters_agree(along, keep, given, monkeypatch):
     models = together(model(white=2.0, sensor=(0.1, 0.2)), model(white=0.5, sensor=(0.3, 0.1)))
 
     def filtered():
         start = start_of(np.full((1, 2, 2), 0.3), models) if given else None
-        left, end = run(along.whole, models, keep=keep, start=start)
+        left, end = run_filter(along.whole, models, keep=keep, start=start)
         last = (end.state, end.covariance, *((end.kept,) if given else ()))
         return left.standard, left.log_spread, left.prior, left.state, left.after, left.posterior, *last
 
@@ -63,7 +63,7 @@ def test_filters(along, keep, given, monkeypatch):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_whitened_series(name, monkeypatch):
+def test_whitened_series_agree(name, monkeypatch):
     along, random = recorded(flow(40, runs=2)), np.random.default_rng(1)
     gains = gains_of(along, MODELS[name])
     series = SeriesAlong(random.standard_normal((*along.new.shape, 3)), random.standard_normal((*along.shift.shape, 3)))
@@ -74,22 +74,22 @@ def test_whitened_series(name, monkeypatch):
     assert_alike(in_each_way(monkeypatch, whitening, innovations))
 
 
-def test_recurrence(monkeypatch):
+def test_recurrences_agree(monkeypatch):
     random = np.random.default_rng(2)
     carries = 0.5 * random.standard_normal((2, 2, 400))
     carries[..., [0, 150]] = 0.0
-    pushed = random.standard_normal((2, 3, 400))
-    kept = pushed.copy()
-    found = in_each_way(monkeypatch, affine, lambda: [Affine.of(carries, 250).solved(pushed)])
+    source = random.standard_normal((2, 3, 400))
+    kept = source.copy()
+    found = in_each_way(monkeypatch, affine, lambda: [Affine.of(carries, 250).solved(source)])
     assert_alike(found)
-    np.testing.assert_array_equal(pushed, kept)
-    expected = pushed[..., 1] + carries[..., 1] @ pushed[..., 0]
+    np.testing.assert_array_equal(source, kept)
+    expected = source[..., 1] + carries[..., 1] @ source[..., 0]
     np.testing.assert_allclose(found[0][0][..., 1], expected, rtol=1e-12)
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("hidden", ["import os; os.environ['MKC_WITHOUT_NUMBA'] = '1'", "sys.modules['numba'] = None"])
-def test_without_numba_numpy_serves(hidden):
+def test_numpy_is_the_fallback_without_numba(hidden):
     code = f"import sys; {hidden}; from {machine_code.__module__} import machine_code; print(machine_code(len))"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "None"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert printed.stdout.strip() == "None"

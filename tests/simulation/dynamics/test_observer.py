@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
-from mkc_torch.simulation.dynamics.trajectory import Grid, carried, marched, solve, stations
+from mkc_torch.simulation.dynamics.trajectory import Grid, marched, solve, stations, transition_matrices
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
 EVERY = 4
-"""Moments from sample to sample."""
+"""Grid intervals between samples."""
 
 
 def tensor(values):
@@ -25,7 +25,7 @@ def pendulum(x):
 
 
 def correcting(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
-    """Gains and a recording of no meaning for a pendulum whose angle's sine, and speed, are seen."""
+    """Random gains and a random recording for a pendulum with the sine of its angle, and its speed, as outputs."""
     random = np.random.default_rng(seed)
     observer = Observer(
         ("sine", "speed")[:m],
@@ -43,14 +43,14 @@ def correcting(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
     return ObserverJump(observer, EVERY * torch.arange(samples), places, measured, predict)
 
 
-def one(samples, end=2.0):
-    """The grid of one trajectory over so many samples."""
+def grid_of(samples, end=2.0):
+    """The grid of a single trajectory with this number of samples."""
     time = torch.linspace(0.0, end, EVERY * (samples - 1) + 1, dtype=torch.float64)
     return Grid(time, torch.arange(len(time)) == 0)
 
 
 def by_steps(rate, jump, begin, grid):
-    """States just before each moment: corrected one sample after the other."""
+    """States just before each grid time, integrated and corrected sample by sample."""
     gain, spread = jump.observer.gain.numpy(), jump.observer.spread.numpy()
     state, time, found = np.asarray(begin, dtype=float), grid.time.numpy(), []
     samples = dict(zip(jump.rows.tolist(), range(len(jump.rows)), strict=True))
@@ -72,8 +72,8 @@ def numpy_pendulum(_, y):
 
 
 @pytest.mark.parametrize("m", [1, 2])
-def test_a_trajectory_with_jumps_is_that_of_steps_with_corrections(m):
-    grid, jump, begin = one(41), correcting(41, m), [0.8, -0.3]
+def test_a_trajectory_with_jumps_matches_stepwise_integration_with_corrections(m):
+    grid, jump, begin = grid_of(41), correcting(41, m), [0.8, -0.3]
     expected = by_steps(numpy_pendulum, jump, begin, grid)
     found = solve(pendulum, grid, tensor([begin]), tensor(expected) + 0.05, jump=jump)
     assert found.converged
@@ -82,24 +82,24 @@ def test_a_trajectory_with_jumps_is_that_of_steps_with_corrections(m):
     assert abs(free.numpy() - expected).max() > 0.1
 
 
-def test_between_the_samples_it_begins_where_the_jump_ends():
-    grid, jump = one(11), correcting(11)
+def test_intervals_start_from_the_corrected_states():
+    grid, jump = grid_of(11), correcting(11)
     states = solve(pendulum, grid, tensor([[0.8, -0.3]]), torch.zeros(len(grid.time), 2).double(), jump=jump).states
     step = grid.step.unsqueeze(-1)
     torch.testing.assert_close(stations(pendulum, states, step, jump)[::3], jump.applied(states)[:-1])
     torch.testing.assert_close(stations(pendulum, states, step)[::3], states[:-1])
 
 
-def test_a_march_finds_it_from_far_away():
-    grid, jump, begin = one(41), correcting(41), [0.8, -0.3]
+def test_a_growing_horizon_converges_from_a_far_guess():
+    grid, jump, begin = grid_of(41), correcting(41), [0.8, -0.3]
     far = torch.full((len(grid.time), 2), 30.0).double()
     rough = marched(pendulum, grid, tensor([begin]), far, jump=jump)
     np.testing.assert_allclose(rough.numpy(), by_steps(numpy_pendulum, jump, begin, grid), atol=1e-2)
 
 
-def test_two_trajectories_with_jumps_are_each_as_by_itself():
+def test_trajectories_with_jumps_are_independent():
     both = [correcting(11, seed=seed) for seed in range(2)]
-    grid = one(11)
+    grid = grid_of(11)
     alone = [
         solve(pendulum, grid, tensor([[0.5, 0.2]]), torch.zeros(41, 2).double(), jump=jump).states for jump in both
     ]
@@ -107,13 +107,16 @@ def test_two_trajectories_with_jumps_are_each_as_by_itself():
         ("sine",),
         (),
         both[0].observer.sensor,
-        *(torch.cat([getattr(one.observer, name) for one in both]) for name in ("gain", "white", "spread")),
+        *(
+            torch.cat([getattr(correction.observer, name) for correction in both])
+            for name in ("gain", "white", "spread")
+        ),
     )
     jump = ObserverJump(
         observer,
         torch.cat([both[0].rows, 41 + both[1].rows]),
         (0, 1),
-        torch.cat([one.measured for one in both]),
+        torch.cat([correction.measured for correction in both]),
         both[0].predict,
     )
     together = Grid(torch.cat([grid.time, grid.time]), torch.cat([grid.begins, grid.begins]))
@@ -122,9 +125,9 @@ def test_two_trajectories_with_jumps_are_each_as_by_itself():
 
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_its_derivative_is_finite_differences(mode):
-    """By what the rate, the first states, and the prediction depend on."""
-    grid, plain = one(21), correcting(21, 2)
+def test_derivatives_with_jumps_match_finite_differences(mode):
+    """By parameters of the rate, the initial states, the prediction and the recording."""
+    grid, plain = grid_of(21), correcting(21, 2)
 
     def states(theta):
         def predict(x):
@@ -145,8 +148,8 @@ def test_its_derivative_is_finite_differences(mode):
 
 @given(seed=st.integers(0, 1000), m=st.integers(1, 2), spread=st.floats(0.01, 10.0), more=st.integers(0, 2))
 @settings(max_examples=25, deadline=None, derandomize=True)
-def test_the_slope_of_a_jump_is_finite_differences(seed, m, spread, more):
-    """Of a moment's states by its own; states without gains, and moments without samples, stay."""
+def test_the_slope_of_a_jump_matches_finite_differences(seed, m, spread, more):
+    """States without gains, and grid times without samples, are unchanged."""
     jump = correcting(4, m, seed, spread, places=(more, 1 + more))
     n = 3 + more
     states = tensor(np.random.default_rng(seed).standard_normal((EVERY * 3 + 1, n)))
@@ -160,10 +163,10 @@ def test_the_slope_of_a_jump_is_finite_differences(seed, m, spread, more):
     assert torch.equal(jump.applied(states)[:, 2 + more :], states[:, 2 + more :])
 
 
-def test_what_is_carried_is_of_states_after_the_jump():
-    grid, jump = one(6), correcting(6)
+def test_transitions_start_from_the_states_after_the_jump():
+    grid, jump = grid_of(6), correcting(6)
     states = solve(pendulum, grid, tensor([[0.8, 0.0]]), torch.zeros(21, 2).double(), jump=jump).states
-    A, _ = carried(pendulum, states, grid.step.unsqueeze(-1), jump)
+    A, _ = transition_matrices(pendulum, states, grid.step.unsqueeze(-1), jump)
     expected = []
     for moment in range(20):
         after = jump.applied(states)[moment]
@@ -176,15 +179,15 @@ def test_what_is_carried_is_of_states_after_the_jump():
 
 
 class TestObserver:
-    """What an observer is by itself."""
+    """Methods of observers and disturbances."""
 
-    def test_those_that_last_have_a_memory(self):
-        pushes = tuple(Disturbance("speed", True, lasting, 1.0) for lasting in (0.0, 2.0, 0.0, 3.0))
+    def test_lasting_disturbances_have_a_time_constant(self):
+        disturbances = tuple(Disturbance("speed", True, lasting, 1.0) for lasting in (0.0, 2.0, 0.0, 3.0))
         empty = torch.zeros(0)
-        observer = Observer((), pushes, empty, empty, empty, empty)
-        assert [one.lasting for one in observer.lasting] == [2.0, 3.0]
+        observer = Observer((), disturbances, empty, empty, empty, empty)
+        assert [disturbance.lasting for disturbance in observer.lasting] == [2.0, 3.0]
 
-    def test_a_disturbance_lasts_at_least_as_long(self):
+    def test_a_least_time_constant_is_applied(self):
         short, long = Disturbance("speed", True, 0.0, 1.0), Disturbance("speed", True, 5.0, 1.0)
         assert short.lasting_at_least(0.1) == Disturbance("speed", True, 0.1, 1.0)
         assert long.lasting_at_least(0.1) == long

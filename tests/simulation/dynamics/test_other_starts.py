@@ -26,13 +26,13 @@ def prepared(**parameters):
     return simulation.prepare(Recording({"time": time, "rpm": 1.0 - torch.exp(-time)}))
 
 
-def test_usable_starts_stay_finite_the_nearest_first_and_the_parameter_that_is_off_is_named():
+def test_starts_are_finite_and_sorted_and_the_wrong_parameter_is_named():
     free = prepared()
     found = other_starts(free, free.given, 3)
     assert len(found.starts) == 3
-    left = [free.residual(one, {}) for one in found.starts]
-    assert all(bool(one.isfinite().all()) for one in left)
-    sizes = [float(one.abs().median()) for one in left]
+    left = [free.residual(start, {}) for start in found.starts]
+    assert all(bool(residual.isfinite().all()) for residual in left)
+    sizes = [float(residual.abs().median()) for residual in left]
     assert sizes == sorted(sizes)
     assert (found.output, found.parameter) == ("rpm", "a")
     assert 0.0 <= found.until < 12.0
@@ -43,4 +43,4 @@ def test_starts_stay_within_the_bounds():
     free = prepared(a=Parameter(80.0, lower=79.0))
     found = other_starts(free, free.given, 3)
     assert found.output == "rpm"
-    assert all(float(one[0]) >= 79.0 for one in found.starts)
+    assert all(float(start[0]) >= 79.0 for start in found.starts)

@@ -1,4 +1,4 @@
-"""White noise of a recording that a file holds to a few decimals: never smaller than what the rounding adds."""
+"""White noise of a recording rounded to a few decimals: never below the rounding noise."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from mkc_torch._support.quantum import quanta_of
 from mkc_torch.simulation import Dynamics
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.kalman import filtered, robust_likelihood
-from mkc_torch.simulation.dynamics.noise import likeliest_noise
+from mkc_torch.simulation.dynamics.noise import most_likely_noise
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.noise_selection import filter_models
@@ -28,13 +28,13 @@ class House(Dynamics):
 
 
 def house(decimals=2):
-    """A room that cools while something unrecorded warms it now and then, read off once in a while."""
+    """A room that cools under unrecorded random heating, rounded to a few decimals."""
     g = torch.Generator().manual_seed(0)
     time = torch.arange(300, dtype=torch.float64)
-    push, indoor, now = 0.0, [], 20.0
+    heating, indoor, now = 0.0, [], 20.0
     for _ in range(300):
-        push = 0.95 * push + 0.05 * float(torch.randn(1, generator=g))
-        now += push - 0.02 * now
+        heating = 0.95 * heating + 0.05 * float(torch.randn(1, generator=g))
+        now += heating - 0.02 * now
         indoor.append(now)
     indoor = torch.tensor(indoor, dtype=torch.float64)
     return House().prepare(Recording({"time": time, "indoor": indoor.round(decimals=decimals)}))
@@ -42,11 +42,11 @@ def house(decimals=2):
 
 def noise(prepared, known=None, **declared):
     theta = prepared.start()
-    found = likeliest_noise(prepared, theta, {}, None, declared=declared, least=6.0, most=2, known=known)
-    return found.disturbed
+    found = most_likely_noise(prepared, theta, {}, None, declared=declared, least=6.0, most=2, known=known)
+    return found.selected
 
 
-def test_the_floor_holds_where_the_noise_is_sought_and_where_it_is_given_its_size_again():
+def test_selection_and_rescaling_respect_the_rounding_floor():
     prepared = house()
     found = noise(prepared)
     assert found.disturbances
@@ -55,15 +55,15 @@ def test_the_floor_holds_where_the_noise_is_sought_and_where_it_is_given_its_siz
     assert float(noise(prepared, smaller).sensor) >= LEAST
 
 
-def test_without_rounding_such_noise_is_far_smaller():
+def test_noise_without_rounding_is_far_smaller():
     assert float(noise(house(decimals=9)).sensor) < 0.1 * LEAST
 
 
-def test_noise_that_is_declared_is_as_declared():
+def test_declared_noise_is_not_raised_to_the_floor():
     assert float(noise(house(), indoor=1e-4).sensor) == pytest.approx(1e-4)
 
 
-def test_a_scale_that_is_profiled_out_ends_at_the_floor():
+def test_a_profiled_scale_ends_at_the_floor():
     prepared = house()
     flow = flow_of(prepared, prepared.start(), {}, None)
     model = NoiseModel((2.0 * LEAST,), ((0, 5.0, 0.0),), (False,), (LEAST,))
@@ -74,17 +74,17 @@ def test_a_scale_that_is_profiled_out_ends_at_the_floor():
     assert held == model.least_scale == 0.5
 
 
-def test_neighbours_in_the_grid_are_above_the_floor_too():
+def test_neighbours_in_the_grid_respect_the_floor():
     prepared = house()
     flow = flow_of(prepared, prepared.start(), {}, None)
     two = replace(flow, new=np.tile(flow.new, 2), seen=np.tile(flow.seen, (1, 2, 1)), counts=np.tile(flow.counts, 2))
     model = NoiseModel((LEAST, 1.0), (), (False, False), (LEAST, 0.0))
-    sensors = [one.sensor for one in NoiseGrid(two, model).neighbours(model, 0.5)]
+    sensors = [neighbour.sensor for neighbour in NoiseGrid(two, model).neighbours(model, 0.5)]
     assert min(first for first, _ in sensors) == LEAST
     assert min(second for _, second in sensors) < 1.0
 
 
-def test_steps_of_a_column_are_its_decimals_or_those_between_its_few_numbers():
+def test_the_quantum_of_a_column_is_its_smallest_step():
     values = torch.tensor([0.25, 0.75, 1.25], dtype=torch.float64).repeat(20)
     fine = torch.linspace(0.0, 1.0, 60, dtype=torch.float64) * torch.pi
     assert quanta_of(torch.stack([values, fine], -1)).tolist() == [0.5, 0.0]

@@ -19,12 +19,12 @@ def van_der_pol(x):
 
 
 def rubbing(x):
-    """A mass on a spring with friction that is all but a jump."""
+    """A mass on a spring with friction that is nearly a jump."""
     return torch.stack([x[:, 1], -x[:, 0] - 0.2 * torch.tanh(x[:, 1] / 0.001)], -1)
 
 
 def reference(rate, start, time):
-    """By scipy, at the given times."""
+    """The trajectory by scipy at the given times."""
 
     def at(_, y):
         return rate(torch.from_numpy(y).unsqueeze(0))[0].numpy()
@@ -35,13 +35,13 @@ def reference(rate, start, time):
 
 
 def near(states, spread, seed=0):
-    """A guess: the states with a normal error of this share of their size."""
+    """A guess: the states with normal errors of this share of their size."""
     generator = torch.Generator().manual_seed(seed)
     return states + spread * states.abs().amax(0) * torch.randn(states.shape, generator=generator, dtype=states.dtype)
 
 
-def one(time):
-    """The grid of one trajectory."""
+def grid_of(time):
+    """The grid of a single trajectory."""
     return Grid(time, torch.arange(len(time)) == 0)
 
 
@@ -54,30 +54,30 @@ def even(end, count):
     [(pendulum, 10.0, 401, 5e-6), (van_der_pol, 20.0, 1601, 1e-5), (rubbing, 10.0, 2001, 1e-4)],
     ids=["pendulum", "van der Pol", "stiff friction"],
 )
-def test_the_trajectory_is_that_of_an_adaptive_integrator(rate, end, count, within):
+def test_trajectories_match_an_adaptive_integrator(rate, end, count, within):
     time = even(end, count)
     expected = reference(rate, [1.0, 0.0], time.numpy())
-    found = solve(rate, one(time), expected[:1], near(expected, 0.01))
+    found = solve(rate, grid_of(time), expected[:1], near(expected, 0.01))
     assert found.converged
     assert float((found.states - expected).abs().max()) < within
 
 
-def test_it_is_of_fourth_order():
+def test_the_error_is_of_fourth_order():
     errors = []
     for count in (101, 201, 401):
         time = even(10.0, count)
         expected = reference(pendulum, [1.0, 0.0], time.numpy())
-        errors.append(float((solve(pendulum, one(time), expected[:1], expected).states - expected).abs().max()))
+        errors.append(float((solve(pendulum, grid_of(time), expected[:1], expected).states - expected).abs().max()))
     ratios = np.array(errors[:-1]) / errors[1:]
     assert (ratios > 15.0).all()
     assert (ratios < 17.0).all()
 
 
-def test_irregular_steps():
+def test_irregular_steps_are_accurate():
     generator = torch.Generator().manual_seed(1)
     time = (0.005 + 0.04 * torch.rand(400, generator=generator, dtype=torch.float64)).cumsum(0)
     expected = reference(pendulum, [1.0, 0.5], time.numpy())
-    found = solve(pendulum, one(time), expected[:1], near(expected, 0.05))
+    found = solve(pendulum, grid_of(time), expected[:1], near(expected, 0.05))
     assert found.converged
     assert float((found.states - expected).abs().max()) < 2e-5
 
@@ -89,7 +89,7 @@ def test_irregular_steps():
 @settings(max_examples=30, deadline=None, derandomize=True)
 def test_rates_that_are_cubics_of_time_are_integrated_exactly(coefficients, steps):
     time = torch.tensor([0.0, *steps], dtype=torch.float64).cumsum(0)
-    grid = one(time)
+    grid = grid_of(time)
 
     def integral(t):
         return sum(c * t ** (k + 1) / (k + 1) for k, c in enumerate(coefficients)).unsqueeze(-1)
@@ -102,14 +102,14 @@ def test_rates_that_are_cubics_of_time_are_integrated_exactly(coefficients, step
 
 def test_stiff_decay_stays_bounded_at_steps_far_beyond_its_time_constant():
     time = even(10.0, 11)
-    found = solve(lambda x: -1e6 * (x - 1.0), one(time), torch.ones(1, 1).double(), torch.zeros(11, 1).double())
+    found = solve(lambda x: -1e6 * (x - 1.0), grid_of(time), torch.ones(1, 1).double(), torch.zeros(11, 1).double())
     assert found.converged
     torch.testing.assert_close(found.states, torch.ones(11, 1).double())
 
 
 @pytest.fixture
 def several():
-    """Trajectories of different length: a grid, their first states and guesses, and each by itself."""
+    """Trajectories of different length: their grid, initial states, guesses, and separate solutions."""
     pieces, guesses, alone = [], [], []
     starts = torch.tensor([[1.0, 0.0], [0.2, 2.0], [-0.5, 0.3]], dtype=torch.float64)
     for count, start in zip((120, 2, 57), starts, strict=True):
@@ -118,12 +118,12 @@ def several():
         guess = near(expected, 0.02)
         pieces.append(time)
         guesses.append(guess)
-        alone.append(solve(pendulum, one(time), start.unsqueeze(0), guess).states)
+        alone.append(solve(pendulum, grid_of(time), start.unsqueeze(0), guess).states)
     begins = torch.cat([torch.arange(len(time)) == 0 for time in pieces])
     return Grid(torch.cat(pieces), begins), starts, torch.cat(guesses), torch.cat(alone)
 
 
-def test_several_trajectories_in_one_grid_are_each_as_by_itself(several):
+def test_trajectories_in_a_grid_are_independent(several):
     grid, starts, guess, alone = several
     found = solve(pendulum, grid, starts, guess)
     assert found.converged
@@ -131,7 +131,7 @@ def test_several_trajectories_in_one_grid_are_each_as_by_itself(several):
     torch.testing.assert_close(found.states, alone, rtol=1e-9, atol=1e-10)
 
 
-def test_a_trajectory_does_not_feel_its_neighbours(several):
+def test_derivatives_by_other_trajectories_are_0(several):
     grid, starts, guess, _ = several
     slope = torch.func.jacfwd(lambda begin: solve(pendulum, grid, begin, guess).states)(starts)
     own = grid.begins.long().cumsum(0) - 1
@@ -140,8 +140,8 @@ def test_a_trajectory_does_not_feel_its_neighbours(several):
         assert float(slope[own == k][:, :, k].abs().max()) > 0.5
 
 
-def test_one_interval():
-    grid = one(torch.tensor([0.0, 0.1], dtype=torch.float64))
+def test_a_single_interval_is_solved():
+    grid = grid_of(torch.tensor([0.0, 0.1], dtype=torch.float64))
     begin = torch.ones(1, 1, dtype=torch.float64)
     found = solve(lambda x: -x, grid, begin, begin.expand(2, 1))
     assert found.converged
@@ -149,11 +149,11 @@ def test_one_interval():
     assert float(found.states[1]) == pytest.approx(np.exp(-0.1), rel=1e-7)
 
 
-def test_what_is_between_is_of_the_same_trajectory():
+def test_stations_lie_on_the_trajectory():
     time = even(4.0, 201)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())
-    found = solve(pendulum, one(time), expected[:1], expected)
-    found_between = stations(pendulum, found.states, one(time).step.unsqueeze(-1))
+    found = solve(pendulum, grid_of(time), expected[:1], expected)
+    found_between = stations(pendulum, found.states, grid_of(time).step.unsqueeze(-1))
     between = reference(pendulum, [1.0, 0.0], np.linspace(0.0, 4.0, 401))[1::2]
     torch.testing.assert_close(found_between[1::3], between, rtol=0.0, atol=1e-5)
     torch.testing.assert_close(found_between[::3], found.states[:-1], rtol=0.0, atol=1e-12)
@@ -172,12 +172,12 @@ def damped(theta, guess=None, known=None, time=TIME):
     def rate(x):
         return torch.stack([x[:, 1], -theta[0] * torch.sin(x[:, 0]) - theta[1] * x[:, 1]], -1)
 
-    return solve(rate, one(time), theta[2:].unsqueeze(0), guess, known)
+    return solve(rate, grid_of(time), theta[2:].unsqueeze(0), guess, known)
 
 
 @pytest.fixture(scope="module")
 def solution():
-    """States that guesses begin from, so that each test's trajectory is one step away."""
+    """The solution at ``THETA``, from which guesses are made."""
 
     def rate(x):
         return torch.stack([x[:, 1], -THETA[0] * torch.sin(x[:, 0]) - THETA[1] * x[:, 1]], -1)
@@ -197,7 +197,7 @@ def differences(solution):
 
 @pytest.mark.parametrize("spread", [0.0, 0.05], ids=["from the answer", "from afar"])
 class TestDerivatives:
-    """Whether the guess is near or not."""
+    """Derivatives, from a near and from a far guess."""
 
     def test_jvp(self, solution, differences, spread):
         direction = torch.tensor([0.5, -1.0, 0.2, 0.7], dtype=torch.float64)
@@ -206,7 +206,7 @@ class TestDerivatives:
         torch.testing.assert_close(slope, differences @ direction, rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(states, damped(THETA, guess).states, rtol=1e-9, atol=1e-9)
 
-    def test_jacfwd_which_maps_over_directions(self, solution, differences, spread):
+    def test_jacfwd(self, solution, differences, spread):
         guess = near(solution, spread)
         slope = torch.func.jacfwd(lambda t: damped(t, guess).states)(THETA)
         torch.testing.assert_close(slope, differences, rtol=1e-5, atol=1e-6)
@@ -218,18 +218,18 @@ class TestDerivatives:
         expected = torch.einsum("bgn,gnp->bp", cotangents, differences)
         torch.testing.assert_close(pulled, expected, rtol=1e-5, atol=1e-5)
 
-    def test_of_the_first_states_alone(self, solution, differences, spread):
+    def test_derivatives_by_the_initial_states_only(self, solution, differences, spread):
         begin = THETA[2:].clone().requires_grad_()
         states = damped(torch.cat([THETA[:2], begin]), near(solution, spread)).states
         (slope,) = torch.autograd.grad(states[-1, 0], begin)
         torch.testing.assert_close(slope, differences[-1, 0, 2:], rtol=1e-5, atol=1e-6)
 
-    def test_of_the_first_states_alone_where_the_rate_has_no_derivative(self, solution, differences, spread):
+    def test_derivatives_by_the_initial_states_of_a_constant_rate(self, solution, differences, spread):
         def rate(x):
             return torch.stack([x[:, 1], -THETA[0] * torch.sin(x[:, 0]) - THETA[1] * x[:, 1]], -1)
 
         begin = THETA[2:].clone().requires_grad_()
-        states = solve(rate, one(TIME), begin.unsqueeze(0), near(solution, spread)).states
+        states = solve(rate, grid_of(TIME), begin.unsqueeze(0), near(solution, spread)).states
         (slope,) = torch.autograd.grad(states[-1, 0], begin)
         torch.testing.assert_close(slope, differences[-1, 0, 2:], rtol=1e-5, atol=1e-6)
 
@@ -241,9 +241,9 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(lambda t: damped(t, near(guess, 0.02), time=time).states, (theta,))
 
 
-def test_the_guess_does_not_matter(solution):
+def test_the_solution_does_not_depend_on_the_guess(solution):
     found = [damped(THETA, near(solution, spread, seed)) for seed, spread in enumerate((0.0, 0.02, 0.1))]
-    assert all(one.converged for one in found)
+    assert all(trajectory.converged for trajectory in found)
     for other in found[1:]:
         torch.testing.assert_close(other.states, found[0].states, rtol=0.0, atol=1e-9)
 
@@ -259,7 +259,7 @@ def test_a_known_linearisation_changes_neither_states_nor_derivatives(solution, 
     torch.testing.assert_close(slope, differences, rtol=1e-5, atol=1e-6)
 
 
-def test_a_known_linearisation_spares_new_ones(solution):
+def test_a_known_linearisation_saves_evaluations(solution):
     calls = 0
 
     def rate(x):
@@ -267,17 +267,17 @@ def test_a_known_linearisation_spares_new_ones(solution):
         calls += 1
         return pendulum(x)
 
-    before = solve(rate, one(TIME), solution[:1], solution)
+    before = solve(rate, grid_of(TIME), solution[:1], solution)
     fresh, calls = calls, 0
-    solve(rate, one(TIME), solution[:1], before.states, before)
+    solve(rate, grid_of(TIME), solution[:1], before.states, before)
     assert calls < fresh
 
 
 def test_a_branch_left_out_by_where_has_no_slope():
-    """An empty tank fills: at level 0 the root's slope is infinite, but what flows out there is 0."""
+    """An empty tank fills: at level 0 the root's slope is infinite, but the outflow is 0."""
     time = even(10.0, 201)
     inflow = torch.where(time > 2.0, 0.1, 0.0)
-    grid = one(time)
+    grid = grid_of(time)
     feed = grid.spread(inflow)
 
     def level(x):
@@ -291,8 +291,8 @@ def test_a_branch_left_out_by_where_has_no_slope():
     assert found.states[-1, 0] == pytest.approx(filled.y[0, -1], rel=0.01)
 
 
-def test_the_slopes_of_a_function_with_parameters_of_its_own_leave_its_graph_whole():
-    """The user's loss can still be differentiated after the trajectory was solved with a parameter that wants it."""
+def test_the_graph_of_a_rate_with_parameters_survives_solving():
+    """The user's loss can still be differentiated after solving with a parameter that requires a gradient."""
     time = even(2.0, 41)
     theta = torch.tensor(9.0, dtype=torch.float64, requires_grad=True)
     begin = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
@@ -301,27 +301,27 @@ def test_the_slopes_of_a_function_with_parameters_of_its_own_leave_its_graph_who
     def swing(x):
         return torch.stack([x[:, 1], -squared / 9.0 * torch.sin(x[:, 0])], -1)
 
-    (slope,) = torch.autograd.grad(solve(swing, one(time), begin, begin.expand(41, 2)).states[-1, 0], theta)
+    (slope,) = torch.autograd.grad(solve(swing, grid_of(time), begin, begin.expand(41, 2)).states[-1, 0], theta)
 
     def end(value):
         fixed = value**2 / 9.0
         return solve(
-            lambda x: torch.stack([x[:, 1], -fixed * torch.sin(x[:, 0])], -1), one(time), begin, begin.expand(41, 2)
+            lambda x: torch.stack([x[:, 1], -fixed * torch.sin(x[:, 0])], -1), grid_of(time), begin, begin.expand(41, 2)
         ).states[-1, 0]
 
     assert slope == pytest.approx(float(end(9.0 + 1e-4) - end(9.0 - 1e-4)) / 2e-4, rel=1e-5)
 
 
-def test_single_precision():
+def test_single_precision_is_accurate():
     time = even(10.0, 401)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())
-    found = solve(pendulum, one(time.float()), expected[:1].float(), near(expected, 0.02).float())
+    found = solve(pendulum, grid_of(time.float()), expected[:1].float(), near(expected, 0.02).float())
     assert found.converged
     assert found.states.dtype == torch.float32
     assert float((found.states - expected).abs().max()) < 5e-4
 
 
-# where there is no trajectory
+# equations without a solution
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_single_precision():
     ],
     ids=["blows up", "blows up at once", "NaN", "runs dry", "singular"],
 )
-def test_what_has_no_trajectory_is_said_to_have_none_after_few_evaluations(rate, begin):
+def test_equations_without_a_solution_fail_after_few_evaluations(rate, begin):
     calls = 0
 
     def counted(x):
@@ -344,22 +344,22 @@ def test_what_has_no_trajectory_is_said_to_have_none_after_few_evaluations(rate,
         return rate(x)
 
     start = torch.full((1, 1), begin, dtype=torch.float64)
-    found = solve(counted, one(even(2.0, 101)), start, start.expand(101, 1))
+    found = solve(counted, grid_of(even(2.0, 101)), start, start.expand(101, 1))
     assert not found.converged
     assert calls < 1000
 
 
-def test_one_trajectory_without_an_answer_is_told_of_all():
+def test_a_single_unsolved_trajectory_fails_the_whole_grid():
     time = torch.cat([even(0.5, 26), even(2.0, 101)])
     begins = torch.zeros(127, dtype=torch.bool)
     begins[[0, 26]] = True
     begin = torch.ones(2, 1, dtype=torch.float64)
     assert not solve(torch.square, Grid(time, begins), begin, torch.ones(127, 1).double()).converged
-    assert solve(torch.square, one(time[:26]), begin[:1], torch.ones(26, 1).double()).converged
+    assert solve(torch.square, grid_of(time[:26]), begin[:1], torch.ones(26, 1).double()).converged
 
 
-def test_segments_keep_an_unstable_system_in_reach():
-    """An inverted pendulum: whatever is wrong in its first state grows ten million times in 5 s."""
+def test_segments_make_an_unstable_system_solvable():
+    """An inverted pendulum: an error of its initial state grows by a factor of 10 million in 5 s."""
 
     def inverted(x):
         return torch.stack([x[:, 1], 9.0 * torch.sin(x[:, 0])], -1)

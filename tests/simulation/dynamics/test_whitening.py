@@ -1,10 +1,10 @@
-"""Series whitened under models of the noise, against the covariance of the noise written out."""
+"""Series whitened under noise models, against the explicit covariance of the noise."""
 
 import numpy as np
 import pytest
 
 from mkc_torch.simulation.dynamics import whitening
-from mkc_torch.simulation.dynamics.kalman import Flow, Models
+from mkc_torch.simulation.dynamics.kalman import FilterModels, Flow
 from mkc_torch.simulation.dynamics.whitening import (
     SeriesAlong,
     gains_of,
@@ -15,32 +15,34 @@ from mkc_torch.simulation.dynamics.whitening import (
 )
 
 STEP = 0.1
-MODELS = Models(
+MODELS = FilterModels(
     white=np.array([[0.0], [0.7], [0.0], [0.3]]),
     place=np.array([[0], [0], [1], [1]]),
     size=np.array([[0.0], [0.9], [1.5], [0.8]]),
     lasting=np.array([[1.0], [0.6], [0.4], [2.0]]),
     sensor=np.array([[1.0], [0.5], [0.3], [0.2]]),
 )
-"""White noise; white and lasting process noise; a slow error of the sensor; that beside white process noise."""
+"""White noise; white and lasting process noise; sensor drift; sensor drift with white process noise."""
 
 
 def oscillator(N=60, runs=1, seed=0):
-    """An oscillator that is known at the start of each run, with its first state measured."""
+    """An oscillator with known states at the start of each run, and its first state measured."""
     random = np.random.default_rng(seed)
     A = np.array([[1.0, STEP], [-0.4 * STEP, 0.97]])
-    carried = np.broadcast_to(A, (N - 1, 2, 2)).copy()
-    pushed = np.broadcast_to(np.array([[0.5 * STEP**2], [STEP]]), (N - 1, 2, 1)).copy()
+    transition = np.broadcast_to(A, (N - 1, 2, 2)).copy()
+    noise_input = np.broadcast_to(np.array([[0.5 * STEP**2], [STEP]]), (N - 1, 2, 1)).copy()
     step = np.full(N - 1, STEP)
     for first in (N * k // runs for k in range(1, runs)):
-        carried[first - 1] = pushed[first - 1] = step[first - 1] = 0.0
+        transition[first - 1] = noise_input[first - 1] = step[first - 1] = 0.0
     counts = (random.random((N, 1)) > 0.1).astype(float)
     seen = np.broadcast_to(np.array([[1.0, 0.0]]), (N, 1, 2)).copy()
-    return Flow(carried, pushed, seen, random.normal(size=(N, 1)), np.zeros((N - 1, 2)), step, counts, np.ones(2))
+    return Flow(
+        transition, noise_input, seen, random.normal(size=(N, 1)), np.zeros((N - 1, 2)), step, counts, np.ones(2)
+    )
 
 
 def covariance(flow, number):
-    """Of the outputs' noise, sample by sample, by the responses to each random number that it is made of."""
+    """Covariance of the outputs' noise, by the responses to each of its random numbers."""
     N, models = len(flow.new), MODELS
     responses = [models.sensor[number, 0] * np.eye(N)]
     lasting, size, place = models.lasting[number, 0], models.size[number, 0], models.place[number, 0]
@@ -51,7 +53,7 @@ def covariance(flow, number):
             for row in range(born, N):
                 if row > born:
                     at_rate = value if kind == "white" or place == 0 else 0.0
-                    state = flow.carried[row - 1] @ state + flow.pushed[row - 1][:, 0] * at_rate
+                    state = flow.transition[row - 1] @ state + flow.noise_input[row - 1][:, 0] * at_rate
                     value = phi[row - 1] * value if kind == "lasting" else 0.0
                 if row == born:
                     first = born == 0 or phi[born - 1] == 0.0
@@ -59,12 +61,12 @@ def covariance(flow, number):
                     value = new if kind == "lasting" else models.white[number, 0]
                 out[row] = state[0] + (value if kind == "lasting" and place == 1 else 0.0)
             responses.append(out[:, None])
-    return sum(one @ one.T for one in responses)
+    return sum(response @ response.T for response in responses)
 
 
 @pytest.mark.parametrize("runs", [1, 3])
 @pytest.mark.parametrize("number", range(4))
-def test_whitened_series_have_the_likelihood_of_the_noise_written_out(number, runs):
+def test_whitened_series_have_the_likelihood_of_the_explicit_covariance(number, runs):
     flow = oscillator(runs=runs)
     used = flow.counts[:, 0] > 0
     S = covariance(flow, number)[np.ix_(used, used)]
@@ -77,7 +79,7 @@ def test_whitened_series_have_the_likelihood_of_the_noise_written_out(number, ru
     assert not found[~used].any()
 
 
-def test_stretches_side_by_side_give_what_one_pass_gives(monkeypatch):
+def test_parallel_stretches_equal_a_single_pass(monkeypatch):
     flow = oscillator(N=200, runs=2)
     gains = gains_of(flow, MODELS)
     random = np.random.default_rng(1)
@@ -90,7 +92,7 @@ def test_stretches_side_by_side_give_what_one_pass_gives(monkeypatch):
 
 
 @pytest.mark.parametrize("number", range(1, 4))
-def test_a_series_of_given_innovations_has_these_innovations(number):
+def test_relative_to_inverts_whitening(number):
     flow = oscillator(runs=2)
     models = MODELS.part(slice(number, number + 1))
     gains = gains_of(flow, models)
@@ -101,19 +103,19 @@ def test_a_series_of_given_innovations_has_these_innovations(number):
     np.testing.assert_allclose(found, innovations, atol=1e-10)
 
 
-def test_series_are_whitened_alike_alone_and_beside_others():
+def test_series_in_a_batch_are_independent():
     flow = oscillator()
     gains = gains_of(flow, MODELS)
     random = np.random.default_rng(3)
-    one, other = (SeriesAlong(random.normal(size=(60, 1, 2)), random.normal(size=(59, 2, 2))) for _ in range(2))
-    alone, both = dict(whitened(flow, gains, one)), dict(whitened(flow, gains, joined(one, other)))
+    first, second = (SeriesAlong(random.normal(size=(60, 1, 2)), random.normal(size=(59, 2, 2))) for _ in range(2))
+    alone, both = dict(whitened(flow, gains, first)), dict(whitened(flow, gains, joined(first, second)))
     for number, values in alone.items():
         np.testing.assert_allclose(both[number][..., :2], values, atol=1e-12)
 
 
 @pytest.mark.parametrize("way", ["machine code", "NumPy"])
 @pytest.mark.parametrize("length", [1, 33, 120, 500])
-def test_blocks_of_samples_give_what_one_pass_gives(length, way, monkeypatch):
+def test_blocks_equal_a_single_pass(length, way, monkeypatch):
     if way == "NumPy":
         monkeypatch.setattr(whitening, "machine_code", lambda _: None)
     flow = oscillator(N=120, runs=2)
@@ -126,6 +128,6 @@ def test_blocks_of_samples_give_what_one_pass_gives(length, way, monkeypatch):
         np.testing.assert_array_equal(np.concatenate(blocks), whole)
 
 
-def test_inverses_of_triangular_matrices_are_those_of_numpy():
+def test_triangular_inverses_match_numpy():
     L = np.tril(np.random.default_rng(2).normal(size=(50, 3, 3))) + 4.0 * np.eye(3)
     np.testing.assert_allclose(whitening._lower_inverse(L), np.linalg.inv(L), rtol=0, atol=1e-14)

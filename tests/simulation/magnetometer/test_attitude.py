@@ -129,7 +129,7 @@ def test_ports(view):
     assert view.ports["field"].channels == ("east", "north", "up")
     assert view.ports["sensor"].channels == ("x", "y", "z")
     assert all(port.pointwise for port in view.ports.values())
-    assert view.ports["sensor"].wanders
+    assert view.ports["sensor"].allows_drift
     assert view.state == {"view": "attitude", "unit": "µT", "strength": view.strength}
 
 

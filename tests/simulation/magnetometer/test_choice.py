@@ -149,7 +149,7 @@ def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **rates(-body_rate(TIME)))
     found = diagnose(Magnetometer(use="gyro"), table, surrogates=19)
     assert (found.verdict, found.findings) == ("unfit", ())
-    assert "The rates seem to have the other sign" in found.world.reasons[0]
+    assert "The rates seem to have the other sign" in found.environment.reasons[0]
 
 
 @pytest.mark.e2e

@@ -102,7 +102,7 @@ def test_ports(view):
         "sensor": ("x", "y", "z"), "field": ("strength",),
     }  # fmt: skip
     assert all(port.unit == "µT" and port.pointwise for port in view.ports.values())
-    assert view.ports["sensor"].wanders
+    assert view.ports["sensor"].allows_drift
     assert view.prior is None
     assert view.state == {"view": "norm", "unit": "µT", "strength": view.strength}
 

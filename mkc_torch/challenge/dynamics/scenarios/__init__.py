@@ -1,4 +1,4 @@
-"""Worlds of differential equations: pushes, inputs as controllers send them, starts far off, and misfits."""
+"""Scenarios of differential equations: process noise, held inputs, far starting values, and wrong simulations."""
 
 from __future__ import annotations
 
@@ -10,60 +10,62 @@ from mkc_torch.challenge.dynamics.scenarios.draw import SLOW_SENSOR, draw, draw_
 from mkc_torch.challenge.scenario import Scenario, Scenarios
 from mkc_torch.challenge.thresholds import Threshold
 
-__all__ = ["dynamics_worlds"]
+__all__ = ["dynamics_scenarios"]
 
 
-def dynamics_worlds() -> Scenarios:
-    """The systems with states, each in twelve worlds; noise is white in all but ``coloured`` and ``slow_sensor``.
+def dynamics_scenarios() -> Scenarios:
+    """Return twelve scenarios of the systems with states. Noise is white except in ``coloured`` and ``slow_sensor``.
 
     Example:
-        >>> [world.name for world in dynamics_worlds().worlds][:3]
+        >>> [scenario.name for scenario in dynamics_scenarios().scenarios][:3]
         ['white', 'coloured', 'pushed_white']
     """
     return Scenarios(
         "dynamics",
         (
-            _world("white", "white sensor noise", aims.WHITE, aims.QUIET),
-            _world("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY, aims.NAMELESS),
-            _world("pushed_white", "white force noise in the rate of one state", aims.PUSHED, aims.DISTURBED),
-            _world("pushed_slowly", "a slow push of the rate of one state", aims.PUSHED, aims.DISTURBED),
-            _world("gusts", "pushes of the rate of one state in some stretches", aims.PUSHED, aims.DISTURBED),
-            _world(
-                "held", "inputs held between samples, which the simulation takes to be linear", aims.WHITE, aims.QUIET
+            _scenario("white", "white sensor noise", aims.WHITE, aims.QUIET),
+            _scenario("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY, aims.NAMELESS),
+            _scenario("pushed_white", "white process noise in one state", aims.DISTURBED_STATE, aims.DISTURBED),
+            _scenario("pushed_slowly", "slow process noise in one state", aims.DISTURBED_STATE, aims.DISTURBED),
+            _scenario("gusts", "gusts in the rate of one state", aims.DISTURBED_STATE, aims.DISTURBED),
+            _scenario(
+                "held", "inputs held between samples; the simulation assumes linear ones", aims.WHITE, aims.QUIET
             ),
-            _world("far_starts", "the simulation's parameters begin ten times off", aims.WHITE, aims.QUIET),
-            _world("runs", "three to five runs", aims.WHITE, aims.QUIET),
+            _scenario(
+                "far_starts", "starting values of the parameters ten times too large or small", aims.WHITE, aims.QUIET
+            ),
+            _scenario("runs", "three to five runs", aims.WHITE, aims.QUIET),
             Scenario(
                 SLOW_SENSOR,
-                "an error of the sensor that lasts 1 to 10 % of a run, beside white noise",
+                "white noise, and a drift of the sensor with a correlation time of 1 to 10 % of a run",
                 partial(draw, SLOW_SENSOR),
                 aims.ORDINARY,
-                right_to_say="no name where nothing is hidden, but a slow error told as that; else what is hidden",
+                right_to_say="nothing hidden: no name, and the drift attributed to the sensor; else the hidden physics",
                 wrong_to_say=aims.CLAIMED,
                 half=True,
             ),
             Scenario(
                 LASTING_ALONE,
-                "a push of the rate of one state that lasts .3 to 1 of the recording, which is one run",
+                "one run; process noise in one state with a correlation time of 0.3 to 1 of the run",
                 partial(draw, LASTING_ALONE),
                 aims.LASTING,
-                right_to_say="unexplained, or a name with alternatives: it cannot be told, a second run would tell",
-                wrong_to_say="a name alone, unless it is what is hidden; unfit",
+                right_to_say="undecided: unexplained, or a name with alternatives; a second run would decide",
+                wrong_to_say="a single name other than the hidden one; unfit",
                 half=True,
                 apart=True,
             ),
             Scenario(
                 LASTING_RUNS,
-                "a push of the rate of one state that lasts .3 to 1 of a run, and is another in each of four runs",
+                "four runs; process noise in one state with a correlation time of 0.3 to 1 of a run, new in each",
                 partial(draw, LASTING_RUNS),
-                aims.PUSHED,
+                aims.DISTURBED_STATE,
                 right_to_say=aims.DISTURBED,
                 wrong_to_say=aims.CLAIMED,
                 half=True,
             ),
             Scenario(
                 "useless",
-                "the simulation cannot follow the recording: its best fit explains at most a quarter of any output",
+                "an unusable simulation, whose best fit explains at most a quarter of any output",
                 draw_useless,
                 aims.USELESS,
                 hides=False,
@@ -75,5 +77,5 @@ def dynamics_worlds() -> Scenarios:
     )
 
 
-def _world(name: str, sentence: str, asked: tuple[Threshold, ...], right: str) -> Scenario:
+def _scenario(name: str, sentence: str, asked: tuple[Threshold, ...], right: str) -> Scenario:
     return Scenario(name, sentence, partial(draw, name), asked, right_to_say=right, wrong_to_say=aims.CLAIMED)

@@ -1,4 +1,4 @@
-"""Process noise: what pushes the rate of one state, and is written in no column."""
+"""Process noise: an unrecorded disturbance of the rate of one state."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ from mkc_torch.challenge.draws import log_uniform, normal, uniform, whole
 from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet
 
 SLOW = (0.03, 0.15)
-"""Correlation time of a slow push, as a share of a run."""
+"""Correlation time of slow process noise, as a share of a run."""
 
 LASTING = (0.3, 1.0)
-"""The same of a push that lasts."""
+"""Correlation time of a lasting disturbance, as a share of a run."""
 
-GUSTS, GUST = (2, 5), (0.04, 0.15)
-"""How many gusts a run has, and the length of each as a share of it."""
+GUSTS = (2, 5)
+"""Number of gusts in a run."""
+
+GUST = (0.04, 0.15)
+"""Length of a gust, as a share of a run."""
 
 
 @dataclass(frozen=True)
 class DisturbanceShape:
-    """One run after another, of size 1.
+    """A disturbance of size 1 in each run.
 
     Attributes:
         fine: value in each fine step (F - 1, R).
-        covariance: of its means over the intervals between samples, for each run (R, T - 1, T - 1).
-        words: what it is, with its times in s.
+        covariance: covariance of its means over the intervals between samples, for each run (R, T - 1, T - 1).
+        words: times in s, by name.
     """
 
     fine: Array
@@ -38,14 +41,14 @@ class DisturbanceShape:
     words: Mapping[str, float]
 
     def at(self, plant: Plant, state: str) -> Array:
-        """Rates (n, F - 1, R) of a push of one state."""
+        """Return the rates (n, F - 1, R) that it adds to one state."""
         rates = np.zeros((len(plant.states), *self.fine.shape))
         rates[plant.row(state)] = self.fine
         return rates
 
 
 def white(g: Generator, trial: RunSet, fine: int) -> DisturbanceShape:
-    """White noise of spectral density 1: independent from fine step to fine step, in the rate's unit times √s."""
+    """Draw white noise of spectral density 1, in the rate's unit times √s; fine steps are independent."""
     intervals, runs = trial.samples - 1, trial.runs
     values = normal(g, intervals * fine, runs).numpy() / np.sqrt(trial.step / fine)
     covariance = np.broadcast_to(np.eye(intervals) / trial.step, (runs, intervals, intervals))
@@ -53,12 +56,12 @@ def white(g: Generator, trial: RunSet, fine: int) -> DisturbanceShape:
 
 
 def slow(g: Generator, trial: RunSet, fine: int, lasting: tuple[float, float] = SLOW) -> DisturbanceShape:
-    """Ornstein and Uhlenbeck's process of variance 1, stationary from the beginning of each run and new in each.
+    """Draw an Ornstein-Uhlenbeck process of variance 1, stationary from the start of each run and new in each.
 
     Args:
-        g: of the draws.
+        g: generator of the draws.
         trial: the runs.
-        fine: steps of the integration between two samples.
+        fine: integration steps between two samples.
         lasting: range of the correlation time, as a share of a run.
     """
     intervals, runs = trial.samples - 1, trial.runs
@@ -74,7 +77,7 @@ def slow(g: Generator, trial: RunSet, fine: int, lasting: tuple[float, float] = 
 
 
 def gusts(g: Generator, trial: RunSet, fine: int) -> DisturbanceShape:
-    """Pushes of one height each, either way, in a few stretches of each run; calm between them."""
+    """Draw a few gusts of constant height and either sign in each run; the disturbance is 0 between them."""
     intervals, runs = trial.samples - 1, trial.runs
     values, covariance = np.zeros((intervals, runs)), np.zeros((runs, intervals, intervals))
     for run in range(runs):
@@ -82,7 +85,7 @@ def gusts(g: Generator, trial: RunSet, fine: int) -> DisturbanceShape:
             length = max(round(uniform(g, *GUST) * intervals), 2)
             start = whole(g, 0, intervals - length)
             height = uniform(g, 0.5, 1.5) * (1.0 if uniform(g, 0.0, 1.0) < 0.5 else -1.0)
-            # a later gust takes the place of an earlier one
+            # a later gust replaces an earlier one
             values[start : start + length, run] = height
             covariance[run, start : start + length] = covariance[run, :, start : start + length] = 0.0
             covariance[run, start : start + length, start : start + length] = 1.0
@@ -90,14 +93,14 @@ def gusts(g: Generator, trial: RunSet, fine: int) -> DisturbanceShape:
 
 
 SHORT = ("pushed_white", "pushed_slowly", "gusts")
-"""Worlds whose pushes act in other worlds too, in every second recording with something hidden."""
+"""Scenarios whose disturbances also act in other scenarios, in every second recording with hidden physics."""
 
 LASTING_ALONE, LASTING_RUNS = "lasting_push", "lasting_push_runs"
-"""Worlds whose push lasts about as long as a run, in one run and in four; it acts in every recording of theirs."""
+"""Scenarios with a disturbance about as long as a run, in one run and in four. It acts in all their recordings."""
 
 _lasting = partial(slow, lasting=LASTING)
 
 KINDS: Mapping[str, Callable[[Generator, RunSet, int], DisturbanceShape]] = MappingProxyType(
     {"pushed_white": white, "pushed_slowly": slow, "gusts": gusts, LASTING_ALONE: _lasting, LASTING_RUNS: _lasting}
 )
-"""By the world that has it."""
+"""Draws of disturbances, by scenario."""

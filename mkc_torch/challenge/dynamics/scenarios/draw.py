@@ -1,4 +1,4 @@
-"""A case of one world of differential equations."""
+"""Draw cases of a scenario of differential equations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mkc_torch.challenge.dynamics.integrate import Course, simulate
 from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet, Setting
 from mkc_torch.challenge.dynamics.scenarios.disturbances import KINDS, LASTING_ALONE, LASTING_RUNS, SHORT
 from mkc_torch.challenge.dynamics.scenarios.follows import Guess, best_shares
-from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, DisturbedState, draw_push
+from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, DisturbedState, draw_disturbance
 from mkc_torch.challenge.dynamics.scenarios.simulations import far_starts, right_source, wrong_source
 from mkc_torch.challenge.dynamics.scenarios.wrong import OTHER, UNRELATED, WRONG_SIGN, right, wrong
 from mkc_torch.challenge.dynamics.scene import SystemScene
@@ -27,30 +27,37 @@ from mkc_torch.challenge.scenario import KeyDisturbance, ScenarioCase, ScenarioK
 from mkc_torch.recording.recording import Recording
 
 OUTSIDE_SHARE = 0.25
-"""Share of the hidden effects that no diagnosis with the catalogue can name."""
+"""Share of hidden effects that are outside the catalogue."""
 
 CORRELATION = (0.3, 0.9)
-"""Of coloured noise from sample to sample."""
+"""Correlation of coloured noise from sample to sample."""
 
 RUNS = (3, 5)
-"""How many runs the world of several runs has."""
+"""Number of runs in the scenario of several runs."""
 
 SLOW_SENSOR = "slow_sensor"
-"""World whose sensors err slowly beside white noise."""
+"""Scenario whose sensors drift in addition to white noise."""
 
-SLOW_SIZE, SLOW_TIME = (1.0, 5.0), (0.01, 0.1)
-"""Of a slow error: its standard deviation over that of the white noise, its correlation time over a run."""
+SLOW_SIZE = (1.0, 5.0)
+"""Standard deviation of a drift over that of the white noise."""
+
+SLOW_TIME = (0.01, 0.1)
+"""Correlation time of a drift, as a share of a run."""
 
 LEAST_SLOW = 3.0
-"""Correlation time in samples; a shorter one is coloured noise."""
+"""Shortest correlation time of a drift, in samples; a shorter time is coloured noise."""
 
 LASTING_COUNT = 4
-"""Runs of a recording in which a push that lasts a run can be told from physics, which is the same in each."""
+"""Number of runs that distinguishes a lasting disturbance from physics, which is the same in each run."""
 
 MOST_FOLLOWED = 0.25
-"""Share of any output's variation that the best fit of a useless simulation may explain."""
+"""Largest share of an output's variation that the best fit of an unusable simulation may explain."""
 
-_TRIED, _FITS = 400, 4
+_TRIED = 400
+"""Most draws of an unusable case."""
+
+_FITS = 4
+"""Fits of an unusable simulation, each from its own starts."""
 
 _TRIALS: Mapping[str, Callable[[Generator, Plant, int, int], RunSet]] = MappingProxyType(
     {
@@ -64,44 +71,44 @@ _TRIALS: Mapping[str, Callable[[Generator, Plant, int, int], RunSet]] = MappingP
 )
 
 
-def draw(world: str, seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:
-    """The case at that address.
+def draw(scenario: str, seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:
+    """Draw the case at an address.
 
     Args:
-        world: a key of ``pushes.KINDS``, or white, coloured, slow_sensor, held, far_starts, runs.
-        seed: of the proof.
-        index: of the case among those of its world, hidden or empty.
-        hidden: hide something; in every second case of those a push acts too, but for sensors that err slowly.
-        number: in the recording's name, which alone depends on it.
+        scenario: a key of ``disturbances.KINDS``, or white, coloured, slow_sensor, held, far_starts, runs.
+        seed: seed of the proof.
+        index: number of the case among those of its scenario, hidden or empty.
+        hidden: hide physics. In every second such case a disturbance acts, too, except with drifting sensors.
+        number: number in the recording's name; nothing else depends on it.
     """
 
     def stream(what: str) -> Generator:
-        return draws.generator(seed, "worlds", "dynamics", world, "hidden" if hidden else "empty", index, what)
+        return draws.generator(seed, "worlds", "dynamics", scenario, "hidden" if hidden else "empty", index, what)
 
-    system, setting = _setting(stream, world)
-    plant, trial = setting.plant, _trial(stream, world, system, setting)
+    system, setting = _setting(stream, scenario)
+    plant, trial = setting.plant, _trial(stream, scenario, system, setting)
     scene = SystemScene(plant, trial, simulate(plant, trial))
-    errors = _errors(stream, world, scene.course.outputs)
-    if world == SLOW_SENSOR:
+    errors = _errors(stream, scenario, scene.course.outputs)
+    if scenario == SLOW_SENSOR:
         errors = replace(errors, slow=_slow(stream("slow"), plant, trial))
-    push = _push(stream, world, index, hidden, scene, errors)
-    rates = None if push is None else push.rates
-    name, simulation = f"{system}_{number:05d}", _simulation(stream, world, system)
+    disturbance = _disturbance(stream, scenario, index, hidden, scene, errors)
+    rates = None if disturbance is None else disturbance.rates
+    name, simulation = f"{system}_{number:05d}", _simulation(stream, scenario, system)
     if not hidden:
-        course = scene.course if rates is None else simulate(plant, trial, push=rates)
-        return _case(stream, world, index, name, scene, course, errors, push, simulation)
-    weighing: Whitening = errors if push is None else DisturbedErrors(scene, errors, push)
+        course = scene.course if rates is None else simulate(plant, trial, disturbance=rates)
+        return _case(stream, scenario, index, name, scene, course, errors, disturbance, simulation)
+    weighing: Whitening = errors if disturbance is None else DisturbedErrors(scene, errors, disturbance)
     kind, effect, size, seen = hide(stream, SYSTEMS[system], scene, weighing, OUTSIDE_SHARE)
     course = simulate(plant, trial, effect, size, rates)
-    case = _case(stream, world, index, name, scene, course, errors, push, simulation)
+    case = _case(stream, scenario, index, name, scene, course, errors, disturbance, simulation)
     key = replace(case.key.key, kind=kind, effects=(key_effect(effect, size, seen),))
     return replace(case, key=replace(case.key, key=key))
 
 
 def draw_useless(seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:  # noqa: ARG001 - nothing to hide
-    """A recording and a simulation that cannot follow it: a wrong sign, another system, or an unrelated output.
+    """Draw a recording and an unusable simulation: a wrong sign, another system, or an unrelated output.
 
-    What is drawn is drawn again until the best of many fits explains too little of every output to be of any use.
+    Cases are drawn until the best of several fits explains at most ``MOST_FOLLOWED`` of every output's variation.
     """
     for again in range(_TRIED):
 
@@ -111,7 +118,7 @@ def draw_useless(seed: int, index: int, hidden: bool, number: int) -> ScenarioCa
         system, setting = _setting(stream, "useless")
         plant, trial = setting.plant, setting.trial
         scene = SystemScene(plant, trial, simulate(plant, trial))
-        # the first draw decides of which kind the case is, so that each kind has its share
+        # the index determines the kind, so that each kind has its share
         kind = (WRONG_SIGN, OTHER, UNRELATED)[index % 3]
         course = scene.course
         if kind == UNRELATED:
@@ -126,11 +133,11 @@ def draw_useless(seed: int, index: int, hidden: bool, number: int) -> ScenarioCa
         case = _case(stream, "useless", index, f"{system}_{number:05d}", scene, course, errors, None, simulation)
         key = replace(case.key.key, kind="useless")
         return replace(case, key=replace(case.key, key=key, useless=kind, follows=follows))
-    raise RuntimeError(f"No useless case of seed {seed}, index {index} in {_TRIED} draws; loosen MOST_FOLLOWED.")
+    raise RuntimeError(f"No unusable case for seed {seed}, index {index} in {_TRIED} draws; increase MOST_FOLLOWED.")
 
 
 def _followed(stream: Callable[[str], Generator], guess: Guess, trial: RunSet, outputs: Array) -> float:
-    """The largest share of any output in several fits, each from starts of its own, as far as the first too large."""
+    """Return the largest explained share of any output over several fits; stops at a share above the limit."""
     most = -np.inf
     for again in range(_FITS):
         most = max(most, *best_shares(stream(f"fit {again}"), guess, trial, outputs))
@@ -139,32 +146,32 @@ def _followed(stream: Callable[[str], Generator], guess: Guess, trial: RunSet, o
     return float(most)
 
 
-def _setting(stream: Callable[[str], Generator], world: str) -> tuple[str, Setting]:
-    """A system with states and its runs; a throw has neither inputs to hold nor parameters to start far from."""
-    without = {"servo", "projectile"} if world in ("held", "far_starts") else {"servo"}
+def _setting(stream: Callable[[str], Generator], scenario: str) -> tuple[str, Setting]:
+    """Draw a system with states and its runs. A throw has no inputs to hold and no starting values."""
+    without = {"servo", "projectile"} if scenario in ("held", "far_starts") else {"servo"}
     system = draws.choose(stream("system"), [name for name in SYSTEMS if name not in without])
     return system, SYSTEMS[system].draw(stream("setting"))
 
 
-def _trial(stream: Callable[[str], Generator], world: str, system: str, setting: Setting) -> RunSet:
-    if world == "runs":
+def _trial(stream: Callable[[str], Generator], scenario: str, system: str, setting: Setting) -> RunSet:
+    if scenario == "runs":
         g = stream("runs")
         runs = draws.whole(g, *RUNS)
         samples = setting.trial.samples * setting.trial.runs // runs
         return _TRIALS[system](g, setting.plant, runs, samples)
-    if world in (LASTING_ALONE, LASTING_RUNS):
-        runs = 1 if world == LASTING_ALONE else LASTING_COUNT
+    if scenario in (LASTING_ALONE, LASTING_RUNS):
+        runs = 1 if scenario == LASTING_ALONE else LASTING_COUNT
         return _TRIALS[system](stream("runs"), setting.plant, runs, setting.trial.samples * setting.trial.runs // runs)
-    return replace(setting.trial, held=world == "held")
+    return replace(setting.trial, held=scenario == "held")
 
 
-def _errors(stream: Callable[[str], Generator], world: str, outputs: Array) -> Errors:
-    correlation = draws.uniform(stream("colour"), *CORRELATION) if world == "coloured" else 0.0
+def _errors(stream: Callable[[str], Generator], scenario: str, outputs: Array) -> Errors:
+    correlation = draws.uniform(stream("colour"), *CORRELATION) if scenario == "coloured" else 0.0
     return replace(draw_errors(stream("noise"), outputs), correlation=correlation)
 
 
 def _slow(g: Generator, plant: Plant, trial: RunSet) -> tuple[Slow, ...]:
-    """Of one output, and of each other one in half of the cases."""
+    """Draw a drift of one output, and of each other output with probability 1/2."""
     first = draws.choose(g, plant.outputs)
     longest = trial.samples - 1
     return tuple(
@@ -176,20 +183,23 @@ def _slow(g: Generator, plant: Plant, trial: RunSet) -> tuple[Slow, ...]:
     )
 
 
-def _push(
-    stream: Callable[[str], Generator], world: str, index: int, hidden: bool, scene: SystemScene, errors: Errors
+def _disturbance(
+    stream: Callable[[str], Generator], scenario: str, index: int, hidden: bool, scene: SystemScene, errors: Errors
 ) -> DisturbedState | None:
-    """In worlds that have one; where something is hidden, in every second case of any world but that of slow errors."""
-    always = world in (LASTING_ALONE, LASTING_RUNS) or (world in KINDS and not hidden)
-    beside = hidden and index % 2 == 0 and world != SLOW_SENSOR
-    if not (always or beside):
+    """Draw the disturbance of a case, if it has one.
+
+    Its scenario has one, or physics is hidden and the index is even, except with drifting sensors.
+    """
+    always = scenario in (LASTING_ALONE, LASTING_RUNS) or (scenario in KINDS and not hidden)
+    additional = hidden and index % 2 == 0 and scenario != SLOW_SENSOR
+    if not (always or additional):
         return None
     g = stream("push")
-    return draw_push(g, world if world in KINDS else draws.choose(g, SHORT), scene, errors)
+    return draw_disturbance(g, scenario if scenario in KINDS else draws.choose(g, SHORT), scene, errors)
 
 
 def _unrelated(g: Generator, system: str, scene: SystemScene) -> Array:
-    """Outputs of other runs, or smooth paths as large; of a throw, which has no inputs to belong to, paths alone."""
+    """Return outputs of other runs, or smooth paths of the same size. A throw, without inputs, gets paths only."""
     plant, trial, outputs = scene.plant, scene.trial, scene.course.outputs
     if plant.inputs and draws.happens(g, 0.5):
         return simulate(plant, _TRIALS[system](g, plant, trial.runs, trial.samples)).outputs
@@ -204,8 +214,8 @@ def _unrelated(g: Generator, system: str, scene: SystemScene) -> Array:
     return np.stack([middle[:, None] + path.numpy().T * reach[:, None] for path in paths], -1)
 
 
-def _simulation(stream: Callable[[str], Generator], world: str, system: str) -> str:
-    return right_source(_class_of(system), far_starts(stream("starts")) if world == "far_starts" else None)
+def _simulation(stream: Callable[[str], Generator], scenario: str, system: str) -> str:
+    return right_source(_class_of(system), far_starts(stream("starts")) if scenario == "far_starts" else None)
 
 
 def _class_of(system: str) -> str:
@@ -214,34 +224,36 @@ def _class_of(system: str) -> str:
 
 def _case(
     stream: Callable[[str], Generator],
-    world: str,
+    scenario: str,
     index: int,
     name: str,
     scene: SystemScene,
     course: Course,
     errors: Errors,
-    push: DisturbedState | None,
+    disturbance: DisturbedState | None,
     simulation: str,
 ) -> ScenarioCase:
     measured = measured_by(stream, "", scene.plant, scene.trial, course, errors)
     key = key_of(name, "empty", scene.plant, errors, measured)
-    told = _key_slow(scene, errors) if errors.slow else None if push is None else _key_push(push)
-    return ScenarioCase(Recording(measured.columns, name=name), simulation, ScenarioKey(world, index, key, told))
+    noted = _key_slow(scene, errors) if errors.slow else None if disturbance is None else _key_disturbance(disturbance)
+    return ScenarioCase(Recording(measured.columns, name=name), simulation, ScenarioKey(scenario, index, key, noted))
 
 
-def _key_push(push: DisturbedState) -> KeyDisturbance:
-    words = {**push.words, "over noise, true parameters": push.free_over_noise}
-    return KeyDisturbance(push.kind, push.state, push.size, push.unit, push.over_noise, words)
+def _key_disturbance(disturbance: DisturbedState) -> KeyDisturbance:
+    words = {**disturbance.words, "over noise, true parameters": disturbance.free_over_noise}
+    return KeyDisturbance(
+        disturbance.kind, disturbance.state, disturbance.size, disturbance.unit, disturbance.over_noise, words
+    )
 
 
 def _key_slow(scene: SystemScene, errors: Errors) -> KeyDisturbance:
-    """The largest of the slow errors, over its white noise; the times of all in the words."""
+    """Return the largest drift over its white noise, with the correlation times of all drifts."""
     plant = scene.plant
     at = max(range(len(errors.slow)), key=lambda k: errors.slow[k].size)
     slow, unit = errors.slow[at], plant.units[plant.outputs[at]]
     times = {
-        f"correlation time, {name}": one.lasting * scene.trial.step
-        for name, one in zip(plant.outputs, errors.slow, strict=True)
-        if one.size
+        f"correlation time, {name}": drift.lasting * scene.trial.step
+        for name, drift in zip(plant.outputs, errors.slow, strict=True)
+        if drift.size
     }
     return KeyDisturbance(SLOW_SENSOR, "sensor", slow.size * errors.deviations[at], unit, slow.size, times)

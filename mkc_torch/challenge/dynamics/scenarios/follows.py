@@ -1,4 +1,4 @@
-"""Whether a simulation can follow outputs at all: the best of several fits, by the generator's own means."""
+"""How much of the outputs' variation a simulation can explain: the best of several fits, by own code."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mkc_torch.challenge.dynamics.integrate import between
 from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet
 
 _TRIED = 8
-"""Starts, all fitted side by side."""
+"""Number of starts, which are fitted in parallel."""
 
 _ROUNDS = 25
 _PARTS = 2
-"""Steps of the integration between two samples."""
+"""Integration steps between two samples."""
 
 _AWAY = 1e3
-"""Nothing that runs away counts as farther off than so many standard deviations of an output."""
+"""Limit of the residual of a diverging run, in standard deviations of an output."""
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A simulation that a user would start from those parameters, within those bounds."""
+    """A simulation with the user's starting values and bounds of the parameters."""
 
     plant: Plant
     starts: Sequence[float]
@@ -33,9 +33,9 @@ class Guess:
 
 
 def best_shares(g: Generator, guess: Guess, trial: RunSet, outputs: Array) -> list[float]:
-    """What the best fit to all outputs (m, T, R) explains of the variation of each.
+    """Return the share of each output's variation (m, T, R) that the best joint fit explains.
 
-    Levenberg's and Marquardt's method for parameters and first states. Below 0 where the mean would do better.
+    Levenberg-Marquardt over parameters and initial states. A share is below 0 if the mean explains more.
     """
     plant, runs = guess.plant, trial.runs
     middle = outputs.mean((1, 2), keepdims=True)
@@ -46,7 +46,7 @@ def best_shares(g: Generator, guess: Guess, trial: RunSet, outputs: Array) -> li
     spread = np.concatenate([np.abs(theta[:, : len(low)]).max(0), np.repeat(_reach(plant, trial, outputs), runs)])
 
     def left(points: Array) -> Array:
-        """(points, M) in standard deviations of the outputs."""
+        """Return residuals (points, M) in standard deviations of the outputs."""
         states = _course(plant, trial, points[:, : len(low)], points[:, len(low) :])
         away = (states - outputs[:, :, None]) / scale[:, :, None]
         away = np.clip(np.nan_to_num(away, nan=_AWAY, posinf=_AWAY, neginf=-_AWAY), -_AWAY, _AWAY)
@@ -73,7 +73,7 @@ def best_shares(g: Generator, guess: Guess, trial: RunSet, outputs: Array) -> li
 
 
 def _starts(g: Generator, guess: Guess, low: Array, high: Array) -> list[Array]:
-    """The user's own, others some ten times off of either sign where both are allowed, and every second one small."""
+    """Return the user's starts and others: up to ten times off, of either sign if allowed, every second small."""
     own = np.array(guess.starts, dtype=float)
     found = [own]
     for k in range(_TRIED - 1):
@@ -84,7 +84,7 @@ def _starts(g: Generator, guess: Guess, low: Array, high: Array) -> list[Array]:
 
 
 def _first_states(plant: Plant, trial: RunSet, outputs: Array) -> Array:
-    """(n, R): as measured, speeds from the first differences, 0 for the rest."""
+    """Return initial states (n, R): measured positions, speeds from first differences, 0 for the rest."""
     begin = np.zeros((len(plant.states), trial.runs))
     for output, values in zip(plant.outputs, outputs, strict=True):
         begin[plant.row(output)] = values[0]
@@ -94,7 +94,7 @@ def _first_states(plant: Plant, trial: RunSet, outputs: Array) -> Array:
 
 
 def _reach(plant: Plant, trial: RunSet, outputs: Array) -> Array:
-    """How far each state goes (n,), by its output or that of its position."""
+    """Return the range of each state (n,), from its output or that of its position."""
     reach = np.ones(len(plant.states))
     for output, values in zip(plant.outputs, outputs, strict=True):
         reach[plant.row(output)] = np.ptp(values)
@@ -104,7 +104,7 @@ def _reach(plant: Plant, trial: RunSet, outputs: Array) -> Array:
 
 
 def _course(plant: Plant, trial: RunSet, parameters: Array, begin: Array) -> Array:
-    """Outputs (m, T, K, R) for each of K parameters (K, p) and first states (K, n R)."""
+    """Return outputs (m, T, K, R) for K parameters (K, p) and initial states (K, n R)."""
     count, runs = len(parameters), trial.runs
     sent = np.repeat(between(trial.inputs, 2 * _PARTS)[:, :, None], count, 2)
     p = np.repeat(parameters.T[:, :, None], runs, 2)
@@ -123,7 +123,7 @@ def _course(plant: Plant, trial: RunSet, parameters: Array, begin: Array) -> Arr
 
 
 def _with_slopes(left: Callable[[Array], Array], theta: Array, step: Array, high: Array) -> tuple[Array, Array]:
-    """Residuals (S, M) and their derivatives (S, M, q) at each of S points (S, q), by differences."""
+    """Return residuals (S, M) and finite-difference derivatives (S, M, q) at S points (S, q)."""
     count, q = theta.shape
     steps = np.broadcast_to(step, theta.shape).copy()
     steps[:, : len(high)] *= np.where(theta[:, : len(high)] + steps[:, : len(high)] > high, -1.0, 1.0)
@@ -135,7 +135,7 @@ def _with_slopes(left: Callable[[Array], Array], theta: Array, step: Array, high
 
 
 def _steps(slopes: Array, rest: Array, damping: Array) -> Array:
-    """(S, q) of each point by its own damping."""
+    """Return the step of each point (S, q), each with its own damping."""
     normal_matrix = np.einsum("smp,smq->spq", slopes, slopes)
     size = normal_matrix.diagonal(axis1=1, axis2=2).max(1)
     slope = np.einsum("smp,sm->sp", slopes, rest)

@@ -1,4 +1,4 @@
-"""Sensor noise and process noise together: how large a push is drawn, and how traces are weighed under it."""
+"""Sensor noise and process noise together: the size of the drawn disturbance, and whitening of residuals."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from mkc_torch.challenge.dynamics.scenarios.disturbances import KINDS, Disturban
 from mkc_torch.challenge.dynamics.scene import SystemScene
 
 OVER_NOISE = (2.0, 8.0)
-"""What a push leaves in the fitted free run, root mean square, over the standard deviation of a sensor's errors."""
+"""RMS residual that a disturbance causes in the fitted open-loop run, over the sensor's noise."""
 
 _ROUNDS = 12
 
 
 @dataclass(frozen=True)
 class DisturbedState:
-    """A push of one state, of its true size.
+    """Process noise of one state, in its true size.
 
     Attributes:
-        kind: name of the world that has such pushes.
-        state: whose rate is pushed.
-        size: standard deviation of the push in ``unit``; of a white one the root of its spectral density.
-        over_noise: what it leaves in the fitted free run over a sensor's errors, of the output where it is most.
-        free_over_noise: the same with parameters and first states at their true values.
-        words: times in s.
-        rates: what is added to the rates (n, F - 1, R).
-        covariance: of its means over the intervals between samples, for each run (R, T - 1, T - 1).
+        kind: name of the scenario with such disturbances.
+        state: the disturbed state.
+        size: standard deviation in ``unit``; for white noise the square root of its spectral density.
+        over_noise: RMS residual of the fitted open-loop run over the sensor's noise, largest of all outputs.
+        free_over_noise: the same with the true parameters and initial states.
+        words: times in s, by name.
+        rates: added rates (n, F - 1, R).
+        covariance: covariance of its means over the intervals between samples, for each run (R, T - 1, T - 1).
     """
 
     kind: str
@@ -49,22 +49,24 @@ class DisturbedState:
     covariance: Array
 
 
-def draw_push(g: Generator, kind: str, scene: SystemScene, errors: Errors) -> DisturbedState:
-    """A push of that kind, of a state drawn, as large as the noise of the sensors asks for."""
+def draw_disturbance(g: Generator, kind: str, scene: SystemScene, errors: Errors) -> DisturbedState:
+    """Draw a disturbance of a kind, its state, and its size relative to the sensors' noise."""
     plant = scene.plant
     state = choose(g, [name for name in plant.states if name not in plant.speeds])
-    push = KINDS[kind](g, scene.trial, plant.fine)
-    wanted, rates = log_uniform(g, *OVER_NOISE), push.at(plant, state)
+    disturbance = KINDS[kind](g, scene.trial, plant.fine)
+    wanted, rates = log_uniform(g, *OVER_NOISE), disturbance.at(plant, state)
     basis = range_of(tangents(scene, errors, rivals=False).known)
     size, free, left = _sized(
-        _first_size(scene, state, push), wanted, lambda k: _over_noise(scene, errors, k * rates, basis)
+        _first_size(scene, state, disturbance), wanted, lambda k: _over_noise(scene, errors, k * rates, basis)
     )
     unit = per_second(plant.units[state]) + ("·√s" if kind == "pushed_white" else "")
-    return DisturbedState(kind, state, size, unit, left, free, push.words, size * rates, size**2 * push.covariance)
+    return DisturbedState(
+        kind, state, size, unit, left, free, disturbance.words, size * rates, size**2 * disturbance.covariance
+    )
 
 
 def per_second(unit: str) -> str:
-    """The unit of a rate.
+    """Return the unit of a rate.
 
     Example:
         >>> per_second("m"), per_second("rad/s")
@@ -74,7 +76,7 @@ def per_second(unit: str) -> str:
 
 
 def _sized(size: float, wanted: float, seen: Callable[[float], tuple[float, float]]) -> tuple[float, float, float]:
-    """A size of which ``wanted`` is left, with what it does free and what is left; nearly so where it goes by leaps."""
+    """Return the size that causes a residual of ``wanted``, its open-loop effect, and the residual that it causes."""
     low, high, best = 0.0, np.inf, (0.0, 0.0, 0.0)
     for _ in range(_ROUNDS):
         free, left = seen(size)
@@ -90,15 +92,15 @@ def _sized(size: float, wanted: float, seen: Callable[[float], tuple[float, floa
     return best
 
 
-def _first_size(scene: SystemScene, state: str, push: DisturbanceShape) -> float:
-    """A size that moves nothing far: a thousandth of how fast the state goes by itself, or of itself in a run."""
+def _first_size(scene: SystemScene, state: str, disturbance: DisturbanceShape) -> float:
+    """Return a small size: 1/1000 of the RMS rate of the state, or of the state over a run."""
     pace = max(scene.pace(state), scene.largest(state) / scene.length)
-    return 1e-3 * pace / float(np.sqrt(np.square(push.fine).mean()))
+    return 1e-3 * pace / float(np.sqrt(np.square(disturbance.fine).mean()))
 
 
 def _over_noise(scene: SystemScene, errors: Errors, rates: Array, basis: Array) -> tuple[float, float]:
-    """Of the output where it is most: what a push does to the free run, and what is left of that after a fit."""
-    moved = simulate(scene.plant, scene.trial, push=rates).outputs - scene.course.outputs
+    """Return the open-loop effect of a disturbance and its residual after a fit, largest of all outputs."""
+    moved = simulate(scene.plant, scene.trial, disturbance=rates).outputs - scene.course.outputs
     white = errors.whitened(moved)
     left = white - basis @ (basis.T @ white)
     return _largest(white, len(moved)), _largest(left, len(moved))
@@ -110,37 +112,37 @@ def _largest(values: Array, outputs: int) -> float:
 
 @dataclass(frozen=True)
 class DisturbedErrors:
-    """The errors of the outputs beside a push, to first order about the course of a scene."""
+    """Errors of the outputs including process noise, to first order about the trajectory of a scene."""
 
     scene: SystemScene
     errors: Errors
-    pushed: DisturbedState
+    disturbed: DisturbedState
 
     def whitened(self, traces: Array) -> Array:
-        """Columns (M, q) of traces (m, T, R, q), or (M,) of (m, T, R), in standard deviations of independent errors."""
+        """Whiten traces (m, T, R, q) to columns (M, q), or (m, T, R) to (M,), in standard deviations."""
         return np.asarray(np.linalg.solve(self._lower, self.errors.whitened(traces)), dtype=np.float64)
 
     @cached_property
     def _lower(self) -> Array:
-        """Cholesky's factor (M, M) of the covariance in standard deviations of the sensors' errors."""
-        moved = responses(self.scene, self.pushed.state)
+        """Return the Cholesky factor (M, M) of the covariance, in standard deviations of the sensors' errors."""
+        moved = responses(self.scene, self.disturbed.state)
         total = np.eye(moved[..., 0].size)
         for run in range(self.scene.trial.runs):
             only = np.zeros_like(moved)
             only[:, :, run] = moved[:, :, run]
             columns = self.errors.whitened(only)
-            total += columns @ self.pushed.covariance[run] @ columns.T
+            total += columns @ self.disturbed.covariance[run] @ columns.T
         return np.asarray(np.linalg.cholesky(total), dtype=np.float64)
 
 
 def responses(scene: SystemScene, state: str) -> Array:
-    """What a push of 1 in each interval between samples does to the outputs (m, T, R, T - 1), to first order."""
+    """Return the first-order response of the outputs (m, T, R, T - 1) to a unit rate in each sampling interval."""
     plant, trial, x, u = scene.plant, scene.trial, scene.course.states, scene.course.inputs
     intervals, moments = trial.samples - 1, x.shape[1]
     forcing = np.zeros((moments, trial.runs, len(plant.states), intervals))
     for k in range(intervals):
         forcing[k * plant.fine : (k + 1) * plant.fine, :, plant.row(state), k] = 1.0
-        # half of what the rule of integration gives the ends of an interval belongs to either side
+        # the integration weight at the ends of an interval is shared with its neighbours
         for end in (k * plant.fine, (k + 1) * plant.fine):
             if 0 < end < moments - 1:
                 forcing[end, :, plant.row(state), k] = 0.5

@@ -1,4 +1,4 @@
-"""The file of a simulation that the diagnosis is given with a recording: one class, with starts of its own."""
+"""Write the file of a simulation for the diagnosis of a recording: one class, with its own starting values."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from torch import Generator
 from mkc_torch.challenge.draws import happens
 from mkc_torch.challenge.dynamics.scenarios.wrong import WRONG_SIGN
 
-NAIVE = Path(__file__).parents[1] / "naive.py"
+NOMINAL = Path(__file__).parents[1] / "nominal_models.py"
 WRONG = Path(__file__).with_name("wrong_simulations.py")
 
 FAR = 10.0
-"""By how much each start is too large or too small in the world of far starts."""
+"""Factor by which each starting value is too large or too small in the scenario of far starts."""
 
 Start = Callable[[float, float], float]
-"""From a start and its least value another start."""
+"""Returns another starting value, given the starting value and its lower bound."""
 
 
 def right_source(system: str, start: Start | None = None) -> str:
-    """The simulation as a user would write it, from other starts."""
-    return one_class(NAIVE, system, system, start)
+    """Return the source of the nominal simulation, with other starting values."""
+    return one_class(NOMINAL, system, system, start)
 
 
 def wrong_source(system: str, kind: str) -> str:
-    """One that is wrong in that way, under the name of the right one."""
+    """Return the source of a wrong simulation, under the name of the nominal one."""
     return one_class(WRONG, f"{system}{'WrongSign' if kind == WRONG_SIGN else 'Other'}", system)
 
 
 def far_starts(g: Generator) -> Start:
-    """Each ten times too large or too small; too large where too small is not allowed."""
+    """Return a draw of starting values 10 times too large or too small; too large if the bound forbids too small."""
 
     def start(value: float, least: float) -> float:
         small = happens(g, 0.5) and (least == 0.0 or value / FAR > least)
@@ -42,16 +42,16 @@ def far_starts(g: Generator) -> Start:
 
 
 def one_class(file: Path, name: str, called: str, start: Start | None = None) -> str:
-    """One class of a file with what that imports, under another name, each parameter from another start.
+    """Return the source of one class of a file with its imports, renamed and with other starting values.
 
     Args:
-        file: whose classes need nothing of one another.
-        name: of the class.
+        file: a file whose classes are independent of each other.
+        name: name of the class.
         called: its new name.
-        start: of each parameter; default the one it has.
+        start: changes each starting value; None keeps them.
 
     Returns:
-        A Python file's text.
+        The text of a Python file.
     """
     tree = ast.parse(file.read_text(encoding="utf-8"))
     needed = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
@@ -65,7 +65,7 @@ def one_class(file: Path, name: str, called: str, start: Start | None = None) ->
 
 
 def _from(value: ast.expr, start: Start) -> ast.expr:
-    """A number, or the first of a ``Parameter``, as another number."""
+    """Replace a number, or the starting value of a ``Parameter``."""
     if isinstance(value, ast.Call):
         bounds = {word.arg: word.value for word in value.keywords}
         least = float(ast.literal_eval(bounds["lower"])) if "lower" in bounds else -float("inf")

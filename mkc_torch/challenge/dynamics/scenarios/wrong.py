@@ -1,4 +1,4 @@
-"""The wrong simulations in the generator's own terms, by which it sees that they are of no use."""
+"""The wrong simulations in the generator's own code, to check that they are unusable."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def _two_lags(x: Array, u: Array, p: Array) -> Array:
 
 
 def _wrong_cart_pole(x: Array, u: Array, p: Array) -> Array:
-    push = p[0] * u[0] - p[1] * x[1]
-    swing = -(push * np.cos(x[2]) - 9.81 * np.sin(x[2])) / p[2] - p[3] * x[3]
-    return np.array([x[1], push, x[3], swing])
+    drive = p[0] * u[0] - p[1] * x[1]
+    swing = -(drive * np.cos(x[2]) - 9.81 * np.sin(x[2])) / p[2] - p[3] * x[3]
+    return np.array([x[1], drive, x[3], swing])
 
 
 def _wrong_tanks(x: Array, u: Array, p: Array) -> Array:
@@ -76,19 +76,19 @@ _STARTS: Mapping[str, tuple[tuple[float, ...], tuple[tuple[float, float], ...]]]
         "thermal": ((0.0045, 0.0045, 0.009, 0.009, 20.0), (_POSITIVE, _POSITIVE, _FREE, _FREE, _FREE)),
     }
 )
-"""What a user starts the right simulations from, and the bounds."""
+"""Starting values and bounds of the nominal simulations."""
 
 _FLOWS = (_POSITIVE,) * 4
 _HEATS = (*(((0.001, np.inf),) * 2), _POSITIVE, _POSITIVE, (-50.0, 50.0))
 
 
 def right(plant: Plant) -> Guess:
-    """The simulation as everybody would write it."""
+    """Return the nominal simulation."""
     return Guess(plant, *_STARTS[plant.name])
 
 
 def wrong(plant: Plant, kind: str) -> Guess:
-    """The simulation with a wrong sign, or of another system, that has the recording's columns."""
+    """Return a simulation with a wrong sign, or of another system, with the columns of the recording."""
     starts, bounds = _STARTS[plant.name]
     if kind == WRONG_SIGN:
         rate = {

@@ -1,9 +1,9 @@
-"""Simulations of something else, as a user could write them by mistake; the diagnosis is given one of them at a time.
+"""Wrong simulations, as a user could write them by mistake. The diagnosis gets one of them at a time.
 
 ``...WrongSign``: the main term has the wrong sign. ``...Other``: another system with the same columns.
 """
 
-# ruff: noqa: ARG002, RUF012 - plain class attributes, and a derivative that is given more than it uses
+# ruff: noqa: ARG002, RUF012 - plain class attributes, and a derivative with unused arguments
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class CartPoleWrongSign(Dynamics):
     }
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
-        push = p.gain * u.force - p.drag * x.speed
-        swing = -(push * torch.cos(x.angle) - 9.81 * torch.sin(x.angle)) / p.length - p.damping * x.turn
-        return {"position": x.speed, "speed": push, "angle": x.turn, "turn": swing}
+        drive = p.gain * u.force - p.drag * x.speed
+        swing = -(drive * torch.cos(x.angle) - 9.81 * torch.sin(x.angle)) / p.length - p.damping * x.turn
+        return {"position": x.speed, "speed": drive, "angle": x.turn, "turn": swing}
 
 
 class CartPoleOther(Dynamics):

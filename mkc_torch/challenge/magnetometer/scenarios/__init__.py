@@ -1,4 +1,4 @@
-"""Worlds of the magnetometer: noise of the world, disturbances, resting orientations, and misfits."""
+"""Scenarios of the magnetometer: noise, drift, bursts, resting orientations, and unusable recordings."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from mkc_torch.challenge.magnetometer.scenarios.draw import draw, draw_useless
 from mkc_torch.challenge.scenario import Scenario, Scenarios
 from mkc_torch.challenge.thresholds import Threshold
 
-__all__ = ["magnetometer_worlds"]
+__all__ = ["magnetometer_scenarios"]
 
 
-def magnetometer_worlds(duration: float = DURATION) -> Scenarios:
-    """Recordings of a magnetometer in six worlds, each so many seconds long; white noise in all but ``coloured``.
+def magnetometer_scenarios(duration: float = DURATION) -> Scenarios:
+    """Return six scenarios of a magnetometer, for recordings of a duration in s. Noise is white except in ``coloured``.
 
     Example:
-        >>> [world.name for world in magnetometer_worlds().worlds]
+        >>> [scenario.name for scenario in magnetometer_scenarios().scenarios]
         ['white', 'coloured', 'wander', 'bursts', 'orientations', 'useless']
     """
 
-    def world(name: str, sentence: str, asked: tuple[Threshold, ...], right: str) -> Scenario:
+    def scenario(name: str, sentence: str, asked: tuple[Threshold, ...], right: str) -> Scenario:
         return Scenario(
             name, sentence, partial(draw, name, duration), asked, right_to_say=right, wrong_to_say=aims.CLAIMED
         )
@@ -30,14 +30,14 @@ def magnetometer_worlds(duration: float = DURATION) -> Scenarios:
     return Scenarios(
         "magnetometer",
         (
-            world("white", "white sensor noise", aims.WHITE, aims.QUIET),
-            world("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY, aims.NAMELESS),
-            world("wander", "an offset that wanders", aims.ORDINARY, aims.NAMELESS),
-            world("bursts", "disturbances in some stretches", aims.ORDINARY, aims.NAMELESS),
-            world("orientations", "the sensor rests in one orientation after another", aims.WHITE, aims.QUIET),
+            scenario("white", "white sensor noise", aims.WHITE, aims.QUIET),
+            scenario("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY, aims.NAMELESS),
+            scenario("wander", "a drifting offset", aims.ORDINARY, aims.NAMELESS),
+            scenario("bursts", "bursts of disturbance", aims.ORDINARY, aims.NAMELESS),
+            scenario("orientations", "the sensor rests in one orientation after another", aims.WHITE, aims.QUIET),
             Scenario(
                 "useless",
-                "the view cannot follow the recording",
+                "a recording that the magnetometer cannot explain",
                 useless,
                 aims.USELESS,
                 hides=False,

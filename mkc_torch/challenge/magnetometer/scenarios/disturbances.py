@@ -1,4 +1,4 @@
-"""What disturbs a magnetometer without being physics to name: an offset that wanders, and sources that come by."""
+"""Disturbances of a magnetometer that are not physics to name: a drifting offset, and passing sources."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 OVER_NOISE = (2.0, 8.0)
-"""How far an offset wanders, root mean square about its mean, over the standard deviation of the sensor's noise."""
+"""RMS drift of an offset about its mean, over the standard deviation of the sensor's noise."""
 
 BURSTS, BURST = (2, 5), (0.01, 0.04)
-"""How many bursts a recording has, and the length of each as a share of it."""
+"""Number of bursts in a recording, and the length of each as a share of it."""
 
 HEIGHT = (5.0, 30.0)
-"""Of a burst, over the standard deviation of the sensor's noise."""
+"""Size of a burst, over the standard deviation of the sensor's noise."""
 
 PERIOD = (0.1, 0.6)
-"""Shortest period of what is in a burst, s."""
+"""Shortest period within a burst, s."""
 
 
-def wandering(g: Generator, noise: Noise, samples: int) -> tuple[Noise, float]:
-    """The noise with a random walk of each axis, and how far the walks go, over the noise."""
+def drifting(g: Generator, noise: Noise, samples: int) -> tuple[Noise, float]:
+    """Add a random walk to the noise of each axis. Returns the noise and the size of the drift over it."""
     wanted = log_uniform(g, *OVER_NOISE)
-    # a walk of N steps goes √(N / 6) steps from its own mean, root mean square
+    # the RMS of a walk of N steps about its own mean is √(N / 6) steps
     step = wanted * noise.sigma * math.sqrt(6.0 / samples)
     x, y, z = (Process((1.0,), step * uniform(g, 0.8, 1.25)) for _ in range(3))
     return replace(noise, kind=f"{noise.kind}, wander", walks=(x, y, z)), wanted
 
 
 def bursts(g: Generator, sigma: float, samples: int, step: float) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
-    """Fields that swell and fade in a few stretches, each way about nought: no passing dipole, which goes one path.
+    """Draw fields of both signs that rise and fade in a few intervals, unlike the field of a passing dipole.
 
     Args:
         sigma: standard deviation of the sensor's noise, µT.
@@ -47,7 +47,7 @@ def bursts(g: Generator, sigma: float, samples: int, step: float) -> tuple[Float
         step: time between samples in s.
 
     Returns:
-        The fields in µT in the sensor's axes, and where they are.
+        The fields in the sensor's axes, µT, and the mask of their samples.
     """
     field, mask = torch.zeros(samples, 3, dtype=torch.float64), torch.zeros(samples, dtype=torch.bool)
     for _ in range(whole(g, *BURSTS)):

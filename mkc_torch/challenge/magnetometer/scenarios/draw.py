@@ -1,4 +1,4 @@
-"""A case of one world of the magnetometer."""
+"""Draw cases of a scenario of the magnetometer."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mkc_torch.challenge.magnetometer import hidden as physics
 from mkc_torch.challenge.magnetometer.columns import Plan, draw_columns, draw_plan
 from mkc_torch.challenge.magnetometer.generator import (
     Contaminated,
+    contaminate_scene,
     draw_scene,
     key_effect,
     key_of,
     recording_of,
     size_effects,
-    spoil_scene,
     total_of,
 )
 from mkc_torch.challenge.magnetometer.hidden import Hidden
 from mkc_torch.challenge.magnetometer.motion import RATE
 from mkc_torch.challenge.magnetometer.noise import Noise, Outliers, draw_noise, draw_outliers
-from mkc_torch.challenge.magnetometer.scenarios.disturbances import bursts, wandering
+from mkc_torch.challenge.magnetometer.scenarios.disturbances import bursts, drifting
 from mkc_torch.challenge.magnetometer.scenarios.poses import poses
 from mkc_torch.challenge.magnetometer.scene import Scene
 from mkc_torch.challenge.scenario import KeyDisturbance, ScenarioCase, ScenarioKey
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 OUTSIDE_SHARE = 0.25
-"""Share of the hidden effects that no diagnosis with the catalogue can name."""
+"""Share of hidden effects that are outside the catalogue."""
 
 UNRELATED, WRONG_SIGN, OTHER_GYRO, OTHER_ATTITUDE = (
     "unrelated field",
@@ -51,37 +51,39 @@ _SIMULATION = """from mkc_torch.simulation import Magnetometer
 sensor = Magnetometer(use="{view}")
 """
 _SPREAD = 30.0
-"""Of a field that is none, on each axis in µT."""
+"""Standard deviation of a signal that is not a field, on each axis, µT."""
 
 
-def draw(world: str, duration: float, seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:
-    """The case at that address.
+def draw(scenario: str, duration: float, seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:
+    """Draw the case at an address.
 
     Args:
-        world: white, coloured, wander, bursts, orientations.
-        duration: of the recording in s.
-        seed: of the proof.
-        index: of the case among those of its world, hidden or empty.
-        hidden: hide something; in every second case of those the offset wanders too.
-        number: in the recording's name, which alone depends on it.
+        scenario: white, coloured, wander, bursts, orientations.
+        duration: length of the recording in s.
+        seed: seed of the proof.
+        index: number of the case among those of its scenario, hidden or empty.
+        hidden: hide physics. In every second such case the offset drifts, too.
+        number: number in the recording's name; nothing else depends on it.
     """
 
     def stream(what: str) -> Generator:
-        return draws.generator(seed, "worlds", "magnetometer", world, "hidden" if hidden else "empty", index, what)
+        return draws.generator(seed, "worlds", "magnetometer", scenario, "hidden" if hidden else "empty", index, what)
 
-    scene = _scene(stream, world, duration)
+    scene = _scene(stream, scenario, duration)
     count, name = len(scene.time), f"case_{number:05d}"
-    noise, outliers = _noise(stream, world, count), draw_outliers(stream("outliers"))
-    push = None
-    if index % 2 == 0 if hidden else world == "wander":
-        noise, far = wandering(stream("wander"), noise, count)
-        push = KeyDisturbance("wander", "sensor", far * noise.sigma, "µT", far)
+    noise, outliers = _noise(stream, scenario, count), draw_outliers(stream("outliers"))
+    disturbance = None
+    if index % 2 == 0 if hidden else scenario == "wander":
+        noise, far = drifting(stream("wander"), noise, count)
+        disturbance = KeyDisturbance("wander", "sensor", far * noise.sigma, "µT", far)
     burst, disturbed = torch.zeros_like(scene.field), torch.zeros(count, dtype=torch.bool)
-    if world == "bursts":
+    if scenario == "bursts":
         burst, disturbed = bursts(stream("bursts"), noise.sigma, count, scene.step)
-        told = float(disturbed.double().mean())
-        push = push or KeyDisturbance("bursts", "sensor", float(burst.abs().max()), "µT", 0.0, {"share": told})
-        outliers = replace(outliers, share=min(outliers.share + told, 0.5))
+        share = float(disturbed.double().mean())
+        disturbance = disturbance or KeyDisturbance(
+            "bursts", "sensor", float(burst.abs().max()), "µT", 0.0, {"share": share}
+        )
+        outliers = replace(outliers, share=min(outliers.share + share, 0.5))
     effects = [_effect(stream("effect"), scene)] if hidden else []
     needed = frozenset(effect.driver for effect in effects if effect.driver)
     plan = draw_plan(stream("plan"), needed, frozenset())
@@ -91,16 +93,18 @@ def draw(world: str, duration: float, seed: int, index: int, hidden: bool, numbe
         kind = "single" if effects[0].effect in physics.CATALOGUE else "outside"
         found = size_effects(stream("size"), kind, effects, scene, noise, outliers, plan, columns)
         total = burst + total_of(effects, [size for size, _ in found], scene)
-    spoilt = _spoilt(stream, world, scene, noise, outliers, total, disturbed)
+    contaminated = _contaminated(stream, scenario, scene, noise, outliers, total, disturbed)
     key = replace(
-        key_of(name, kind, plan, scene, noise, outliers, spoilt, columns),
+        key_of(name, kind, plan, scene, noise, outliers, contaminated, columns),
         effects=tuple(key_effect(e, size, power, plan) for e, (size, power) in zip(effects, found, strict=True)),
     )
-    return ScenarioCase(recording_of(name, scene, spoilt, columns), "", ScenarioKey(world, index, key, push))
+    return ScenarioCase(
+        recording_of(name, scene, contaminated, columns), "", ScenarioKey(scenario, index, key, disturbance)
+    )
 
 
 def draw_useless(duration: float, seed: int, index: int, hidden: bool, number: int) -> ScenarioCase:  # noqa: ARG001
-    """A recording whose field is none, or whose gyroscope or attitude, by which it is to be compared, is another's."""
+    """Draw a recording without a field, or with the gyroscope or attitude of another recording."""
 
     def stream(what: str) -> Generator:
         return draws.generator(seed, "worlds", "magnetometer", "useless", index, what)
@@ -111,23 +115,23 @@ def draw_useless(duration: float, seed: int, index: int, hidden: bool, number: i
     noise = _noise(stream, "useless", len(scene.time))
     outliers = draw_outliers(stream("outliers"))
     plan = replace(draw_plan(stream("plan"), frozenset(), frozenset()), mode=_VIEWS.get(kind, "norm"))
-    spoilt = spoil_scene(stream("errors"), scene, noise, outliers, torch.zeros_like(scene.field))
-    seen = _told_otherwise(stream, kind, plan, scene, other, noise)
+    contaminated = contaminate_scene(stream("errors"), scene, noise, outliers, torch.zeros_like(scene.field))
+    seen = _replaced_columns(stream, kind, plan, scene, other, noise)
     if kind == UNRELATED:
         path = _SPREAD * draws.smooth(stream("path"), len(scene.time), 3, scene.step, 2.0)
         clean = scene.field @ scene.sensor.soft.mT
-        spoilt = replace(spoilt, measured=spoilt.measured - clean + path)
-    key = key_of(name, "useless", plan, scene, noise, outliers, spoilt, seen)
+        contaminated = replace(contaminated, measured=contaminated.measured - clean + path)
+    key = key_of(name, "useless", plan, scene, noise, outliers, contaminated, seen)
     simulation = _SIMULATION.format(view=_VIEWS[kind]) if kind in _VIEWS else ""
     return ScenarioCase(
-        recording_of(name, scene, spoilt, seen), simulation, ScenarioKey("useless", index, key, None, kind)
+        recording_of(name, scene, contaminated, seen), simulation, ScenarioKey("useless", index, key, None, kind)
     )
 
 
-def _told_otherwise(
+def _replaced_columns(
     stream: Callable[[str], Generator], kind: str, plan: Plan, scene: Scene, other: Scene, noise: Noise
 ) -> dict[str, Float[Tensor, " N"]]:
-    """The columns, of which a few are those of the other recording, or of the wrong sign."""
+    """Return the columns; some are those of the other recording, or have the wrong sign."""
     columns = draw_columns(stream("columns"), plan, scene, noise)
     elsewhere = draw_columns(stream("other columns"), plan, other, noise)
     if kind == WRONG_SIGN:
@@ -136,22 +140,22 @@ def _told_otherwise(
     return {name: elsewhere[name] if name.split("_")[0] == first else values for name, values in columns.items()}
 
 
-def _scene(stream: Callable[[str], Generator], world: str, duration: float) -> Scene:
+def _scene(stream: Callable[[str], Generator], scenario: str, duration: float) -> Scene:
     scene = draw_scene(stream("scene"), duration, RATE)
-    if world == "orientations":
+    if scenario == "orientations":
         return replace(scene, motion=poses(stream("poses"), duration=duration, rate=RATE))
     return scene
 
 
-def _noise(stream: Callable[[str], Generator], world: str, samples: int) -> Noise:
-    """White, with an attitude that is right, but for the world of coloured noise."""
+def _noise(stream: Callable[[str], Generator], scenario: str, samples: int) -> Noise:
+    """Draw white noise with a right attitude, or coloured noise in the scenario ``coloured``."""
     for again in range(1000):
         noise = draw_noise(stream(f"noise {again}"), samples, RATE)
-        if world == "coloured" and noise.kind in _COLOURED:
+        if scenario == "coloured" and noise.kind in _COLOURED:
             return noise
-        if world != "coloured" and noise.kind == "white":
+        if scenario != "coloured" and noise.kind == "white":
             return replace(noise, attitude=None)
-    raise AssertionError("a thousand draws without the noise that was asked for")
+    raise AssertionError("no noise of the required kind in a thousand draws")
 
 
 def _effect(g: Generator, scene: Scene) -> Hidden:
@@ -159,17 +163,17 @@ def _effect(g: Generator, scene: Scene) -> Hidden:
     return forms[draws.choose(g, list(forms))](g, scene)
 
 
-def _spoilt(
+def _contaminated(
     stream: Callable[[str], Generator],
-    world: str,
+    scenario: str,
     scene: Scene,
     noise: Noise,
     outliers: Outliers,
     added: Float[Tensor, "N 3"],
     disturbed: Tensor,
 ) -> Contaminated:
-    """The measurement; what is disturbed counts as bad, and the share of outliers is what is told beside that."""
-    if world == "bursts":
+    """Contaminate the measurement; disturbed samples count as outliers, too."""
+    if scenario == "bursts":
         outliers = replace(outliers, share=max(outliers.share - float(disturbed.double().mean()), 0.0))
-    spoilt = spoil_scene(stream("errors"), scene, noise, outliers, added)
-    return replace(spoilt, mask=spoilt.mask | disturbed)
+    contaminated = contaminate_scene(stream("errors"), scene, noise, outliers, added)
+    return replace(contaminated, mask=contaminated.mask | disturbed)

@@ -1,4 +1,4 @@
-"""A sensor that is laid down in one orientation after another, as one calibrates on a table."""
+"""A sensor that is laid down in one orientation after another, as in a calibration on a table."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from mkc_torch.challenge.magnetometer import rotation
 from mkc_torch.challenge.magnetometer.motion import Motion
 
 POSES = (24, 32)
-"""How many orientations a recording has."""
+"""Number of orientations in a recording."""
 
 TURNING = (0.25, 0.45)
-"""Share of the time in which the sensor is turned."""
+"""Share of the time during which the sensor is turned."""
 
 
 def poses(g: Generator, *, duration: float, rate: float) -> Motion:
-    """At rest in some orientations, between which it is turned by 1 to 3 rad about any axis.
+    """Draw a motion with rests in several orientations; between them it turns by 1 to 3 rad about any axis.
 
     Args:
-        duration: in s.
+        duration: length in s.
         rate: samples per second.
     """
     count, step = round(duration * rate), 1.0 / rate
@@ -40,5 +40,5 @@ def poses(g: Generator, *, duration: float, rate: float) -> Motion:
     attitude = rotation.running_product(torch.cat([first[None], turns[:-1]]))
     moves = (gyro != 0.0).any(-1).long()
     hand = 0.5 * torch.tanh(0.5 * smooth(g, count, 3, step, 3.0))
-    position = hand[(moves.cumsum(0) - 1).clamp(min=0)]  # where it lies it stays
+    position = hand[(moves.cumsum(0) - 1).clamp(min=0)]  # a resting sensor does not move
     return Motion(torch.arange(count, dtype=torch.float64) * step, attitude, position, gyro, walks=False)

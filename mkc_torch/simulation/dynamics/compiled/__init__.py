@@ -1,1 +1,1 @@
-"""Differential equations as lists of NumPy operations: traced once, differentiated by rules, solved without torch."""
+"""Differential equations as NumPy operations: traced once, differentiated symbolically, solved without torch."""

@@ -1,4 +1,4 @@
-"""Affine recurrences of a few states with NumPy, many right-hand sides at once, in a depth of log G."""
+"""Solve affine recurrences of a few states with NumPy, many right-hand sides at once, in a depth of log G."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 __all__ = ["Affine", "inverted", "multiplied"]
 
 _FEW = 128
-"""Moments up to which every product over 1, 2, 4 ... intervals is kept instead of those of every second moment."""
+"""Number of grid times up to which products over 1, 2, 4 ... intervals replace halving."""
 
 
 @dataclass(frozen=True)
 class Affine:
-    """The recurrence ``δ[k+1] = A[k] δ[k] + v[k+1]``: moment after moment in machine code, or by its products.
+    """The recurrence ``δ[k+1] = A[k] δ[k] + v[k+1]``, solved sequentially by machine code, or in parallel by NumPy.
 
-    Products over growing intervals: Blelloch, "Prefix Sums and Their Applications" (1990).
+    Parallel composition: Blelloch, "Prefix Sums and Their Applications" (1990).
 
     Attributes:
-        carries: A of all moments, those of every second moment and so on, (w, w, G) each; 0 where a trajectory begins.
-        products: of few moments, over 1, 2, 4 ... intervals.
+        carries: A at all grid times, at every second time, and so on, (w, w, G) each; 0 where a trajectory starts.
+        products: products of A over 1, 2, 4 ... intervals at the last level.
 
     Example:
         >>> carries = np.full((1, 1, 4), 0.5)
@@ -38,7 +38,7 @@ class Affine:
 
     @classmethod
     def of(cls, carries: Array, longest: int) -> Affine:
-        """From A as it arrives at each moment, and the number of moments of the longest trajectory."""
+        """Compose from A into each grid time, and the number of grid times of the longest trajectory."""
         if machine_code(pass_on) is not None:
             return cls((carries,), ())
         levels = []
@@ -55,22 +55,22 @@ class Affine:
             shift *= 2
         return cls(tuple(levels), tuple(products))
 
-    def solved(self, pushed: Array, level: int = 0) -> Array:
-        """δ for v, (w, K, G) both."""
+    def solved(self, source: Array, level: int = 0) -> Array:
+        """Solve for δ given v, (w, K, G) each."""
         compiled = None if self.products else machine_code(pass_on)
         if compiled is not None:
-            values = np.array(pushed, order="C")
+            values = np.array(source, order="C")
             compiled(self.carries[0], values)
             return values
         if level < len(self.carries):
-            A, G = self.carries[level], pushed.shape[-1]
-            found = np.empty_like(pushed)
-            second = pushed[..., 1::2] + multiplied(A[..., 1::2], pushed[..., : G // 2 * 2 : 2])
+            A, G = self.carries[level], source.shape[-1]
+            found = np.empty_like(source)
+            second = source[..., 1::2] + multiplied(A[..., 1::2], source[..., : G // 2 * 2 : 2])
             second = found[..., 1::2] = self.solved(second, level + 1)
-            found[..., 0] = pushed[..., 0]
-            found[..., 2::2] = pushed[..., 2::2] + multiplied(A[..., 2::2], second[..., : (G - 1) // 2])
+            found[..., 0] = source[..., 0]
+            found[..., 2::2] = source[..., 2::2] + multiplied(A[..., 2::2], second[..., : (G - 1) // 2])
             return found
-        values, shift = pushed, 1
+        values, shift = source, 1
         for product in self.products:
             later = values[..., shift:] + multiplied(product, values[..., :-shift])
             values = np.concatenate([values[..., :shift], later], -1)
@@ -78,19 +78,19 @@ class Affine:
         return values
 
 
-def multiplied(one: Array, other: Array) -> Array:
-    """Matrices of each moment, (i, j, G), times (j, k, G)."""
-    if one.shape[1] == 1:
-        product: Array = one * other
+def multiplied(left: Array, right: Array) -> Array:
+    """Matrix product at each grid time, (i, j, G) times (j, k, G)."""
+    if left.shape[1] == 1:
+        product: Array = left * right
         return product
-    total: Array = one[:, :1] * other[None, 0]
-    for j in range(1, one.shape[1]):
-        total += one[:, j : j + 1] * other[None, j]
+    total: Array = left[:, :1] * right[None, 0]
+    for j in range(1, left.shape[1]):
+        total += left[:, j : j + 1] * right[None, j]
     return total
 
 
 def inverted(matrices: Array) -> Array:
-    """The inverse of each moment's matrix, (n, n, G)."""
+    """Inverse of the matrix at each grid time, (n, n, G); NaN where singular."""
     n = len(matrices)
     with np.errstate(all="ignore"):
         if n == 1:

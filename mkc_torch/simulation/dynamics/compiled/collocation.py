@@ -36,14 +36,14 @@ __all__ = [
 
 
 class JumpFunctions(Protocol):
-    """What happens to the states at the moments of a grid; see :class:`..trajectory.Jump`."""
+    """A jump of the states at grid times; see :class:`..trajectory.Jump`."""
 
     def applied(self, states: Array) -> Array:
-        """The states just after each moment, (w, G), by those just before it."""
+        """Return the states just after each grid time, (w, G), from those just before."""
         ...
 
     def slope(self, states: Array) -> Array:
-        """Of the states after by those before, (w, w, G)."""
+        """Return the derivative of the states after by those before, (w, w, G)."""
         ...
 
 
@@ -53,8 +53,8 @@ class Functions:
 
     Attributes:
         ends, middle: the rates, in the states' shape.
-        ends_slope, middle_slope: of the rates by the states, (w, w, 2, G-1) and (w, w, G-1).
-        jump: at the moments; None for nothing.
+        ends_slope, middle_slope: derivatives of the rates by the states, (w, w, 2, G-1) and (w, w, G-1).
+        jump: jump of the states at the grid times; None for no jump.
     """
 
     ends: Callable[[Array], Array]
@@ -66,12 +66,12 @@ class Functions:
 
 @dataclass(frozen=True)
 class ArrayGrid:
-    """The moments of trajectories that follow one another.
+    """Grid times of trajectories, in sequence.
 
     Attributes:
-        step: (G-1,), length of each interval in s; 0 before the beginning of a trajectory.
-        begins: (G,), where a trajectory begins.
-        longest: number of moments of the longest trajectory.
+        step: (G-1,), length of each interval in s; 0 before the start of a trajectory.
+        begins: (G,), True where a trajectory starts.
+        longest: number of grid times of the longest trajectory.
     """
 
     step: Array
@@ -81,31 +81,31 @@ class ArrayGrid:
 
 @dataclass(frozen=True)
 class Factor:
-    """Linearised equations, ready to be solved.
+    """Linearised collocation equations, factorised.
 
     Attributes:
         affine: the recurrence of a small change of the states.
-        inverse: how a defect arrives at the end of its interval, (w, w, G-1).
+        inverse: derivative of an interval's end by its negative defect, (w, w, G-1).
     """
 
     affine: Affine
     inverse: Array
 
     def solved(self, defect: Array) -> Array:
-        """The change that takes defects (w, K, G-1) away, (w, K, G), with first states that stay."""
-        pushed = multiplied(self.inverse, defect)
-        return self.affine.solved(np.concatenate([np.zeros_like(pushed[..., :1]), -pushed], -1))
+        """Solve for the change of the states, (w, K, G), that cancels defects (w, K, G-1) at fixed initial states."""
+        source = multiplied(self.inverse, defect)
+        return self.affine.solved(np.concatenate([np.zeros_like(source[..., :1]), -source], -1))
 
 
 @dataclass(frozen=True)
 class LinearisedCollocation:
-    """Equations linearised at states.
+    """Collocation equations linearised about states.
 
     Attributes:
-        factor: ready to be solved.
+        factor: the factorised equations.
         ends, middle: the states at the ends (w, 2, G-1) and in the middle (w, G-1) of each interval.
-        behind: the slope of the defects by the states just after the left ends, (w, w, G-1).
-        middle_slope: the slope of the rates in the middle, (w, w, G-1).
+        behind: derivative of the defects by the states just after the left ends, (w, w, G-1).
+        middle_slope: derivative of the rates by the states in the middle, (w, w, G-1).
     """
 
     factor: Factor
@@ -117,14 +117,14 @@ class LinearisedCollocation:
 
 @dataclass(frozen=True)
 class CollocationSolution:
-    """A trajectory, (w, G), and the linearised equations that it was found with."""
+    """A trajectory, (w, G), and the linearised equations of the last Newton step."""
 
     states: Array
     factor: Factor
 
 
 class _Iterate:
-    """States on the way to a solution, with their defects, the scale of each state, and the size of the defects."""
+    """An iterate: states, defects, the scale of each state, and the mean square of the scaled defects."""
 
     def __init__(self, functions: Functions, grid: ArrayGrid, states: Array) -> None:
         self.states = states
@@ -135,7 +135,7 @@ class _Iterate:
 
 
 def _defect(functions: Functions, grid: ArrayGrid, states: Array) -> tuple[Array, Array, Array]:
-    """The states at the ends and in the middle of each interval, and what the ends lack of Simpson's rule."""
+    """States at the ends and in the middle of each interval, and the defect of Simpson's rule."""
     h, after = grid.step, states if functions.jump is None else functions.jump.applied(states)
     ends = np.stack([after[:, :-1], states[:, 1:]], 1)
     rates = functions.ends(ends)
@@ -146,7 +146,7 @@ def _defect(functions: Functions, grid: ArrayGrid, states: Array) -> tuple[Array
 
 
 def linearised(functions: Functions, grid: ArrayGrid, states: Array) -> LinearisedCollocation:
-    """The equations linearised at states (w, G)."""
+    """Linearise the equations about states (w, G)."""
     return _linearised(functions, grid, _Iterate(functions, grid, states))
 
 
@@ -167,10 +167,10 @@ def _linearised(functions: Functions, grid: ArrayGrid, at: _Iterate) -> Linearis
 def solved(
     functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor | None = None
 ) -> CollocationSolution | None:
-    """The trajectories near a guess (w, G), whose states where they begin are kept; None where none is found.
+    """Solve for the trajectories near a guess (w, G), with its initial states; None where none is found.
 
-    As :func:`mkc_torch.simulation.dynamics.trajectory.solve` step for step; a factor of a trajectory nearby serves as
-    long as it brings the equations to rest quickly. Warnings of NumPy are the caller's to silence.
+    Same steps as :func:`mkc_torch.simulation.dynamics.trajectory.solve`. The factor of a trajectory nearby is used as
+    long as it converges quickly. The caller silences warnings of NumPy.
     """
     at = _Iterate(functions, grid, guess)
     fresh = factor is None
@@ -202,23 +202,23 @@ def solved(
 
 
 def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = HORIZON) -> Array | None:
-    """A guess near the trajectories, solved roughly over a horizon that grows; None where there is none.
+    """Improve a poor guess by solving roughly over a growing horizon; None where the iteration diverges.
 
-    As :func:`mkc_torch.simulation.dynamics.trajectory.marched`, but the horizon grows by twice as much after each
-    success, and by a quarter of that after each failure.
+    As :func:`mkc_torch.simulation.dynamics.trajectory.marched`, but the stride doubles after each success, and is
+    divided by 4 after each failure.
 
     Args:
         functions: the differential equation.
-        grid: the moments.
-        guess: (w, G), of all states; those where trajectories begin are kept.
-        stride: moments by which the horizon grows at least.
+        grid: the grid times.
+        guess: (w, G), of all states; the initial states of the trajectories are kept.
+        stride: grid times by which the horizon grows at least.
     """
     index = np.arange(guess.shape[1])
     first = np.maximum.accumulate(np.where(grid.begins, index, 0))
     place, states, horizon, growth = index - first, guess, 0, stride
     while horizon < grid.longest:
         check_deadline()
-        # beyond what is solved the last state stays
+        # beyond the horizon the last solved state is held
         held = states[:, np.minimum(index, first + horizon)]
         tried, settled = _solved_to(functions, grid, held, place <= horizon + growth)
         if not settled and growth > stride:
@@ -234,7 +234,7 @@ def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = H
 def _solved_to(
     functions: Functions, grid: ArrayGrid, states: Array, inside: np.ndarray[tuple[int], np.dtype[np.bool_]]
 ) -> tuple[Array | None, bool]:
-    """States solved roughly at the moments inside, None where they are lost; and whether they came to rest."""
+    """States solved roughly at the grid times inside, None where they diverge; and whether they converged."""
     for _ in range(MOST_STEPS):
         at = _Iterate(functions, grid, states)
         left = np.where(inside[1:], at.defect, 0.0)
@@ -255,7 +255,7 @@ def _solved_to(
 
 
 def dense(values: Sequence[Array | float], places: Sequence[tuple[int, int]], shape: tuple[int, ...]) -> Array:
-    """A matrix of which these elements are not 0, each for all moments."""
+    """Build a matrix for all grid times from its elements that are not 0."""
     found = np.zeros(shape)
     for place, value in zip(places, values, strict=True):
         found[place] = value

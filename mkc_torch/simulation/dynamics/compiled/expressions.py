@@ -14,7 +14,7 @@ __all__ = ["FUNCTIONS", "Array", "Expressions", "Node"]
 Array = NDArray[np.float64]
 
 CONSTANT, PARAMETER, STATE = 0, 1, 2
-"""What a node depends on at most."""
+"""Level of a node: the last kind of leaf that it depends on."""
 
 
 def _sigmoid(x: Any) -> Any:
@@ -85,7 +85,7 @@ class Node:
 
 
 class Expressions:
-    """Nodes in an order in which each follows its arguments; equal nodes are one node.
+    """A list of nodes in which each node follows its arguments; equal nodes are stored once.
 
     Example:
         The derivative of ``sin(x) p`` by the state x:
@@ -110,21 +110,21 @@ class Expressions:
         return self._node(Node("number", (), float(value)))
 
     def column(self, values: Array) -> int:
-        """A constant for each moment, (S,)."""
+        """A column of constants, a value for each station, (S,)."""
         self.columns.append(values)
         return self._node(Node("column", (), len(self.columns) - 1))
 
     def leaf(self, kind: str, index: int) -> int:
-        """The parameter or state of this number."""
+        """The parameter or state of this index; ``kind`` is "parameter" or "state"."""
         return self._node(Node(kind, (), index))
 
     def apply(self, operation: str, *arguments: int) -> int:
-        """The operation on these nodes, simplified where an argument is 0 or 1."""
+        """Apply an operation to nodes, simplified where an argument is 0 or 1."""
         simple = self._simplified(operation, arguments)
         if simple is not None:
             return simple
-        values = [self._value(one) for one in arguments]
-        if all(one is not None for one in values):
+        values = [self._value(argument) for argument in arguments]
+        if all(value is not None for value in values):
             with np.errstate(all="ignore"):
                 found = FUNCTIONS[operation](*values)
             if not isinstance(found, (bool, np.bool_)):
@@ -132,11 +132,11 @@ class Expressions:
         return self._node(Node(operation, tuple(arguments)))
 
     def leaves(self, node: int) -> frozenset[int]:
-        """The parameters and states that a node is made of."""
+        """The parameters and states that a node depends on."""
         return self._leaves[node]
 
     def derivative(self, node: int, leaf: int) -> int:
-        """The derivative of a node by a parameter or state, as torch has it where there are two.
+        """Differentiate a node by a parameter or state; where the derivative is not unique, as torch does.
 
         Raises:
             KeyError: an operation without a rule.
@@ -155,7 +155,7 @@ class Expressions:
         if operation in _FLAT:
             return self.number(0.0)
         if operation == "where":
-            slopes = [self.derivative(one, leaf) for one in arguments[1:]]
+            slopes = [self.derivative(branch, leaf) for branch in arguments[1:]]
             return slopes[0] if slopes[0] == slopes[1] else self.apply("where", arguments[0], *slopes)
         total = self.number(0.0)
         for place, argument in enumerate(arguments):
@@ -169,9 +169,9 @@ class Expressions:
             self._known[node] = index = len(self.nodes)
             self.nodes.append(node)
             own = {"parameter": PARAMETER, "state": STATE}.get(node.operation, CONSTANT)
-            self.levels.append(max([own, *(self.levels[one] for one in node.arguments)]))
+            self.levels.append(max([own, *(self.levels[argument] for argument in node.arguments)]))
             leaves = frozenset((index,)) if own != CONSTANT else frozenset()
-            self._leaves.append(leaves.union(*(self._leaves[one] for one in node.arguments)))
+            self._leaves.append(leaves.union(*(self._leaves[argument] for argument in node.arguments)))
         return self._known[node]
 
     def _value(self, node: int) -> float | None:
@@ -182,25 +182,25 @@ class Expressions:
         if operation not in ("add", "sub", "mul", "div", "pow"):
             return None
         first, second = arguments
-        one, other = self._value(first), self._value(second)
+        a, b = self._value(first), self._value(second)
         if operation == "add":
-            return second if one == 0.0 else first if other == 0.0 else None
+            return second if a == 0.0 else first if b == 0.0 else None
         if operation == "sub":
-            return first if other == 0.0 else self.apply("neg", second) if one == 0.0 else None
+            return first if b == 0.0 else self.apply("neg", second) if a == 0.0 else None
         if operation == "mul":
-            if 0.0 in (one, other):
+            if 0.0 in (a, b):
                 return self.number(0.0)
-            return second if one == 1.0 else first if other == 1.0 else None
+            return second if a == 1.0 else first if b == 1.0 else None
         if operation == "div":
-            return self.number(0.0) if one == 0.0 and other != 0.0 else first if other == 1.0 else None
-        return first if other == 1.0 else self.apply("mul", first, first) if other == 2.0 else None
+            return self.number(0.0) if a == 0.0 and b != 0.0 else first if b == 1.0 else None
+        return first if b == 1.0 else self.apply("mul", first, first) if b == 2.0 else None
 
 
 _Rule = Callable[[Expressions, int], int]
 
 
 def _of(build: Callable[..., int]) -> _Rule:
-    """A rule from a function of the expressions, the node itself, and its arguments."""
+    """Build a rule from a function of the expressions, the node, and the node's arguments."""
     return lambda e, node: build(e, node, *e.nodes[node].arguments)
 
 
@@ -208,31 +208,31 @@ def _square(e: Expressions, node: int) -> int:
     return e.apply("mul", node, node)
 
 
-def _less(e: Expressions, node: int) -> int:
+def _one_minus(e: Expressions, node: int) -> int:
     return e.apply("sub", e.number(1.0), node)
 
 
-def _ratio(e: Expressions, one: int, other: int) -> int:
-    return e.apply("div", one, other)
+def _ratio(e: Expressions, a: int, b: int) -> int:
+    return e.apply("div", a, b)
 
 
 def _inverse(e: Expressions, node: int) -> int:
     return _ratio(e, e.number(1.0), node)
 
 
-def _minus(e: Expressions, node: int) -> int:
+def _negative(e: Expressions, node: int) -> int:
     return e.apply("neg", node)
 
 
-def _if(e: Expressions, operation: str, one: int, other: int) -> int:
+def _indicator(e: Expressions, operation: str, a: int, b: int) -> int:
     """1 where a comparison holds, else 0."""
-    return e.apply("double", e.apply(operation, one, other))
+    return e.apply("double", e.apply(operation, a, b))
 
 
-def _shared(e: Expressions, operation: str, one: int, other: int) -> int:
-    """As :func:`_if`, and a half where both are equal."""
-    half = e.apply("mul", e.number(0.5), _if(e, "eq", one, other))
-    return e.apply("add", _if(e, operation, one, other), half)
+def _indicator_with_ties(e: Expressions, operation: str, a: int, b: int) -> int:
+    """As :func:`_indicator`, plus 1/2 where both are equal."""
+    half = e.apply("mul", e.number(0.5), _indicator(e, "eq", a, b))
+    return e.apply("add", _indicator(e, operation, a, b), half)
 
 
 def _power(e: Expressions, a: int, b: int) -> int:
@@ -249,13 +249,13 @@ _FLAT = {"sign", "floor", "ceil", "trunc", "round", "gt", "ge", "lt", "le", "eq"
     "logical_or",
     "logical_not",
 }
-"""Operations whose slope is 0 wherever they have one."""
+"""Operations whose derivative is 0 wherever it exists."""
 
 _RULES: dict[str, tuple[_Rule, ...]] = {
     "add": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(1.0))),
     "sub": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(-1.0))),
     "mul": (_of(lambda _e, _n, _a, b: b), _of(lambda _e, _n, a, _b: a)),
-    "div": (_of(lambda e, _n, _a, b: _inverse(e, b)), _of(lambda e, n, _a, b: _minus(e, _ratio(e, n, b)))),
+    "div": (_of(lambda e, _n, _a, b: _inverse(e, b)), _of(lambda e, n, _a, b: _negative(e, _ratio(e, n, b)))),
     "pow": (
         _of(lambda e, _n, a, b: _power(e, a, b)),
         _of(lambda e, n, a, _b: _logarithmic(e, n, a)),
@@ -268,25 +268,37 @@ _RULES: dict[str, tuple[_Rule, ...]] = {
     "log": (_of(lambda e, _n, a: _inverse(e, a)),),
     "log1p": (_of(lambda e, _n, a: _inverse(e, e.apply("add", a, e.number(1.0)))),),
     "sin": (_of(lambda e, _n, a: e.apply("cos", a)),),
-    "cos": (_of(lambda e, _n, a: _minus(e, e.apply("sin", a))),),
+    "cos": (_of(lambda e, _n, a: _negative(e, e.apply("sin", a))),),
     "tan": (_of(lambda e, n, _a: e.apply("add", e.number(1.0), _square(e, n))),),
-    "asin": (_of(lambda e, _n, a: _inverse(e, e.apply("sqrt", _less(e, _square(e, a))))),),
-    "acos": (_of(lambda e, _n, a: _minus(e, _inverse(e, e.apply("sqrt", _less(e, _square(e, a)))))),),
+    "asin": (_of(lambda e, _n, a: _inverse(e, e.apply("sqrt", _one_minus(e, _square(e, a))))),),
+    "acos": (_of(lambda e, _n, a: _negative(e, _inverse(e, e.apply("sqrt", _one_minus(e, _square(e, a)))))),),
     "atan": (_of(lambda e, _n, a: _inverse(e, e.apply("add", e.number(1.0), _square(e, a)))),),
     "atan2": (
         _of(lambda e, _n, a, b: _ratio(e, b, e.apply("add", _square(e, a), _square(e, b)))),
-        _of(lambda e, _n, a, b: _minus(e, _ratio(e, a, e.apply("add", _square(e, a), _square(e, b))))),
+        _of(lambda e, _n, a, b: _negative(e, _ratio(e, a, e.apply("add", _square(e, a), _square(e, b))))),
     ),
     "sinh": (_of(lambda e, _n, a: e.apply("cosh", a)),),
     "cosh": (_of(lambda e, _n, a: e.apply("sinh", a)),),
-    "tanh": (_of(lambda e, n, _a: _less(e, _square(e, n))),),
-    "sigmoid": (_of(lambda e, n, _a: e.apply("mul", n, _less(e, n))),),
+    "tanh": (_of(lambda e, n, _a: _one_minus(e, _square(e, n))),),
+    "sigmoid": (_of(lambda e, n, _a: e.apply("mul", n, _one_minus(e, n))),),
     "hypot": (_of(lambda e, n, a, _b: _ratio(e, a, n)), _of(lambda e, n, _a, b: _ratio(e, b, n))),
-    "maximum": (_of(lambda e, _n, a, b: _shared(e, "gt", a, b)), _of(lambda e, _n, a, b: _shared(e, "gt", b, a))),
-    "minimum": (_of(lambda e, _n, a, b: _shared(e, "lt", a, b)), _of(lambda e, _n, a, b: _shared(e, "lt", b, a))),
-    "clamp_min": (_of(lambda e, _n, a, b: _if(e, "ge", a, b)), _of(lambda e, _n, a, b: _if(e, "lt", a, b))),
-    "clamp_max": (_of(lambda e, _n, a, b: _if(e, "le", a, b)), _of(lambda e, _n, a, b: _if(e, "gt", a, b))),
-    "relu": (_of(lambda e, _n, a: _if(e, "gt", a, e.number(0.0))),),
+    "maximum": (
+        _of(lambda e, _n, a, b: _indicator_with_ties(e, "gt", a, b)),
+        _of(lambda e, _n, a, b: _indicator_with_ties(e, "gt", b, a)),
+    ),
+    "minimum": (
+        _of(lambda e, _n, a, b: _indicator_with_ties(e, "lt", a, b)),
+        _of(lambda e, _n, a, b: _indicator_with_ties(e, "lt", b, a)),
+    ),
+    "clamp_min": (
+        _of(lambda e, _n, a, b: _indicator(e, "ge", a, b)),
+        _of(lambda e, _n, a, b: _indicator(e, "lt", a, b)),
+    ),
+    "clamp_max": (
+        _of(lambda e, _n, a, b: _indicator(e, "le", a, b)),
+        _of(lambda e, _n, a, b: _indicator(e, "gt", a, b)),
+    ),
+    "relu": (_of(lambda e, _n, a: _indicator(e, "gt", a, e.number(0.0))),),
     "double": (_of(lambda e, _n, _a: e.number(1.0)),),
 }
 """The derivative of each operation by each of its arguments."""

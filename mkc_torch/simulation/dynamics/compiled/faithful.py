@@ -1,4 +1,4 @@
-"""Traced functions compared with torch's."""
+"""Compare traced functions with torch."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 __all__ = ["is_faithful"]
 
 _FAITHFUL = 1e-9
-"""Largest difference between traced functions and torch's, as a share of their size."""
+"""Largest relative difference between traced functions and torch."""
 
 
 def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
-    """Whether a system's functions as they are traced have the values and derivatives that torch finds, near a guess.
+    """Whether a system's traced functions have the same values and derivatives as torch, near the guess.
 
-    They have not where a function has a derivative of its own, as those of ``torch.autograd.Function`` may.
+    They differ where a function defines its own derivative, as a ``torch.autograd.Function`` may.
 
     Args:
         system: the prepared system.
-        theta: its parameters.
+        theta: (p,), its parameters.
     """
     found = traced(system, lambda parameters: (parameters, {}), len(theta))
     if found is None:
@@ -53,16 +53,16 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
         expected, slopes = torch.func.jvp(functions, (theta, at), (along, moved))[:2]
     except RuntimeError:
         return False
-    ends, moves, rates, slope = (_ends(one) for one in (at, moved, expected[0], slopes[0]))
+    ends, moves, rates, slope = (_ends(array) for array in (at, moved, expected[0], slopes[0]))
     outputs, seen = expected[1].T, slopes[1].T
     known = [(found.ends, ends, moves, rates, slope)]
     if found.outputs is not None:
         known.append((found.outputs, at[:N].T, moved[:N].T, outputs, seen))
-    return all(_agrees(block, values, along, *one) for block, *one in known)
+    return all(_agrees(block, values, along, *arrays) for block, *arrays in known)
 
 
 def _ends(values: Tensor) -> Tensor:
-    """Values at the stations (S, k) as those at both ends of each interval, (k, 2, G-1)."""
+    """Rearrange values at the stations (S, k) to the ends of the intervals, (k, 2, G-1)."""
     return values.unflatten(0, (-1, 3))[:, ::2].permute(2, 1, 0)
 
 
@@ -75,16 +75,16 @@ def _agrees(
     values: Tensor,
     slopes: Tensor,
 ) -> bool:
-    """Whether values (k, *) and their derivatives along a direction are those of a block, where they are finite."""
+    """Whether a block has these values (k, *) and directional derivatives, wherever they are finite."""
     states = at.numpy()
     with np.errstate(all="ignore"):
         by_parameters = block.by_parameters.at(parameters)(states)
         change = np.einsum("kw...,w...->k...", block.by_states.at(parameters)(states), moved.numpy())
         change += np.einsum("kp...,p->k...", by_parameters, along[block.moving].numpy())
         own = block.values(parameters)(states)
-    for one, other in ((own, values.numpy()), (change, slopes.numpy())):
-        finite = np.isfinite(other)
-        size = np.abs(np.where(finite, other, 0.0)).max() + np.finfo(float).tiny
-        if not bool((np.abs(np.where(finite, one - other, 0.0)) <= _FAITHFUL * size).all()):
+    for computed, expected in ((own, values.numpy()), (change, slopes.numpy())):
+        finite = np.isfinite(expected)
+        size = np.abs(np.where(finite, expected, 0.0)).max() + np.finfo(float).tiny
+        if not bool((np.abs(np.where(finite, computed - expected, 0.0)) <= _FAITHFUL * size).all()):
             return False
     return True

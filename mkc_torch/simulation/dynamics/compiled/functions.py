@@ -1,4 +1,4 @@
-"""Traced expressions as the functions that a collocation is made of."""
+"""Traced expressions as the functions of a collocation."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["CompiledBlock", "CompiledObserverJump", "Derivatives"]
 
 
 class Derivatives:
-    """Derivatives of several nodes by several leaves, those that are not 0.
+    """Sparse derivatives of several nodes by several leaves.
 
     Args:
-        expressions: with the nodes.
-        nodes: to be differentiated.
-        leaves: the parameters or states, by their numbers.
-        arranged: as of :class:`..tape.Tape`.
+        expressions: the expressions that hold the nodes.
+        nodes: the nodes to differentiate.
+        leaves: the nodes of the parameters or states.
+        arranged: as in :class:`..tape.Tape`.
     """
 
     def __init__(
@@ -45,20 +45,20 @@ class Derivatives:
         self.tape = Tape(expressions, [slopes[place] for place in self.places], arranged)
 
     def at(self, parameters: Sequence[float]) -> Callable[[Array], Array]:
-        """The matrix of derivatives (nodes, leaves, *) by the states (w, *)."""
+        """The derivatives (nodes, leaves, *) as a function of the states (w, *)."""
         evaluated = self.tape.at(parameters)
         return lambda states: dense(evaluated(states), self.places, (*self.shape, *states.shape[1:]))
 
 
 @dataclass(frozen=True)
 class CompiledBlock:
-    """Nodes as functions of states and parameters at fixed moments.
+    """Nodes as functions of states and parameters at fixed stations or samples.
 
     Attributes:
-        expressions: with the nodes.
-        nodes: of what is computed.
-        states, parameters: leaves.
-        arranged: as of :class:`..tape.Tape`.
+        expressions: the expressions that hold the nodes.
+        nodes: the nodes to compute.
+        states, parameters: their leaves.
+        arranged: as in :class:`..tape.Tape`.
     """
 
     expressions: Expressions
@@ -78,7 +78,7 @@ class CompiledBlock:
 
     @cached_property
     def moving(self) -> list[int]:
-        """Numbers of the parameters that a node depends on."""
+        """Indices of the parameters that a node depends on."""
         leaves = frozenset().union(*(self.expressions.leaves(node) for node in self.nodes))
         return [k for k, leaf in enumerate(self.parameters) if leaf in leaves]
 
@@ -88,7 +88,7 @@ class CompiledBlock:
         return Derivatives(self.expressions, self.nodes, [self.parameters[k] for k in self.moving], self.arranged)
 
     def values(self, parameters: Sequence[float]) -> Callable[[Array], Array]:
-        """The values (nodes, *) by the states (w, *)."""
+        """The values (nodes, *) as a function of the states (w, *)."""
         evaluated: Evaluation = self._tape.at(parameters)
 
         def values(states: Array) -> Array:
@@ -105,12 +105,12 @@ class CompiledObserverJump:
     """An observer's jump at given parameters; see :class:`mkc_torch.simulation.dynamics.observer.ObserverJump`.
 
     Attributes:
-        rows: (N,), the moment of each sample.
-        places: of the states that the gains are of.
-        gain: (k, m, N).
-        limit: (m, N), of the innovations.
-        new: the innovations (m, N) by the states at the samples (w, N).
-        new_slope: of these by the states, (m, w, N).
+        rows: (N,), grid index of each sample.
+        places: indices of the corrected states.
+        gain: (k, m, N), gains of the observer.
+        limit: (m, N), at which the innovations are clipped.
+        new: the innovations (m, N) as a function of the states at the samples (w, N).
+        new_slope: their derivatives by the states, (m, w, N).
     """
 
     rows: NDArray[np.int64]
@@ -135,7 +135,7 @@ class CompiledObserverJump:
         return self._moved(found, self.new_slope(at), at)
 
     def by_parameters(self, states: Array, new_slope: Array) -> Array:
-        """Of the states just after, (w, K, G), where the innovations have this slope (m, K, N)."""
+        """Derivatives of the states just after, (w, K, G), given those of the innovations, (m, K, N)."""
         found = np.zeros((len(states), new_slope.shape[1], states.shape[1]))
         return self._moved(found, new_slope, states[:, self.rows])
 

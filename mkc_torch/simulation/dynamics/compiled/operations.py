@@ -1,4 +1,4 @@
-"""What torch's operations are on the expressions of a symbol."""
+"""Torch's operations on symbols, as operations on their expressions."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ __all__ = ["OPERATIONS"]
 
 
 def _pointwise(build: Callable[..., int], values: Sequence[Any], dtype: torch.dtype | None = None) -> Symbol:
-    """An operation on each element, with torch's rules of broadcasting."""
-    trace = next(one.tracing for one in values if isinstance(one, Symbol))
-    parts = [as_nodes(one, trace) for one in values]
+    """Apply an operation to each element, with torch's broadcasting."""
+    trace = next(value.tracing for value in values if isinstance(value, Symbol))
+    parts = [as_nodes(value, trace) for value in values]
     shape = torch.broadcast_shapes(*(part.shape for part in parts))
     moments = {len(shape) - len(part.shape) + part.moments for part in parts if part.moments is not None}
     if len(moments) > 1:
         raise UntraceableError("moments against moments")
-    built = np.frompyfunc(lambda *one: build(trace.expressions, *one), len(parts), 1)(*(part.nodes for part in parts))
+    built = np.frompyfunc(lambda *arguments: build(trace.expressions, *arguments), len(parts), 1)(
+        *(part.nodes for part in parts)
+    )
     nodes: Nodes = np.asarray(built).astype(np.int64)
     return Symbol(trace, nodes, shape, moments.pop() if moments else None, dtype or torch.float64)
 
 
-def _plain(name: str, dtype: torch.dtype | None = None) -> Callable[..., Symbol]:
+def _operation(name: str, dtype: torch.dtype | None = None) -> Callable[..., Symbol]:
     def operation(*values: Any) -> Symbol:
         return _pointwise(lambda e, *nodes: e.apply(name, *nodes), values, dtype)
 
@@ -36,100 +38,100 @@ def _plain(name: str, dtype: torch.dtype | None = None) -> Callable[..., Symbol]
 
 
 def _scaled(name: str) -> Callable[..., Symbol]:
-    """Addition and subtraction, which take a factor."""
+    """Addition or subtraction, which take a factor ``alpha``."""
 
-    def operation(one: Any, other: Any, *, alpha: float = 1) -> Symbol:
+    def operation(first: Any, second: Any, *, alpha: float = 1) -> Symbol:
         def build(e: Expressions, a: int, b: int) -> int:
             return e.apply(name, a, b if alpha == 1 else e.apply("mul", e.number(alpha), b))
 
-        return _pointwise(build, (one, other))
+        return _pointwise(build, (first, second))
 
     return operation
 
 
-def _reversed_sub(one: Any, other: Any, alpha: float = 1) -> Symbol:
+def _reversed_sub(first: Any, second: Any, alpha: float = 1) -> Symbol:
     if alpha != 1:
         raise UntraceableError("rsub with a factor")
-    return _pointwise(lambda e, a, b: e.apply("sub", b, a), (one, other))
+    return _pointwise(lambda e, a, b: e.apply("sub", b, a), (first, second))
 
 
-def _is_truth(value: Any) -> bool:
+def _is_boolean(value: Any) -> bool:
     return isinstance(value, bool) or getattr(value, "dtype", None) == torch.bool
 
 
-def _mul(one: Any, other: Any) -> Symbol:
-    if _is_truth(one) and _is_truth(other):
-        return _plain("logical_and", torch.bool)(one, other)
-    return _plain("mul")(one, other)
+def _mul(first: Any, second: Any) -> Symbol:
+    if _is_boolean(first) and _is_boolean(second):
+        return _operation("logical_and", torch.bool)(first, second)
+    return _operation("mul")(first, second)
 
 
-def _div(one: Any, other: Any, *, rounding_mode: str | None = None) -> Symbol:
+def _div(first: Any, second: Any, *, rounding_mode: str | None = None) -> Symbol:
     if rounding_mode is not None:
         raise UntraceableError("division with rounding")
-    return _plain("div")(one, other)
+    return _operation("div")(first, second)
 
 
-def _round(one: Any, *, decimals: int = 0) -> Symbol:
+def _round(values: Any, *, decimals: int = 0) -> Symbol:
     if decimals:
         raise UntraceableError("rounding to decimals")
-    return _plain("round")(one)
+    return _operation("round")(values)
 
 
-def _clamp(one: Any, low: Any = None, high: Any = None, **named: Any) -> Symbol:
+def _clamp(values: Any, low: Any = None, high: Any = None, **named: Any) -> Symbol:
     low, high = named.get("min", low), named.get("max", high)
     if low is not None:
-        one = _plain("clamp_min")(one, low)
-    return one if high is None else _plain("clamp_max")(one, high)
+        values = _operation("clamp_min")(values, low)
+    return values if high is None else _operation("clamp_max")(values, high)
 
 
 def _bitwise(name: str) -> Callable[..., Symbol]:
     def operation(*values: Any) -> Symbol:
-        if not all(_is_truth(one) for one in values):
+        if not all(_is_boolean(value) for value in values):
             raise UntraceableError("bits of numbers")
-        return _plain(name, torch.bool)(*values)
+        return _operation(name, torch.bool)(*values)
 
     return operation
 
 
-def _lerp(one: Any, other: Any, weight: Any) -> Symbol:
+def _lerp(start: Any, end: Any, weight: Any) -> Symbol:
     return _pointwise(
-        lambda e, a, b, w: e.apply("add", a, e.apply("mul", w, e.apply("sub", b, a))), (one, other, weight)
+        lambda e, a, b, w: e.apply("add", a, e.apply("mul", w, e.apply("sub", b, a))), (start, end, weight)
     )
 
 
-def _addcmul(one: Any, a: Any, b: Any, *, value: float = 1) -> Symbol:
-    return _scaled("add")(one, _mul(a, b), alpha=value)
+def _addcmul(first: Any, a: Any, b: Any, *, value: float = 1) -> Symbol:
+    return _scaled("add")(first, _mul(a, b), alpha=value)
 
 
-def _simple(operation: str, *extra: float) -> Callable[..., Symbol]:
-    def built(one: Any) -> Symbol:
-        return _pointwise(lambda e, a: e.apply(operation, *(e.number(x) for x in extra), a), (one,))
+def _unary(operation: str, *extra: float) -> Callable[..., Symbol]:
+    def built(values: Any) -> Symbol:
+        return _pointwise(lambda e, a: e.apply(operation, *(e.number(x) for x in extra), a), (values,))
 
     return built
 
 
-def _squared(one: Any) -> Symbol:
-    return _pointwise(lambda e, a: e.apply("mul", a, a), (one,))
+def _squared(values: Any) -> Symbol:
+    return _pointwise(lambda e, a: e.apply("mul", a, a), (values,))
 
 
-def _reciprocal_root(one: Any) -> Symbol:
-    return _pointwise(lambda e, a: e.apply("div", e.number(1.0), e.apply("sqrt", a)), (one,))
+def _reciprocal_root(values: Any) -> Symbol:
+    return _pointwise(lambda e, a: e.apply("div", e.number(1.0), e.apply("sqrt", a)), (values,))
 
 
-def _copied(one: Symbol, *, dtype: torch.dtype | None = None, **_: Any) -> Symbol:
-    if dtype is None or dtype == one.dtype:
-        return SHAPES["clone"](one)
+def _copied(values: Symbol, *, dtype: torch.dtype | None = None, **_: Any) -> Symbol:
+    if dtype is None or dtype == values.dtype:
+        return SHAPES["clone"](values)
     if dtype != torch.float64:
         raise UntraceableError(f"conversion to {dtype}")
-    return _plain("double")(one)
+    return _operation("double")(values)
 
 
-def _logical_not(one: Any) -> Symbol:
-    return _plain("logical_not", torch.bool)(one)
+def _logical_not(values: Any) -> Symbol:
+    return _operation("logical_not", torch.bool)(values)
 
 
-def _truth(name: str) -> Callable[..., Symbol]:
-    return _plain(name, torch.bool)
+def _boolean(name: str) -> Callable[..., Symbol]:
+    return _operation(name, torch.bool)
 
 
 _SAME = (
@@ -137,12 +139,15 @@ _SAME = (
     *("atan2", "sinh", "cosh", "tanh", "sigmoid", "hypot", "maximum", "minimum", "relu", "floor", "ceil", "trunc"),
     *("pow", "where", "clamp_min", "clamp_max"),
 )
-"""Operations that have the same name in torch and in :data:`..expressions.FUNCTIONS`."""
+"""Operations with the same name in torch and in :data:`..expressions.FUNCTIONS`."""
 
 OPERATIONS: Mapping[str, Callable[..., Any]] = {
     **SHAPES,
-    **{name: _plain(name) for name in _SAME},
-    **{name: _truth(name) for name in ("gt", "ge", "lt", "le", "eq", "ne", "logical_and", "logical_or", "logical_not")},
+    **{name: _operation(name) for name in _SAME},
+    **{
+        name: _boolean(name)
+        for name in ("gt", "ge", "lt", "le", "eq", "ne", "logical_and", "logical_or", "logical_not")
+    },
     "add": _scaled("add"),
     "sub": _scaled("sub"),
     "rsub": _reversed_sub,
@@ -151,11 +156,11 @@ OPERATIONS: Mapping[str, Callable[..., Any]] = {
     "true_divide": _div,
     "round": _round,
     "clamp": _clamp,
-    "sgn": _plain("sign"),
+    "sgn": _operation("sign"),
     "lerp": _lerp,
     "addcmul": _addcmul,
     "square": _squared,
-    "reciprocal": _simple("div", 1.0),
+    "reciprocal": _unary("div", 1.0),
     "rsqrt": _reciprocal_root,
     "bitwise_and": _bitwise("logical_and"),
     "bitwise_or": _bitwise("logical_or"),

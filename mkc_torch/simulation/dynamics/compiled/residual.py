@@ -37,11 +37,11 @@ __all__ = ["CompiledDynamics", "compiled_dynamics"]
 
 
 def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> CompiledDynamics | None:
-    """The residual of a prepared system by ``size`` parameters; None where its functions cannot be traced.
+    """Compile the residual of a prepared system; None where its functions cannot be traced.
 
     Args:
         system: the prepared system.
-        meaning: the simulation's own parameters and the changes at its ports, by these.
+        meaning: maps the parameters to the simulation's own parameters and the changes at its ports.
         size: number of parameters.
     """
     found = traced(system, meaning, size)
@@ -49,7 +49,7 @@ def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> Compile
 
 
 class CompiledDynamics:
-    """The residual of a traced system: the same values and tangents as torch computes, to rounding."""
+    """The residual of a traced system; values and tangents agree with torch to rounding."""
 
     def __init__(self, system: Traceable, meaning: Meaning, size: int, functions: Traced) -> None:
         self._system, self._meaning, self._size, self._traced = system, meaning, size, functions
@@ -60,17 +60,17 @@ class CompiledDynamics:
         self._measured = np.ascontiguousarray(system.measured.numpy().T)
 
     def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
-        """The residual; NaN where no trajectory is found near the one given, nor near the first guess.
+        """Compute the residual; NaN where no trajectory is found from ``near`` nor from the first guess.
 
-        Without a trajectory given, one is also searched over a horizon that grows.
+        If ``near`` is None, the guess is also improved over a growing horizon.
         """
         known = near if isinstance(near, Trajectory) else None
         values = parameters.tolist()
         with np.errstate(all="ignore"):
             functions, first = self._functions(values), self._first(values)
-            found = None if known is None else solved(functions, self._grid, *self._begun(known, first))
+            found = None if known is None else solved(functions, self._grid, *self._guess_nearby(known, first))
             if found is None:
-                guess = self._from(self._system.guess, first)
+                guess = self._with_first_states(self._system.guess, first)
                 found = solved(functions, self._grid, guess)
                 nearer = marched(functions, self._grid, guess) if found is None and known is None else None
                 found = found if nearer is None else solved(functions, self._grid, nearer)
@@ -84,26 +84,26 @@ class CompiledDynamics:
     def marched(
         self, parameters: Float[Tensor, " p"], guess: Float[Tensor, "G w"], stride: int
     ) -> Float[Tensor, "G w"] | None:
-        """States near the trajectory, by :func:`..collocation.marched` from a guess; None where there are none."""
+        """Improve a guess by :func:`..collocation.marched`; None where that fails."""
         values = parameters.tolist()
         with np.errstate(all="ignore"):
-            begun = self._from(guess, self._first(values))
+            begun = self._with_first_states(guess, self._first(values))
             found = marched(self._functions(values), self._grid, begun, stride)
         return None if found is None else torch.from_numpy(np.ascontiguousarray(found.T))
 
-    def _begun(self, known: Trajectory, first: Array) -> tuple[Array, Factor | None]:
-        """A trajectory nearby as a guess, and its equations linearised."""
+    def _guess_nearby(self, known: Trajectory, first: Array) -> tuple[Array, Factor | None]:
+        """A trajectory nearby as the guess, and its linearised equations."""
         factor = None if known.linear is None else known.linear.factor
         usable = isinstance(factor, Factor) and known.states.shape[1] == self._traced.width
-        return self._from(known.states, first), factor if usable and isinstance(factor, Factor) else None
+        return self._with_first_states(known.states, first), factor if usable and isinstance(factor, Factor) else None
 
-    def _from(self, states: Tensor, first: Array) -> Array:
-        """A guess (w, G) that begins with these first states (w, K)."""
+    def _with_first_states(self, states: Tensor, first: Array) -> Array:
+        """A guess (w, G) with these initial states (w, K)."""
         guess = self._system.with_memories(states.detach(), self._traced.memories)
         return np.where(self._grid.begins, first[:, self._places], guess.numpy().T)
 
     def tangents(self, parameters: Float[Tensor, " p"], near: Nearby | None) -> ResidualTangents | None:
-        """Derivatives of the residual at parameters whose answer is known; None where it is of another system."""
+        """Derivatives of the residual at a solved trajectory; None where the trajectory has other states."""
         if not isinstance(near, Trajectory) or near.states.shape[1] != self._traced.width:
             return None
         states, values = np.ascontiguousarray(near.states.detach().numpy().T), parameters.tolist()
@@ -115,13 +115,13 @@ class CompiledDynamics:
         return ResidualTangents(tangents, self._nearby(parameters, states, linear.factor))
 
     def _outputs(self, parameters: Tensor, states: Array) -> Array:
-        """(m, N), by the states at the samples."""
+        """The outputs, (m, N), from the states at the samples."""
         if self._traced.outputs is not None:
             return self._traced.outputs.values(parameters.tolist())(states)
         return self._outputs_by_torch(parameters, torch.from_numpy(np.ascontiguousarray(states.T))).numpy().T
 
     def _outputs_by_torch(self, parameters: Tensor, states: Tensor) -> Tensor:
-        """(N, m), by the states at the samples (N, w)."""
+        """The outputs, (N, m), from the states at the samples (N, w)."""
         return self._system.outputs_by_states(*self._meaning(parameters), states)
 
     def _output_tangents(
@@ -149,12 +149,12 @@ class CompiledDynamics:
         self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
     ) -> Array:
         """Derivatives of the states at the samples by all parameters, (w, p, N)."""
-        own = self._own(values, states, functions, linear)
+        own = self._defect_tangents(values, states, functions, linear)
         w, G = states.shape
-        pushed = np.zeros((w, len(own.parameters) + w, G))
-        pushed[:, : len(own.parameters), 1:] = -multiplied(linear.factor.inverse, own.defects)
-        pushed[np.arange(w), len(own.parameters) + np.arange(w)] = self._grid.begins
-        moved = linear.factor.affine.solved(pushed)[..., self._rows]
+        source = np.zeros((w, len(own.parameters) + w, G))
+        source[:, : len(own.parameters), 1:] = -multiplied(linear.factor.inverse, own.defects)
+        source[np.arange(w), len(own.parameters) + np.arange(w)] = self._grid.begins
+        moved = linear.factor.affine.solved(source)[..., self._rows]
         rows = np.zeros((w, self._size, moved.shape[2]))
         rows[:, own.parameters] = moved[:, : len(own.parameters)]
         by_first = moved[:, len(own.parameters) :]
@@ -165,10 +165,10 @@ class CompiledDynamics:
             rows[:, first.moving[k], inside] += slope[run, state, k] * by_first[:, state, inside]
         return rows
 
-    def _own(
+    def _defect_tangents(
         self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
-    ) -> _Defects:
-        """How the defects change with parameters at fixed states."""
+    ) -> _DefectTangents:
+        """Derivatives of the defects by the parameters, at fixed states."""
         ends, middle, new = self._traced.ends, self._traced.middle, self._traced.new
         h, rated = self._grid.step, ends.moving
         seen = [] if new is None else [k for k in new.moving if k not in rated]
@@ -185,7 +185,7 @@ class CompiledDynamics:
             after = functions.jump.by_parameters(states, by_new)[..., :-1]
             places = [parameters.index(k) for k in new.moving]
             defects[:, places] += np.where(h > 0, multiplied(linear.behind, after), 0.0)
-        return _Defects(parameters, defects)
+        return _DefectTangents(parameters, defects)
 
     def _functions(self, values: Sequence[float]) -> Functions:
         known, jump = self._traced, None
@@ -202,11 +202,11 @@ class CompiledDynamics:
         )
 
     def _first(self, values: Sequence[float]) -> Array:
-        """(w, K)."""
+        """The initial states, (w, K)."""
         return self._traced.first.values(values)(np.empty(0)).reshape(-1, self._traced.width).T
 
     def _whitened(self, rows: Array) -> Array:
-        """Innovations as independent residuals of one size, (m, K, N)."""
+        """Whiten innovations to independent residuals of equal size, (m, K, N)."""
         return rows if self._white is None else multiplied(self._white, rows)
 
     def _nearby(self, parameters: Tensor, states: Array, factor: Factor) -> Trajectory:
@@ -227,7 +227,7 @@ class CompiledDynamics:
 
     @cached_property
     def _observed(self) -> tuple[Array, Array]:
-        """The gain (k, m, N) and the limit (m, N) of the observer's corrections."""
+        """The observer's gain (k, m, N) and the clipping limit of the innovations (m, N)."""
         observer = self._system.observer
         assert observer is not None
         gain = np.ascontiguousarray(np.moveaxis(observer.gain.numpy(), 0, -1))
@@ -240,8 +240,8 @@ class CompiledDynamics:
 
 
 @dataclass(frozen=True)
-class _Defects:
-    """Derivatives of the defects (w, K, G-1) by these K parameters."""
+class _DefectTangents:
+    """Derivatives of the defects, (w, K, G-1), by the K parameters with these indices."""
 
     parameters: list[int]
     defects: Array

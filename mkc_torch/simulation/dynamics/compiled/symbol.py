@@ -1,4 +1,4 @@
-"""A tensor without values that notes what is computed with it, as scalar expressions for each moment."""
+"""A tensor without values that records operations as scalar expressions for each moment (station or sample)."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 __all__ = ["Nodes", "Part", "Symbol", "Trace", "UntraceableError", "as_nodes", "parameter_symbol", "state_symbol"]
 
 Nodes = NDArray[np.int64]
-"""Nodes of expressions, in the shape of a tensor whose axis of moments has length 1."""
+"""Nodes in the shape of a tensor, with length 1 along its axis of moments."""
 
 
 class UntraceableError(RuntimeError):
-    """A function that asks for values, mixes moments, or has an operation without a rule."""
+    """A function that uses values, mixes moments, or has an operation without a rule."""
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What the symbols of one function have in common.
+    """The shared state of one function's symbols.
 
     Attributes:
-        expressions: that hold their nodes.
-        lengths: of the axes that count as moments.
+        expressions: the expressions that hold their nodes.
+        lengths: lengths of an axis that mark it as the axis of moments.
         operations: torch's operations on symbols, by name.
     """
 
@@ -39,13 +39,13 @@ class Trace:
 
 
 class Symbol(Tensor):
-    """A tensor as expressions: one for each of its elements, save along the axis of moments, where all have the same.
+    """A tensor of expressions, an expression for each element; elements along the axis of moments share it.
 
     Attributes:
-        tracing: of the function.
-        nodes: of the elements.
-        moments: the axis of moments; None where there is none.
-        packed: a matrix and nodes whose product this is, where channels and moments are one axis; None elsewhere.
+        tracing: the trace of the function.
+        nodes: nodes of the elements.
+        moments: the axis of moments; None without such an axis.
+        packed: a matrix and nodes whose product is this tensor, if channels and moments share an axis; else None.
     """
 
     tracing: Trace
@@ -85,19 +85,19 @@ class Symbol(Tensor):
         cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
         name = func.overloadpacket.__name__
-        operation = _first(args).tracing.operations.get(name)
+        operation = _first_symbol(args).tracing.operations.get(name)
         if operation is None:
             raise UntraceableError(f"torch's operation {name}")
         return operation(*args, **(kwargs or {}))
 
 
-def _first(values: Sequence[Any]) -> Symbol:
-    """The first symbol among arguments, or in a list of them."""
-    for one in values:
-        if isinstance(one, Symbol):
-            return one
-        if isinstance(one, list | tuple) and any(isinstance(part, Symbol) for part in one):
-            return _first(one)
+def _first_symbol(values: Sequence[Any]) -> Symbol:
+    """The first symbol among arguments or in a list among them."""
+    for value in values:
+        if isinstance(value, Symbol):
+            return value
+        if isinstance(value, list | tuple) and any(isinstance(part, Symbol) for part in value):
+            return _first_symbol(value)
     raise UntraceableError("an argument by name")
 
 
@@ -114,7 +114,7 @@ def state_symbol(trace: Trace, length: int, count: int) -> Symbol:
 
 
 class Part(NamedTuple):
-    """An argument of an operation: nodes in a tensor's shape, and its axis of moments."""
+    """An argument of an operation: its nodes, its shape, and its axis of moments."""
 
     nodes: Nodes
     shape: tuple[int, ...]
@@ -122,10 +122,10 @@ class Part(NamedTuple):
 
 
 def as_nodes(value: object, trace: Trace) -> Part:
-    """What stands in an operation: a symbol, a number, or a tensor of constants.
+    """Convert an argument of an operation, a symbol, a number or a tensor of constants, to nodes.
 
     Raises:
-        UntraceableError: a matrix over the moments, a large constant, one in single precision, or something else.
+        UntraceableError: a matrix over the moments, a large constant, a constant in single precision, or another type.
     """
     expressions, lengths = trace.expressions, trace.lengths
     if isinstance(value, Symbol):
@@ -146,24 +146,24 @@ def as_nodes(value: object, trace: Trace) -> Part:
     if len(axes) > 1:
         raise UntraceableError("a matrix over the moments")
     if not axes:
-        if array.size > _MOST:
+        if array.size > _LARGEST_CONSTANT:
             raise UntraceableError("a large constant")
-        flat = [expressions.number(float(one)) for one in array.reshape(-1)]
+        flat = [expressions.number(float(element)) for element in array.reshape(-1)]
         return Part(np.array(flat, dtype=np.int64).reshape(shape), shape, None)
     by_element = np.moveaxis(array, axes[0], -1)
-    if by_element.size > _MOST * by_element.shape[-1]:
+    if by_element.size > _LARGEST_CONSTANT * by_element.shape[-1]:
         raise UntraceableError("a large constant")
-    flat = [_constant(expressions, one) for one in by_element.reshape(-1, by_element.shape[-1])]
+    flat = [_constant(expressions, column) for column in by_element.reshape(-1, by_element.shape[-1])]
     nodes = np.array(flat, dtype=np.int64).reshape(by_element.shape[:-1])
     return Part(np.expand_dims(nodes, axes[0]), shape, axes[0])
 
 
-_MOST = 4096
-"""Elements of a constant at most, for each moment."""
+_LARGEST_CONSTANT = 4096
+"""Elements of a constant at each moment, at most."""
 
 
 def _constant(expressions: Expressions, values: NDArray[Any]) -> int:
-    """A column, or a number where all of it is the same."""
+    """A column of constants, or a number where all are equal."""
     if values.dtype != np.bool_ and bool((values == values[0]).all()):
         return expressions.number(float(values[0]))
     return expressions.column(np.array(values))

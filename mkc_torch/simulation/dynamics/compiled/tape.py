@@ -1,4 +1,4 @@
-"""Expressions in the order of their evaluation with NumPy."""
+"""Evaluate expressions with NumPy."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _Step = tuple[Callable[..., Any], int, tuple[int, ...]]
 
 
 class Tape:
-    """Nodes of :class:`Expressions` at fixed moments, evaluated as few times as what they depend on changes.
+    """Evaluates nodes at fixed stations or samples; constants once, and parameter terms once for all states.
 
-    Warnings of NumPy, as of a division by 0, are the caller's to silence.
+    The caller silences warnings of NumPy, such as a division by 0.
 
     Args:
-        expressions: with the nodes.
-        outputs: the nodes that are asked for.
-        arranged: what brings a column of constants into the shape of the states.
+        expressions: the expressions that hold the nodes.
+        outputs: the nodes to return.
+        arranged: reshapes a column of constants to the shape of the states.
 
     Example:
         >>> e = Expressions()
@@ -51,14 +51,14 @@ class Tape:
             elif own.operation == "state":
                 self._states.append((k, int(own.value)))
             else:
-                arguments = tuple(place[one] for one in own.arguments)
+                arguments = tuple(place[argument] for argument in own.arguments)
                 steps[expressions.levels[node]].append((FUNCTIONS[own.operation], k, arguments))
         with np.errstate(all="ignore"):
             _run(steps[CONSTANT], self._fixed)
         self._by_parameters, self._by_states = steps[PARAMETER], steps[STATE]
 
     def at(self, parameters: Sequence[float]) -> Evaluation:
-        """The nodes as a function of the states, at these parameters."""
+        """The output nodes as a function of the states, at these parameters."""
         slots = list(self._fixed)
         for k, index in self._parameters:
             slots[k] = parameters[index]
@@ -75,11 +75,11 @@ class Tape:
 
 
 Evaluation = Callable[[Array], list[Any]]
-"""The values of nodes by the states, (w, *): arrays of the states' shape, or numbers."""
+"""A function from the states, (w, *), to the values of nodes: arrays of shape (*), or numbers."""
 
 
 def _needed(expressions: Expressions, outputs: Sequence[int]) -> list[int]:
-    """The nodes that outputs are made of, each after its arguments."""
+    """The nodes that outputs depend on, each after its arguments."""
     found: set[int] = set()
     waiting = list(outputs)
     while waiting:
@@ -92,4 +92,4 @@ def _needed(expressions: Expressions, outputs: Sequence[int]) -> list[int]:
 
 def _run(steps: Sequence[_Step], slots: list[Any]) -> None:
     for function, k, arguments in steps:
-        slots[k] = function(*[slots[one] for one in arguments])
+        slots[k] = function(*[slots[argument] for argument in arguments])

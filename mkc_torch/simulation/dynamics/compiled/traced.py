@@ -1,4 +1,4 @@
-"""A prepared system of differential equations as expressions of states and parameters."""
+"""Trace a prepared system of differential equations to expressions of states and parameters."""
 
 from __future__ import annotations
 
@@ -32,18 +32,19 @@ if TYPE_CHECKING:
 __all__ = ["Traceable", "Traced", "traced"]
 
 _FEWEST = 16
-"""Samples below which an axis of moments cannot be told from another one."""
+"""Smallest number of samples, plus the number of parameters, that distinguishes the axis of moments from others."""
 
 
 class Traceable(Protocol):
-    """What is needed of a prepared system of differential equations.
+    """The interface of a prepared system that tracing uses.
 
     Attributes:
-        grid: the moments of its trajectories.
-        rows, begins: (N,), the moment of each sample, and where a run begins.
-        measured: (N, m), the outputs as recorded.
+        grid: the grid times.
+        rows: (N,), grid index of each sample.
+        begins: (N,), True where a run starts.
+        measured: (N, m), the recorded outputs.
         guess: (G, n), a first guess of the states.
-        observer: that corrects it; None where it runs freely.
+        observer: the observer that corrects the states; None in open loop.
     """
 
     grid: Grid
@@ -65,12 +66,12 @@ class Traced:
     """The functions of a system as expressions.
 
     Attributes:
-        memories: the state that each internal state begins like; empty for 0.
-        first: the states that runs begin in, K w nodes.
+        memories: the state that each internal state starts equal to; empty to start at 0.
+        first: initial states of the runs, K w nodes.
         ends, middle: rates at the ends (2, G-1) and in the middle (G-1,) of each interval.
-        new: innovations of an observer at the samples; None where there is no observer.
-        outputs: at the samples; None where they cannot be traced, as of effects that join samples.
-        places: of the states that the gains of an observer are of.
+        new: innovations of an observer at the samples; None without an observer.
+        outputs: outputs at the samples; None where they cannot be traced, as with effects across samples.
+        places: indices of the states that an observer corrects.
     """
 
     memories: Sequence[str]
@@ -83,16 +84,16 @@ class Traced:
 
     @property
     def width(self) -> int:
-        """Number of states, internal ones included."""
+        """Number of states, including internal states."""
         return len(self.ends.nodes)
 
 
 def traced(system: Traceable, meaning: Meaning, size: int) -> Traced | None:
-    """The functions of a system by ``size`` parameters; None where one of them cannot be traced.
+    """Trace the functions of a system; None where a function cannot be traced.
 
     Args:
         system: the prepared system.
-        meaning: of the parameters.
+        meaning: maps the parameters to the simulation's own parameters and the changes at its ports.
         size: number of parameters.
     """
     stations, samples = len(system.grid.stations), len(system.measured)
@@ -100,7 +101,7 @@ def traced(system: Traceable, meaning: Meaning, size: int) -> Traced | None:
         return None
     try:
         return _traced(system, meaning, size, stations, samples)
-    # whatever a user's function raises on a symbol, it is not traceable; the other way computes it, or raises it again
+    # a user's function may raise anything on a symbol; torch computes the function instead, or raises again
     except Exception:
         return None
 
@@ -128,7 +129,7 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
     try:
         outputs = block(system.outputs_by_states(theta, changes, at_samples()), samples, _as_is)
-    except Exception:  # whatever a function raises on a symbol; torch computes it, or raises it again
+    except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
         outputs = None
     return Traced(
         memories,
@@ -146,7 +147,7 @@ def _as_is(column: Array) -> Array:
 
 
 def _at_ends(column: Array) -> Array:
-    """Values at the stations as those at both ends of each interval, (2, G-1)."""
+    """Rearrange values at the stations to the ends of the intervals, (2, G-1)."""
     return np.ascontiguousarray(column.reshape(-1, 3)[:, ::2].T)
 
 

@@ -1,4 +1,4 @@
-"""The Kalman filter of :func:`mkc_torch.simulation.dynamics.kalman.run`, sample after sample."""
+"""The Kalman filter of :func:`mkc_torch.simulation.dynamics.kalman.run_filter`, sample by sample."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ __all__ = ["filter_samples"]
 
 
 def filter_samples(
-    carried: Any,
-    pushed: Any,
+    transition: Any,
+    noise_input: Any,
     shift: Any,
     phi: Any,
     renewed: Any,
@@ -22,6 +22,7 @@ def filter_samples(
     place: Any,
     variance: Any,
     clip: float,
+    hard_clip: bool,
     state: Any,
     P: Any,
     left: Any,
@@ -35,20 +36,22 @@ def filter_samples(
     """Filter G stretches of L samples under B models; writes into ``state``, ``P`` and all arguments after them.
 
     Args:
-        carried, pushed, shift: (L-1, G, n, n), (L-1, G, n, p) and (L-1, G, n), of the flow.
-        phi, renewed: (L-1, G, B, D), share of a lasting disturbance that stays, and variance that is added to it.
+        transition, noise_input, shift: (L-1, G, n, n), (L-1, G, n, p) and (L-1, G, n), of the flow.
+        phi: (L-1, G, B, D), share of a lasting disturbance that remains at the next sample.
+        renewed: (L-1, G, B, D), variance added to a lasting disturbance.
         seen, new, counts: (L, G, m, n), (L, G, m) and (L, G, m), of the flow.
-        white: (B, p), standard deviations of pushes that are new at each sample.
-        place: (B, D), what a lasting disturbance acts on.
+        white: (B, p), standard deviations of white process noise.
+        place: (B, D), index of the rate, or p plus index of the output, that a lasting disturbance acts on.
         variance: (B, m), of each output's white noise.
-        clip: standard deviations at which an innovation moves the states no further.
-        state, P: (G, B, k) and (G, B, k, k), at the first sample; at the end, after the last one.
-        left: (G, B, k, k), what is left of an error of the first state; no rows where nobody asks.
+        clip: standard deviations at which innovations are clipped.
+        hard_clip: whether innovations within the clip are left as they are, instead of shrunk by a hyperbolic tangent.
+        state, P: (G, B, k) and (G, B, k, k), at the first sample; on return, after the last sample.
+        left: (G, B, k, k), derivative of the error by an error of the first state; empty if not wanted.
         standard, spread: (L, G, B, m), the standardised innovations and their standard deviations.
-        priors, states, afters, posteriors: covariances and states on the way; no samples where nobody asks.
+        priors, states, afters, posteriors: covariances and states at each sample; empty if not wanted.
     """
     L, G, m, n = seen.shape
-    p = pushed.shape[3]
+    p = noise_input.shape[3]
     B, D = place.shape
     k = n + D
     keep, through = len(priors) > 0, len(left) > 0
@@ -68,10 +71,10 @@ def filter_samples(
                     A[:] = 0.0
                     for i in range(n):
                         for j in range(n):
-                            A[i, j] = carried[row - 1, g, i, j]
+                            A[i, j] = transition[row - 1, g, i, j]
                         for d in range(D):
                             if place[b, d] < p:
-                                A[i, n + d] = pushed[row - 1, g, i, place[b, d]]
+                                A[i, n + d] = noise_input[row - 1, g, i, place[b, d]]
                     for d in range(D):
                         A[n + d, n + d] = phi[row - 1, g, b, d]
                     for i in range(k):
@@ -112,7 +115,7 @@ def filter_samples(
                             size = white[b, q] * white[b, q]
                             for i in range(n):
                                 for j in range(n):
-                                    V[i, j] += size * pushed[row - 1, g, i, q] * pushed[row - 1, g, j, q]
+                                    V[i, j] += size * noise_input[row - 1, g, i, q] * noise_input[row - 1, g, j, q]
                 if keep:
                     priors[row, g, b] = V
                     states[row, g, b] = x
@@ -136,7 +139,10 @@ def filter_samples(
                     used = counts[row, g, output]
                     if used == 0.0:
                         continue
-                    pulled = used * min(max(z, -clip), clip) / root
+                    if hard_clip:
+                        pulled = used * min(max(z, -clip), clip) / root
+                    else:
+                        pulled = used * clip * np.tanh(z / clip) / root
                     if through:
                         for j in range(k):
                             total = 0.0

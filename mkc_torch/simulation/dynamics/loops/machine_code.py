@@ -1,4 +1,4 @@
-"""Machine code of a loop, by Numba (BSD-2-Clause; ``pip install mkc-torch[fast]``)."""
+"""Compile loops by Numba (BSD-2-Clause; ``pip install mkc-torch[fast]``)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 __all__ = ["machine_code"]
 
 OFF = "MKC_WITHOUT_NUMBA"
-"""Environment variable that leaves Numba out where it is set."""
+"""Environment variable that disables Numba."""
 
 
 @cache
 def machine_code(loop: Callable[..., Any]) -> Callable[..., Any] | None:
-    """A loop compiled to machine code when it is first called, and kept on disk; None where Numba is not installed.
+    """Compile a loop to machine code at its first call, cached on disk; None where Numba is not available.
 
     Args:
-        loop: a function of NumPy arrays and numbers in the part of Python that Numba compiles.
+        loop: a function of NumPy arrays and numbers that Numba can compile.
     """
     if os.environ.get(OFF):
         return None
@@ -28,6 +28,6 @@ def machine_code(loop: Callable[..., Any]) -> Callable[..., Any] | None:
         return None
     try:
         compiled: Callable[..., Any] = numba.njit(cache=True, error_model="numpy")(loop)
-    except RuntimeError:  # there is no folder that machine code could be kept in
+    except RuntimeError:  # no writable folder for the cache
         compiled = numba.njit(error_model="numpy")(loop)
     return compiled

@@ -1,4 +1,4 @@
-"""The recurrence of :class:`mkc_torch.simulation.dynamics.compiled.affine.Affine`, moment after moment."""
+"""The recurrence of :class:`mkc_torch.simulation.dynamics.compiled.affine.Affine`, sequentially."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ __all__ = ["pass_on"]
 
 
 def pass_on(carries: Any, values: Any) -> None:
-    """``δ[k+1] = A[k] δ[k] + v[k+1]``, in place.
+    """Solve ``δ[k+1] = A[k] δ[k] + v[k+1]`` in place.
 
     Args:
-        carries: A as it arrives at each moment, (w, w, G); 0 where a trajectory begins.
-        values: v, (w, K, G); δ afterwards.
+        carries: A into each grid time, (w, w, G); 0 where a trajectory starts.
+        values: v, (w, K, G); δ on return.
     """
     w, K, G = values.shape
     for moment in range(1, G):

@@ -1,4 +1,4 @@
-"""The whitening of :func:`mkc_torch.simulation.dynamics.whitening.whitened`, sample after sample."""
+"""The whitening of :func:`mkc_torch.simulation.dynamics.whitening.whitened`, sample by sample."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ __all__ = ["whiten_samples"]
 
 
 def whiten_samples(
-    carried: Any,
-    pushed: Any,
+    transition: Any,
+    noise_input: Any,
     phi: Any,
     place: Any,
     seen: Any,
@@ -22,20 +22,20 @@ def whiten_samples(
     start: Any,
     out: Any,
 ) -> None:
-    """Whiten K series of N samples under B models of the noise; writes into ``start`` and ``out``.
+    """Whiten K series of N samples under B noise models; writes into ``start`` and ``out``.
 
     Args:
-        carried, pushed: (M, n, n) and (M, n, p), of the flow; M is N where more samples follow, and N-1 otherwise.
-        phi: (M, B, D), share of a lasting disturbance that stays until the next sample.
-        place: (B, D), what a lasting disturbance acts on.
-        seen: (N, m, n), outputs by states.
+        transition, noise_input: (M, n, n) and (M, n, p), of the flow; M is N where more samples follow, and N-1 otherwise.
+        phi: (M, B, D), share of a lasting disturbance that remains at the next sample.
+        place: (B, D), index of the rate, or p plus index of the output, that a lasting disturbance acts on.
+        seen: (N, m, n), derivative of the outputs by the states.
         gain, white: (N, B, k, m) and (N, B, m, m), of the filters.
         new, shift: (N, m, K) and (M, n, K), of the series.
-        start: (B, k, K), states and lasting disturbances before the first sample; at the end, before the next one.
+        start: (B, k, K), states and lasting disturbances before the first sample; on return, before the next sample.
         out: (B, N, m, K), the innovations.
     """
     N, m, K = new.shape
-    n, p = pushed.shape[1], pushed.shape[2]
+    n, p = noise_input.shape[1], noise_input.shape[2]
     B, D = place.shape
     k = n + D
     state, moved, left = np.empty((k, K)), np.empty((k, K)), np.empty((m, K))
@@ -61,7 +61,7 @@ def whiten_samples(
                     w = white[row, b, output, other]
                     for s in range(K):
                         out[b, row, output, s] += w * left[other, s]
-            if row == len(carried):
+            if row == len(transition):
                 break
             for i in range(k):
                 for output in range(m):
@@ -73,13 +73,13 @@ def whiten_samples(
                 for s in range(K):
                     moved[i, s] = -shift[row, i, s]
                 for j in range(n):
-                    w = carried[row, i, j]
+                    w = transition[row, i, j]
                     if w != 0.0:
                         for s in range(K):
                             moved[i, s] += w * state[j, s]
                 for d in range(D):
                     if place[b, d] < p:
-                        w = pushed[row, i, place[b, d]]
+                        w = noise_input[row, i, place[b, d]]
                         for s in range(K):
                             moved[i, s] += w * state[n + d, s]
             for d in range(D):

@@ -1,4 +1,4 @@
-"""Each world is what its name says, and gives the same case at the same address."""
+"""Each scenario is what its name says, and gives the same case at the same address."""
 
 import sys
 
@@ -10,7 +10,7 @@ from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.dynamics.generator import SYSTEMS
 from mkc_torch.challenge.dynamics.integrate import between, holding, simulate
 from mkc_torch.challenge.dynamics.plant import Plant, RunSet
-from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
+from mkc_torch.challenge.dynamics.scenarios import dynamics_scenarios
 from mkc_torch.challenge.dynamics.scenarios.disturbances import KINDS, LASTING
 from mkc_torch.challenge.dynamics.scenarios.draw import LEAST_SLOW, MOST_FOLLOWED, SLOW_SIZE, SLOW_TIME, draw_useless
 from mkc_torch.challenge.dynamics.scenarios.follows import best_shares
@@ -19,52 +19,52 @@ from mkc_torch.challenge.dynamics.scenarios.wrong import right, wrong
 from mkc_torch.challenge.key import canonical
 from mkc_torch.simulation.load import load_simulation
 
-WORLDS = {world.name: world for world in dynamics_worlds().worlds}
+SCENARIOS = {scenario.name: scenario for scenario in dynamics_scenarios().scenarios}
 
 
-def test_the_worlds_are_all_there():
-    assert list(WORLDS) == [
+def test_the_scenarios_are_all_there():
+    assert list(SCENARIOS) == [
         "white", "coloured", "pushed_white", "pushed_slowly", "gusts", "held", "far_starts", "runs", "slow_sensor",
         "lasting_push", "lasting_push_runs", "useless",
     ]  # fmt: skip
-    assert [name for name, world in WORLDS.items() if not world.hides] == ["useless"]
+    assert [name for name, scenario in SCENARIOS.items() if not scenario.hides] == ["useless"]
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_the_same_address_gives_the_same_case_under_another_number(name):
-    one, other = (WORLDS[name].draw(3, 1, False, number) for number in (1, 7))
+    one, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
     assert (one.key.name[-5:], other.key.name[-5:]) == ("00001", "00007")
     assert one.simulation == other.simulation
     assert canonical([one.key]) == canonical([other.key]).replace("_00007", "_00001")
     for column, values in one.recording.columns.items():
         torch.testing.assert_close(other.recording[column], values, rtol=0, atol=0)
-    elsewhere = WORLDS[name].draw(4, 1, False, 1).recording.columns
+    elsewhere = SCENARIOS[name].draw(4, 1, False, 1).recording.columns
     assert not all(
         torch.equal(values, elsewhere.get(column, values[:0])) for column, values in one.recording.columns.items()
     )
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_nothing_is_hidden_in_an_empty_case(name):
     for index in range(3):
-        key = WORLDS[name].draw(3, index, False, index).key
+        key = SCENARIOS[name].draw(3, index, False, index).key
         assert key.key.effects == ()
         assert key.key.kind == ("useless" if name == "useless" else "empty")
-        assert (key.push is not None) == (name in KINDS or name == "slow_sensor")
+        assert (key.disturbance is not None) == (name in KINDS or name == "slow_sensor")
         assert bool(key.useless) == (name == "useless")
         assert (key.key.noise["correlation"] > 0.0) == (name == "coloured")
-        if key.push is not None:
-            assert key.push.kind == name
-            assert key.push.over_noise >= (1.0 if name == "slow_sensor" else 1.5)
+        if key.disturbance is not None:
+            assert key.disturbance.kind == name
+            assert key.disturbance.over_noise >= (1.0 if name == "slow_sensor" else 1.5)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", ["white", "gusts", "held"])
 def test_a_push_acts_in_every_second_case_with_something_hidden(name):
-    keys = [WORLDS[name].draw(3, index, True, index).key for index in range(2)]
-    assert [key.push is not None for key in keys] == [True, False]
+    keys = [SCENARIOS[name].draw(3, index, True, index).key for index in range(2)]
+    assert [key.disturbance is not None for key in keys] == [True, False]
     assert all(len(key.key.effects) == 1 for key in keys)
     assert all(key.key.kind in ("single", "outside") for key in keys)
 
@@ -74,18 +74,18 @@ def test_a_push_makes_a_hidden_effect_harder_to_see():
     """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
     from mkc_torch.challenge.dynamics.errors import draw_errors
     from mkc_torch.challenge.dynamics.oracle import power
-    from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, draw_push
+    from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, draw_disturbance
     from mkc_torch.challenge.dynamics.scene import SystemScene
 
     setting = SYSTEMS["thermal"].draw(generator(2))
     scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     errors = draw_errors(generator(3), scene.course.outputs)
-    pushes = (draw_push(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
-    push = next(push for push in pushes if push.state == "temperature_1")
+    pushes = (draw_disturbance(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
+    disturbance = next(disturbance for disturbance in pushes if disturbance.state == "temperature_1")
     effect = SYSTEMS["thermal"].inside[0](generator(5), scene)  # in the same body
     alone, beside = (
         power(scene.plant, scene.trial, effect, effect.large, noise)
-        for noise in (errors, DisturbedErrors(scene, errors, push))
+        for noise in (errors, DisturbedErrors(scene, errors, disturbance))
     )
     assert beside.z < 0.8 * alone.z
 
@@ -105,7 +105,7 @@ def test_a_held_input_is_held_in_the_integration(held):
 
 
 @pytest.mark.e2e
-def test_the_world_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
+def test_the_scenario_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
     """Otherwise nothing would be asked there."""
     from dataclasses import replace
 
@@ -128,43 +128,43 @@ def recorded_runs(recording):
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_push_that_lasts_acts_in_every_recording_for_about_a_run(name, runs, hidden):
     for index in range(3):
-        case = WORLDS[name].draw(3, index, hidden, index)
+        case = SCENARIOS[name].draw(3, index, hidden, index)
         assert recorded_runs(case.recording) == runs
         time = case.recording["time"]
-        share = case.key.push.words["correlation time"] / float(time.max() - time.min())
+        share = case.key.disturbance.words["correlation time"] / float(time.max() - time.min())
         assert LASTING[0] <= share <= LASTING[1]
         assert bool(case.key.key.effects) == hidden
-    assert WORLDS[name].half
-    assert WORLDS[name].apart == (runs == 1)
+    assert SCENARIOS[name].half
+    assert SCENARIOS[name].apart == (runs == 1)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_sensor_errs_slowly_for_one_to_ten_per_cent_of_a_run_and_nothing_pushes(hidden):
     for index in range(4):
-        case = WORLDS["slow_sensor"].draw(3, index, hidden, index)
+        case = SCENARIOS["slow_sensor"].draw(3, index, hidden, index)
         key, time = case.key, case.recording["time"]
         step, length = float(time[1] - time[0]), float(time.max() - time.min())
-        assert (key.push.kind, key.push.at) == ("slow_sensor", "sensor")
-        assert SLOW_SIZE[0] <= key.push.over_noise <= SLOW_SIZE[1]
-        for constant in key.push.words.values():
+        assert (key.disturbance.kind, key.disturbance.at) == ("slow_sensor", "sensor")
+        assert SLOW_SIZE[0] <= key.disturbance.over_noise <= SLOW_SIZE[1]
+        for constant in key.disturbance.words.values():
             assert SLOW_TIME[0] * length <= constant <= max(SLOW_TIME[1] * length, LEAST_SLOW * step) * (1 + 1e-9)
         assert bool(key.key.effects) == hidden
         slow = key.key.noise["slow"]
-        assert max(one["over_noise"] for one in slow.values()) == key.push.over_noise
+        assert max(one["over_noise"] for one in slow.values()) == key.disturbance.over_noise
 
 
 def test_runs_are_several_and_throws_have_nothing_to_hold():
     for index in range(6):
-        recording = WORLDS["runs"].draw(3, index, False, index).recording
+        recording = SCENARIOS["runs"].draw(3, index, False, index).recording
         assert 3 <= len(recording["experiment"].unique()) <= 5
         for name in ("held", "far_starts"):
-            assert "projectile" not in WORLDS[name].draw(3, index, False, index).key.name
+            assert "projectile" not in SCENARIOS[name].draw(3, index, False, index).key.name
 
 
 @pytest.mark.parametrize("index", range(4))
 def test_far_starts_are_ten_times_off_and_the_true_ones_are_not(index, tmp_path):
-    case = WORLDS["far_starts"].draw(3, index, False, 0)
+    case = SCENARIOS["far_starts"].draw(3, index, False, 0)
     system = case.key.key.mode
     name = "".join(word.capitalize() for word in system.split("_"))
     far, near = tmp_path / "far.py", tmp_path / "near.py"
@@ -182,7 +182,7 @@ def test_far_starts_are_ten_times_off_and_the_true_ones_are_not(index, tmp_path)
 @pytest.mark.parametrize("index", range(6))
 def test_a_useless_simulation_follows_no_output_of_the_recording(index):
     """Nor does a fit from other starts, to the outputs as they are recorded, explain a quarter of any one."""
-    case = WORLDS["useless"].draw(5, index, False, index)
+    case = SCENARIOS["useless"].draw(5, index, False, index)
     assert case.key.useless == ("wrong sign", "another system", "unrelated output")[index % 3]
     assert case.key.follows <= MOST_FOLLOWED
     plant = SYSTEMS[case.key.key.mode].draw(generator(1)).plant

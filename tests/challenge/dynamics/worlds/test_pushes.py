@@ -12,7 +12,7 @@ from mkc_torch.challenge.dynamics.integrate import simulate
 from mkc_torch.challenge.dynamics.oracle import range_of, tangents
 from mkc_torch.challenge.dynamics.plant import RunSet
 from mkc_torch.challenge.dynamics.scenarios.disturbances import GUSTS, KINDS, LASTING, SLOW, gusts, slow, white
-from mkc_torch.challenge.dynamics.scenarios.noise import OVER_NOISE, DisturbedErrors, draw_push, responses
+from mkc_torch.challenge.dynamics.scenarios.noise import OVER_NOISE, DisturbedErrors, draw_disturbance, responses
 from mkc_torch.challenge.dynamics.scene import SystemScene
 
 STEP, FINE = 0.05, 8
@@ -77,46 +77,46 @@ def test_gusts_are_level_in_some_stretches_and_absent_in_others():
 def test_a_push_is_in_the_rate_of_its_state_and_of_size_nought_is_not_there(system, kind):
     scene, errors = scene_of(system)
     plant = scene.plant
-    push = draw_push(generator(4, kind), kind, scene, errors)
-    others = [plant.row(name) for name in plant.states if name != push.state]
-    assert not push.rates[others].any()
-    assert push.rates[plant.row(push.state)].any()
-    assert push.state not in plant.speeds
-    still = simulate(plant, scene.trial, push=0.0 * push.rates)
+    disturbance = draw_disturbance(generator(4, kind), kind, scene, errors)
+    others = [plant.row(name) for name in plant.states if name != disturbance.state]
+    assert not disturbance.rates[others].any()
+    assert disturbance.rates[plant.row(disturbance.state)].any()
+    assert disturbance.state not in plant.speeds
+    still = simulate(plant, scene.trial, disturbance=0.0 * disturbance.rates)
     np.testing.assert_array_equal(still.states, scene.course.states)
     # in the first fine step nothing but that state has moved to first order
-    first = simulate(plant, scene.trial, push=push.rates).states[:, 1] - scene.course.states[:, 1]
+    first = simulate(plant, scene.trial, disturbance=disturbance.rates).states[:, 1] - scene.course.states[:, 1]
     step = scene.trial.step / plant.fine
-    np.testing.assert_allclose(first[plant.row(push.state)], step * push.rates[plant.row(push.state), 0], rtol=0.2)
+    np.testing.assert_allclose(first[plant.row(disturbance.state)], step * disturbance.rates[plant.row(disturbance.state), 0], rtol=0.2)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_a_push_leaves_in_the_fitted_run_is_what_the_key_says(kind):
     scene, errors = scene_of("tanks")
-    push = draw_push(generator(5, kind), kind, scene, errors)
-    moved = simulate(scene.plant, scene.trial, push=push.rates).outputs - scene.course.outputs
+    disturbance = draw_disturbance(generator(5, kind), kind, scene, errors)
+    moved = simulate(scene.plant, scene.trial, disturbance=disturbance.rates).outputs - scene.course.outputs
     free = [np.sqrt(np.square(one / d).mean()) for one, d in zip(moved, errors.deviations, strict=True)]
-    assert OVER_NOISE[0] <= push.over_noise <= OVER_NOISE[1]
+    assert OVER_NOISE[0] <= disturbance.over_noise <= OVER_NOISE[1]
     plain = dataclasses.replace(errors, correlation=0.0)
     if errors.correlation == 0.0:
-        assert max(free) == pytest.approx(push.free_over_noise)
+        assert max(free) == pytest.approx(disturbance.free_over_noise)
     basis = range_of(tangents(scene, plain, rivals=False).known)
     white_moved = plain.whitened(moved)
     left = (white_moved - basis @ (basis.T @ white_moved)).reshape(len(moved), -1)
     if errors.correlation == 0.0:
-        assert np.sqrt(np.square(left).mean(1)).max() == pytest.approx(push.over_noise)
+        assert np.sqrt(np.square(left).mean(1)).max() == pytest.approx(disturbance.over_noise)
 
 
 @pytest.mark.parametrize("system", ["pendulum", "tanks", "projectile"])
 def test_responses_are_those_of_the_true_system(system):
     scene, _ = scene_of(system)
     plant, state = scene.plant, next(name for name in scene.plant.states if name not in scene.plant.speeds)
-    push = slow(generator(6), scene.trial, plant.fine)
+    disturbance = slow(generator(6), scene.trial, plant.fine)
     size = 1e-4 * max(scene.pace(state), scene.largest(state) / scene.length)
-    rates = size * push.at(plant, state)
+    rates = size * disturbance.at(plant, state)
     means = rates[plant.row(state)].reshape(-1, plant.fine, scene.trial.runs).mean(1)
     linear = np.einsum("mtrk,kr->mtr", responses(scene, state), means)
-    true = simulate(plant, scene.trial, push=rates).outputs - scene.course.outputs
+    true = simulate(plant, scene.trial, disturbance=rates).outputs - scene.course.outputs
     np.testing.assert_allclose(linear, true, atol=0.02 * np.abs(true).max())
 
 
@@ -125,21 +125,21 @@ def test_under_a_push_traces_that_look_like_it_weigh_less():
     """Draws of noise and push together are white of variance one in that metric, in the mean over many."""
     scene, errors = scene_of("tanks")
     errors = dataclasses.replace(errors, correlation=0.0, family="gaussian")
-    push = draw_push(generator(7), "pushed_slowly", scene, errors)
-    weighing = DisturbedErrors(scene, errors, push)
-    moved = simulate(scene.plant, scene.trial, push=push.rates).outputs - scene.course.outputs
+    disturbance = draw_disturbance(generator(7), "pushed_slowly", scene, errors)
+    weighing = DisturbedErrors(scene, errors, disturbance)
+    moved = simulate(scene.plant, scene.trial, disturbance=disturbance.rates).outputs - scene.course.outputs
     assert np.square(weighing.whitened(moved)).sum() < 0.5 * np.square(errors.whitened(moved)).sum()
     draws = generator(8)
     squares = []
     for _ in range(20):
         again = slow(draws, scene.trial, scene.plant.fine)
         if not squares:
-            covariance = push.size**2 * again.covariance
-            weighing = DisturbedErrors(scene, errors, dataclasses.replace(push, covariance=covariance))
-        rates = push.size * again.at(scene.plant, push.state)
+            covariance = disturbance.size**2 * again.covariance
+            weighing = DisturbedErrors(scene, errors, dataclasses.replace(disturbance, covariance=covariance))
+        rates = disturbance.size * again.at(scene.plant, disturbance.state)
         noise = np.reshape(errors.deviations, (-1, 1, 1)) * np.random.default_rng(len(squares)).standard_normal(
             moved.shape
         )
-        total = simulate(scene.plant, scene.trial, push=rates).outputs - scene.course.outputs + noise
+        total = simulate(scene.plant, scene.trial, disturbance=rates).outputs - scene.course.outputs + noise
         squares.append(np.square(weighing.whitened(total)).mean())
     assert np.mean(squares) == pytest.approx(1.0, abs=0.15)

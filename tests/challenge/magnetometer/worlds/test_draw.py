@@ -1,4 +1,4 @@
-"""Each world of the magnetometer is what its name says."""
+"""Each scenario of the magnetometer is what its name says."""
 
 import math
 
@@ -9,38 +9,38 @@ from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import canonical
 from mkc_torch.challenge.magnetometer import rotation
 from mkc_torch.challenge.magnetometer.noise import axis_errors, draw_noise
-from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
-from mkc_torch.challenge.magnetometer.scenarios.disturbances import BURSTS, HEIGHT, bursts, wandering
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_scenarios
+from mkc_torch.challenge.magnetometer.scenarios.disturbances import BURSTS, HEIGHT, bursts, drifting
 from mkc_torch.challenge.magnetometer.scenarios.poses import POSES, poses
 from mkc_torch.simulation.load import load_simulation
 
-WORLDS = {world.name: world for world in magnetometer_worlds(30.0).worlds}
+SCENARIOS = {scenario.name: scenario for scenario in magnetometer_scenarios(30.0).scenarios}
 
 
-def test_the_worlds_are_all_there():
-    assert list(WORLDS) == ["white", "coloured", "wander", "bursts", "orientations", "useless"]
-    assert [name for name, world in WORLDS.items() if not world.hides] == ["useless"]
+def test_the_scenarios_are_all_there():
+    assert list(SCENARIOS) == ["white", "coloured", "wander", "bursts", "orientations", "useless"]
+    assert [name for name, scenario in SCENARIOS.items() if not scenario.hides] == ["useless"]
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_the_same_address_gives_the_same_case_under_another_number(name):
-    one, other = (WORLDS[name].draw(3, 1, False, number) for number in (1, 7))
+    one, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
     assert one.key.name == "case_00001"
     assert canonical([one.key]) == canonical([other.key]).replace("_00007", "_00001")
     for column, values in one.recording.columns.items():
         torch.testing.assert_close(other.recording[column], values, rtol=0, atol=0)
-    elsewhere = WORLDS[name].draw(4, 1, False, 1).recording
+    elsewhere = SCENARIOS[name].draw(4, 1, False, 1).recording
     assert not torch.equal(elsewhere["mag_x"], one.recording["mag_x"])
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_nothing_is_hidden_in_an_empty_case(name):
     for index in range(4):
-        key = WORLDS[name].draw(3, index, False, index).key
+        key = SCENARIOS[name].draw(3, index, False, index).key
         assert key.key.effects == ()
         assert key.key.kind == ("useless" if name == "useless" else "empty")
         assert bool(key.useless) == (name == "useless")
-        assert (key.push.kind if key.push else "") == (name if name in ("wander", "bursts") else "")
+        assert (key.disturbance.kind if key.disturbance else "") == (name if name in ("wander", "bursts") else "")
         white = key.key.noise["kind"].startswith("white")
         assert white == (name != "coloured")
         assert (key.key.noise["walks"] is not None) == (name == "wander")
@@ -49,7 +49,7 @@ def test_nothing_is_hidden_in_an_empty_case(name):
 
 @pytest.mark.parametrize("name", ["white", "bursts"])
 def test_the_offset_wanders_in_every_second_case_with_something_hidden(name):
-    keys = [WORLDS[name].draw(3, index, True, index).key for index in range(4)]
+    keys = [SCENARIOS[name].draw(3, index, True, index).key for index in range(4)]
     assert [key.key.noise["walks"] is not None for key in keys] == [True, False, True, False]
     assert all(len(key.key.effects) == 1 for key in keys)
     assert all(key.key.effects[0].z > 0.0 for key in keys)
@@ -59,7 +59,7 @@ def test_a_wander_goes_as_far_as_it_says():
     noise = draw_noise(generator(1), 2000, 50.0)
     reach = []
     for seed in range(60):
-        walking, far = wandering(generator(seed), noise, 2000)
+        walking, far = drifting(generator(seed), noise, 2000)
         still = [process.sample(generator(seed, k), 2000) for k, process in enumerate(walking.walks)]
         reach += [float((path - path.mean()).square().mean().sqrt()) / noise.sigma / far for path in still]
     assert math.sqrt(sum(r * r for r in reach) / len(reach)) == pytest.approx(1.0, abs=0.12)
@@ -75,9 +75,9 @@ def test_bursts_are_few_and_short_and_nothing_is_between_them():
     assert float(field[mask].norm(dim=-1).max()) >= 0.5 * HEIGHT[0] * 0.5
     starts = int((mask.int().diff(prepend=torch.zeros(1, dtype=torch.int32)) == 1).sum())
     assert 1 <= starts <= BURSTS[1]
-    key = WORLDS["bursts"].draw(3, 1, False, 1).key
-    assert key.push.words["share"] < 0.25
-    assert key.push.words["share"] * 1500 <= len(key.key.outliers) + 1
+    key = SCENARIOS["bursts"].draw(3, 1, False, 1).key
+    assert key.disturbance.words["share"] < 0.25
+    assert key.disturbance.words["share"] * 1500 <= len(key.key.outliers) + 1
 
 
 def test_bursts_go_each_way_as_nothing_that_passes_by_does():
@@ -107,7 +107,7 @@ def test_a_sensor_rests_in_many_orientations_and_is_turned_between():
 def test_useless_views_are_asked_for_and_differ_from_the_truth(tmp_path):
     views = []
     for index in range(4):
-        case = WORLDS["useless"].draw(3, index, False, index)
+        case = SCENARIOS["useless"].draw(3, index, False, index)
         names = case.recording.names
         views.append((case.key.useless, "gyro_x" in names, "q_w" in names))
         if case.simulation:
@@ -134,14 +134,14 @@ def turned_along(recording, sign):
 
 
 def test_the_wrong_sign_is_wrong_and_another_gyroscope_tells_nothing():
-    wrong, other = (WORLDS["useless"].draw(3, index, False, index).recording for index in (1, 2))
+    wrong, other = (SCENARIOS["useless"].draw(3, index, False, index).recording for index in (1, 2))
     assert turned_along(wrong, -1.0) > 0.8
     assert turned_along(wrong, 1.0) < -0.8
     assert abs(turned_along(other, 1.0)) < 0.5
 
 
 def test_an_unrelated_field_has_no_length_of_its_own():
-    recording = WORLDS["useless"].draw(3, 0, False, 0).recording
+    recording = SCENARIOS["useless"].draw(3, 0, False, 0).recording
     field = recording.stack("mag_x", "mag_y", "mag_z")
     length = (field - field.median(0).values).norm(dim=-1)
     assert float(length.std() / length.mean()) > 0.25

@@ -1,4 +1,4 @@
-"""Compiled residuals and their tangents are those of torch."""
+"""Compiled residuals and their tangents agree with torch."""
 
 import math
 
@@ -36,10 +36,10 @@ class Driven(Dynamics):
     parameters = {"stiffness": 4.0, "damping": Parameter(0.2, lower=0.0), "gain": 1.0, "loss": 0.3}  # noqa: RUF012
 
     def derivative(self, time, x, u, p):
-        push = torch.where(u.torque > 0, p.gain * u.torque, 0.5 * p.gain * torch.tanh(u.torque))
+        torque = torch.where(u.torque > 0, p.gain * u.torque, 0.5 * p.gain * torch.tanh(u.torque))
         return {
             "angle": x.speed,
-            "speed": push - p.stiffness * torch.sin(x.angle) - p.damping * x.speed * (1.0 + x.speed.abs()),
+            "speed": torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed * (1.0 + x.speed.abs()),
             "warmth": p.damping * x.speed**2 - p.loss * x.warmth.clamp(min=-1.0) + 0.1 * torch.exp(-time),
         }
 
@@ -114,13 +114,13 @@ def recorded(runs=1, **columns):
     return Recording({**known, **columns})
 
 
-def assert_close(one, other, share):
-    """Equal but for a share of the largest value."""
-    torch.testing.assert_close(one, other, rtol=0, atol=share * float(other.abs().max()) + 1e-14)
+def assert_close(computed, expected, share):
+    """Assert equality up to a share of the largest value."""
+    torch.testing.assert_close(computed, expected, rtol=0, atol=share * float(expected.abs().max()) + 1e-14)
 
 
 def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
-    """Values and tangents of the compiled residual are those of torch, and there is one."""
+    """Assert that a compiled residual exists, and agrees with torch in values and tangents."""
     prepared = model.prepared
     compiled = model._compiled
     assert compiled is not None
@@ -129,12 +129,12 @@ def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
         return prepared.answer(p[: model.base], model.changes(p), nearby).residual
 
     nearby = None
-    for _ in range(2):  # the second time to all digits
+    for _ in range(2):  # the second solution is converged to all digits
         theirs = prepared.answer(parameters[: model.base], model.changes(parameters), nearby)
         nearby = theirs.nearby.bare
-    beside = compiled.answer(0.999 * parameters, nearby).nearby
-    assert beside is not None
-    for near in (beside, beside.bare, nearby, None):
+    neighbour = compiled.answer(0.999 * parameters, nearby).nearby
+    assert neighbour is not None
+    for near in (neighbour, beside.bare, nearby, None):
         ours = compiled.answer(parameters, near)
         torch.testing.assert_close(
             ours.residual, theirs.residual, rtol=0, atol=rtol * float(theirs.residual.abs().max())
@@ -145,11 +145,11 @@ def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
     rows = forward_tangents(generic)(parameters)
     own = compiled.tangents(parameters, compiled.answer(parameters, nearby).nearby)
     assert own.rows.shape == rows.shape
-    for one, other in zip(own.rows, rows, strict=True):
-        assert_close(one, other, rtol)
+    for ours_row, their_row in zip(own.rows, rows, strict=True):
+        assert_close(ours_row, their_row, rtol)
     if not further:
         return
-    # what is found there serves torch's own way too
+    # torch can start from the compiled trajectory too
     again = prepared.answer(parameters[: model.base], model.changes(parameters), own.nearby).residual
     assert_close(again, theirs.residual, rtol)
     slopes = torch.func.jacfwd(lambda p: prepared.answer(p[: model.base], model.changes(p), own.nearby).residual)
@@ -159,36 +159,36 @@ def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
 def observed(prepared, lasting=0.0):
     theta = prepared.given
     flow = flow_along(prepared, theta, prepared.guess)
-    pushes = tuple(Disturbance(name, True, lasting, 0.5) for name in prepared.pushable)
+    process_noise = tuple(Disturbance(name, True, lasting, 0.5) for name in prepared.disturbable)
     more = (Disturbance(prepared.channels[0], False, 1.0, 0.1),) if lasting else ()
-    observer = observer_of(flow, (*pushes, *more), floor_of(prepared), prepared.pushable, prepared.channels)
+    observer = observer_of(flow, (*process_noise, *more), floor_of(prepared), prepared.disturbable, prepared.channels)
     assert observer is not None
     return prepared.observed(observer)
 
 
 @pytest.mark.parametrize("system", [Driven(), Turned(), Single()])
 @pytest.mark.parametrize("runs", [1, 3])
-def test_free_runs(system, runs):
+def test_open_loop_residuals_match_torch(system, runs):
     prepared = system.prepare(recorded(runs))
     assert_like_torch(JointModel(prepared), prepared.given)
 
 
 @pytest.mark.parametrize("system", [Driven(), Turned(), Single()])
 @pytest.mark.parametrize("lasting", [0.0, 2.0])
-def test_runs_that_an_observer_corrects(system, lasting):
+def test_residuals_with_an_observer_match_torch(system, lasting):
     prepared = observed(system.prepare(recorded(2)), lasting)
     assert_like_torch(JointModel(prepared), prepared.given)
 
 
-class Bent(Effect):
-    """An output that is not straight."""
+class Quadratic(Effect):
+    """A quadratic output error."""
 
-    id = "bent"
+    id = "quadratic"
     port = "output"
     follows_signal = True
 
     def quantities(self, shape, context):  # noqa: ARG002
-        return (Quantity("bend", 1, ""),)
+        return (Quantity("curvature", 1, ""),)
 
     def change(self, gamma, shape, context):  # noqa: ARG002
         return gamma * context.signal.square()
@@ -207,7 +207,7 @@ class Warming(GainEffect):
 def candidates(prepared):
     """Each effect at each of its ports, alone or with a driver."""
     column = torch.sin(prepared.time)
-    for effect in (*DYNAMICS, Bent(), Warming()):
+    for effect in (*DYNAMICS, Quadratic(), Warming()):
         for name, port in prepared.ports.items():
             if (port.kind or name) != effect.port or not set(effect.needs) <= set(port.parts):
                 continue
@@ -225,7 +225,7 @@ def sized(effect, port, shape):
 
 
 @pytest.mark.parametrize("corrected", [False, True])
-def test_every_effect_is_as_torch_has_it(corrected):
+def test_residuals_with_each_effect_match_torch(corrected):
     prepared = Driven().prepare(recorded(2))
     prepared = observed(prepared) if corrected else prepared
     seen = set()
@@ -234,7 +234,7 @@ def test_every_effect_is_as_torch_has_it(corrected):
         gamma = 0.02 * torch.ones(model.size - model.base, dtype=torch.float64)
         parameters = torch.cat([prepared.given, gamma])
         assert model._compiled is not None, term.effect.id
-        # an effect that passes on from moment to moment what the simulation puts out is computed by torch
+        # torch computes effects that link outputs of different samples
         assert (model._compiled._traced.outputs is None) == (term.effect.id == "sensor_lag")
         seen.add((term.effect.id, prepared.ports[term.port].kind or "output"))
         if prepared.answer(parameters[: model.base], model.changes(parameters)).nearby is not None:
@@ -244,7 +244,7 @@ def test_every_effect_is_as_torch_has_it(corrected):
 
 
 @pytest.mark.parametrize("system", [Branching(), Declared()])
-def test_what_cannot_be_traced_is_left_to_torch(system):
+def test_untraceable_systems_fall_back_to_torch(system):
     prepared = system.prepare(recorded())
     assert prepared.compiled(lambda p: (p, {}), len(prepared.given)) is None
     way = Continuation(prepared, lambda p: (p, {}))
@@ -253,7 +253,7 @@ def test_what_cannot_be_traced_is_left_to_torch(system):
     assert bool(found.theta.isfinite().all())
 
 
-def test_a_fit_is_the_same_with_and_without():
+def test_fits_with_compiled_and_torch_residuals_agree():
     prepared = observed(Driven().prepare(recorded(2)))
     start = prepared.given * 1.05
 
@@ -261,7 +261,7 @@ def test_a_fit_is_the_same_with_and_without():
         return prepared.answer(theta, {}).residual
 
     way = Continuation(prepared, lambda p: (p, {}))
-    ours, theirs = (fit(one, start, jacobian="reverse twice", tol=1e-12) for one in (way, plain))
+    ours, theirs = (fit(residual, start, jacobian="reverse twice", tol=1e-12) for residual in (way, plain))
     assert ours.log_likelihood == pytest.approx(float(theirs.log_likelihood), rel=1e-10)
     torch.testing.assert_close(ours.theta, theirs.theta, rtol=1e-6, atol=1e-8)
     assert way.tangents(ours.theta) is not None
@@ -271,11 +271,11 @@ def test_a_fit_uses_the_compiled_residual():
     prepared = Single().prepare(recorded())
     way = Continuation(prepared, lambda p: (p, {}))
     way(prepared.given)
-    prepared.answer = prepared.rate = None  # torch's own way
+    prepared.answer = prepared.rate = None  # the torch implementation
     assert bool(fit(way, prepared.given, jacobian="reverse twice").converged)
 
 
-def test_a_march_ends_near_the_trajectory_as_that_of_torch_does():
+def test_growing_horizons_of_numpy_and_torch_end_near_the_trajectory():
     prepared = Driven().prepare(recorded(2))
     theta = prepared.given
     compiled = prepared.compiled(lambda p: (p, {}), len(theta))
@@ -288,7 +288,7 @@ def test_a_march_ends_near_the_trajectory_as_that_of_torch_does():
     assert (far - solved).abs().max() > 0.5
 
 
-def test_a_trajectory_that_is_found_by_a_march_alone():
+def test_a_growing_horizon_finds_a_trajectory_from_a_bad_guess():
     prepared = Driven().prepare(recorded(2))
     theta = prepared.given
     expected = prepared.answer(theta, {}).residual
@@ -297,7 +297,7 @@ def test_a_trajectory_that_is_found_by_a_march_alone():
     assert_close(compiled.answer(theta).residual, expected, 1e-8)
 
 
-def test_no_trajectory_is_no_answer():
+def test_the_residual_is_nan_without_a_trajectory():
     class Exploding(Single):
         def derivative(self, time, x, u, p):  # noqa: ARG002
             return {"level": p.rate * torch.exp(x.level * x.level)}
