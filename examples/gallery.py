@@ -1,4 +1,4 @@
-"""The manual's pictures of real magnetometers: what was recorded, and what came out.
+"""The manual's pictures of real magnetometers: the recordings and their calibrations.
 
     python examples/gallery.py --data ../shared/data/magnetometer --output docs/pictures
 
@@ -26,14 +26,14 @@ from mkc_torch.calibration import calibrate
 from mkc_torch.simulation import Magnetometer
 
 FIELD = ("mag_x", "mag_y", "mag_z")
-SIZE, DPI, COLORS = (9.0, 3.6), 90, 48  # inches, dots an inch: small enough to be kept beside the text
+SIZE, DPI, COLORS = (9.0, 3.6), 90, 48  # inches, dots an inch: small enough for the repository
 
 
 def read(folder: Path, name: str, *, every: int = 1, unit: str = "µT", field_alone: bool = False) -> Recording:
-    """A recording, some of its rows, with what is used of it."""
+    """Read every n-th row of a recording, with all columns or the field only."""
     whole = Recording.read(folder / f"{name}.csv")
-    names = [one for one in whole.names if not field_alone or one in ("time", *FIELD)]
-    columns = {one: whole[one][::every] for one in names}
+    names = [name for name in whole.names if not field_alone or name in ("time", *FIELD)]
+    columns = {name: whole[name][::every] for name in names}
     return Recording(columns, name=name, units=dict.fromkeys(FIELD, unit))
 
 
@@ -61,14 +61,14 @@ def raw_counts(folder: Path, left: Any, right: Any) -> None:
 
 
 def quadrotor(folder: Path, left: Any, right: Any) -> None:
-    """The third compass of a flying quadrotor, beside the wires of its battery."""
+    """The third compass of a flying quadrotor, next to the wires of its battery."""
     diagnosis = diagnose(Magnetometer("attitude"), read(folder, "quadrotor_compass3"))
     diagnosis.plot.effect(0, ax=left)
     diagnosis.plot.held_out(ax=right)
 
 
 def save(figure: Figure, path: Path) -> None:
-    """As a PNG of few colours, which is half as large."""
+    """Save as a PNG of few colours, which halves the file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=DPI)
     pyplot.close(figure)
@@ -76,7 +76,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 PICTURES: dict[str, Callable[[Path, Any, Any], None]] = {
-    one.__name__: one for one in (passing_magnet, attached_magnet, raw_counts, quadrotor)
+    picture.__name__: picture for picture in (passing_magnet, attached_magnet, raw_counts, quadrotor)
 }
 
 

@@ -1,4 +1,4 @@
-"""The curves of every loss in the manual: the value ρ, its derivative by the error, and the weight of the error.
+"""Pictures of every loss in the manual: value ρ, derivative by the error, and weight of the error.
 
 python examples/loss_pictures.py --output docs/pictures
 """
@@ -29,13 +29,13 @@ Curves = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 
 def fixed(panels: Sequence[Any]) -> None:
-    """MKCLoss of given numbers at four bandwidths."""
+    """MKCLoss with fixed parameters at four bandwidths."""
     error = torch.linspace(-8.0, 8.0, 401, dtype=torch.float64).unsqueeze(-1)
     curves: Curves = {}
     for sigma in (math.inf, 3.0, 2.0, 1.0):
         loss = MKCLoss(1, sigma=sigma, d=1.0, learn_sigma=False, learn_d=False).double()
         values = loss.rho(error), loss.influence(error), loss.weight(error)
-        curves[f"σ = {sigma:g}".replace("inf", "∞")] = tuple(one[:, 0] for one in values)  # type: ignore[assignment]
+        curves[f"σ = {sigma:g}".replace("inf", "∞")] = tuple(curve[:, 0] for curve in values)  # type: ignore[assignment]
     draw(panels, error[:, 0], curves, "error / d", ("value ρ", "influence · d", "weight"))
     panels[0].set_ylim(-0.3, 12.0)
     panels[1].set_ylim(-3.2, 3.2)
@@ -59,7 +59,7 @@ def scheduled(panels: Sequence[Any]) -> None:
 
 
 def heteroscedastic(panels: Sequence[Any]) -> None:
-    """HeteroscedasticMKCLoss of samples with another scale each."""
+    """HeteroscedasticMKCLoss of samples with different scales."""
     error, loss = torch.linspace(-8.0, 8.0, 401, dtype=torch.float64), HeteroscedasticMKCLoss(bound=50.0)
     curves: Curves = {}
     for d in (0.5, 1.0, 2.0):
@@ -82,7 +82,7 @@ def labels(panels: Sequence[Any]) -> None:
 
 
 def entropy(panels: Sequence[Any]) -> None:
-    """LELoss of an error that joins 200 normal ones."""
+    """LELoss of one error among 200 Gaussian errors."""
     level = (torch.arange(200, dtype=torch.float64) + 0.5) / 200.0
     batch, loss = torch.special.ndtri(level), LELoss()
     error = torch.linspace(-6.0, 6.0, 400, dtype=torch.float64)  # an even number: at 0 the weight is infinite
@@ -95,12 +95,12 @@ def entropy(panels: Sequence[Any]) -> None:
 
 
 PICTURES: dict[str, Callable[[Sequence[Any]], None]] = {
-    f"losses_{one.__name__}": one for one in (fixed, scheduled, heteroscedastic, labels, entropy)
+    f"losses_{curves.__name__}": curves for curves in (fixed, scheduled, heteroscedastic, labels, entropy)
 }
 
 
 def draw(panels: Sequence[Any], x: Tensor, curves: Curves, xlabel: str, titles: tuple[str, str, str]) -> None:
-    """Three panels: one curve of each loss in each of them."""
+    """Draw three panels: value, influence and weight."""
     for panel, title in zip(panels, titles, strict=True):
         panel.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
         panel.set_title(title, fontsize="medium")
@@ -115,7 +115,7 @@ def draw(panels: Sequence[Any], x: Tensor, curves: Curves, xlabel: str, titles: 
 
 
 def save(figure: Figure, path: Path) -> None:
-    """As a PNG of few colours, which is half as large."""
+    """Save as a PNG of few colours, which halves the file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=DPI)
     Image.open(buffer).convert("P", palette=Image.Palette.ADAPTIVE, colors=COLORS).save(path, optimize=True)

@@ -28,11 +28,10 @@ from tests.recording.test_strange_files import FIELD, LINES, OTHER, PLAIN, SAME,
 
 PAGE = ROOT / "docs" / "bad_inputs.md"
 
-HEAD = """# Bad inputs, and what is said
+HEAD = """# Bad inputs, and what is reported
 
-Each row was given to the command line or to Python, and the right column is what it said, word for word;
-`tests/test_bad_inputs.py` gives each again and compares. None ends in a traceback, none in a number that is none, and
-no file that was there before is changed.
+Each row is an input to the command line or to Python, and the message that it gets, as `python -m tests.bad_inputs`
+prints them. No traceback, no NaN, no file changed: `tests/test_bad_inputs.py` gives each input again and checks this.
 
 """
 LOGS = (".parquet", ".ulg", ".bin", ".log", ".mcap", ".bag", ".mat", ".h5", ".mf4")
@@ -174,7 +173,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "`--field-strength nan`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "nan"),
     "`--place` without `--date`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
     "`--export mavlink`": ("calibrate", "@rec.csv", "--output", "@out", "--export", "mavlink"),
-    "`--compare-with` that is no calibration": ("calibrate", "@rec.csv", "--output", "@out", "--compare-with", "@none.json"),
+    "`--compare-with` another JSON": ("calibrate", "@rec.csv", "--output", "@out", "--compare-with", "@none.json"),
     "a calibration that is cut": ("apply", "@cut.json", "@rec.csv", "--output", "@out.csv"),
     "a calibration that is none": ("apply", "@none.json", "@rec.csv", "--output", "@out.csv"),
     "a calibration that is not there": ("apply", "@other.json", "@rec.csv", "--output", "@out.csv"),
@@ -274,7 +273,7 @@ def page() -> str:
     text, group = HEAD, ""
     for bad, said in rows():
         if bad.group != group:
-            text += f"{'' if not group else chr(10)}## {bad.group}\n\n| what was given | what is said |\n|---|---|\n"
+            text += f"{'' if not group else chr(10)}## {bad.group}\n\n| input | message |\n|---|---|\n"
             group = bad.group
         text += row(bad, said) + "\n"
     return text

@@ -24,7 +24,7 @@ def test_quaternions_turn_as_their_matrices_do():
     torch.testing.assert_close(torch.stack([torch.stack(row, -1) for row in rows], -2), to_world)
 
 
-def test_a_sensor_is_recorded_at_the_rate_that_is_asked_for(tmp_path):
+def test_a_sensor_is_recorded_at_the_requested_rate(tmp_path):
     recording = Recording.read(diagnosis.sensor(tmp_path / "a.csv", 10.0, 60.0, 1, attitude=True))
     assert len(recording) == 600
     assert float(recording["time"][-1]) == pytest.approx(59.9)

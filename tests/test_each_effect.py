@@ -21,7 +21,7 @@ def says(folder, key, *effects):
     (folder / key.name / "diagnosis.json").write_text(json.dumps(told), encoding="utf-8")
 
 
-def test_the_effect_asked_for_is_hidden_and_well_to_be_seen(case):
+def test_the_requested_effect_is_hidden_and_detectable(case):
     (truth,) = case.key.effects
     assert truth.effect == "gravity_sag"
     assert min(truth.z, truth.z_sep) >= 10.0

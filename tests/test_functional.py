@@ -133,7 +133,7 @@ def test_log_normalizer_gradients_equal_differences_of_the_series():
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=0)
 
 
-def test_normalizer_of_many_channels_equals_one_at_a_time():
+def test_normalizer_of_many_channels_equals_a_loop():
     sigma, d, bound = double([0.05, 0.4, 3.0, 50.0, INF], [0.2, 3.0, 1.0, 7.0, 0.01], [1.0, 40.0, 1e5, 8.0, 1.0])
     together = log_normalizer(sigma, d, bound)
     alone = torch.stack([log_normalizer(*each) for each in zip(sigma, d, bound, strict=True)])
@@ -226,7 +226,7 @@ def test_energy_in_float32_has_the_kappa_gradient_of_float64():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("error", [1e15, 1e20, -1e20, 1e30])
 @pytest.mark.parametrize("sigma", [0.05, 3.0, 1e4])
-def test_huge_errors_give_the_flat_tail_and_pull_at_nothing(error, sigma, dtype):
+def test_huge_errors_give_the_flat_tail_and_zero_gradient(error, sigma, dtype):
     e, s, d, bound = (torch.tensor(v, dtype=dtype, requires_grad=True) for v in (error, sigma, 1.0, 100.0))
     value = mkc_energy(e, s, d)
     by_e, by_sigma, by_d = torch.autograd.grad(value, (e, s, d))
@@ -263,7 +263,7 @@ def test_energy_lies_between_zero_and_both_of_its_limits(sigma, d, error):
 
 @sampled
 @given(sigma=sigmas, d=scales, dtype=st.sampled_from([torch.float32, torch.float64]))
-def test_energy_never_falls_and_the_weight_never_rises_with_the_absolute_error(sigma, d, dtype):
+def test_energy_is_monotonic_and_weight_antitonic_in_the_absolute_error(sigma, d, dtype):
     e = torch.cat([torch.zeros(1, dtype=dtype), torch.logspace(-4, 4, 200, dtype=dtype)])
     value, weight = mkc_energy(e, sigma, d), mkc_weight(e, sigma, d)
     ulp = 4 * torch.finfo(dtype).eps
@@ -472,7 +472,7 @@ def test_autocast_changes_nothing(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_python_numbers_are_as_good_as_tensors(dtype):
+def test_python_numbers_equal_tensors(dtype):
     e = torch.tensor(AT[0], dtype=dtype)
     tensors = [torch.tensor(v, dtype=dtype) for v in (2, 0.3, 50)]
     for function, count in ((mkc_energy, 2), (mkc_weight, 2), (mkc_nll, 3)):
@@ -483,7 +483,7 @@ def test_python_numbers_are_as_good_as_tensors(dtype):
     torch.testing.assert_close(log_normalizer(2, 0.3, 50).to(dtype), log_normalizer(*tensors))
 
 
-def test_a_number_in_double_does_not_lose_digits_to_a_float32_tensor_beside_it():
+def test_a_float64_scalar_keeps_its_digits_with_a_float32_tensor():
     assert mkc_energy(double(1.0), torch.tensor(0.5), 0.1).item() == pytest.approx(0.25 * -math.expm1(-200), rel=1e-15)
 
 
@@ -518,7 +518,7 @@ def test_complex_values_are_refused(position):
         mkc_nll(*arguments)
 
 
-def test_kappa_max_is_the_inverse_square_of_the_least_sigma():
+def test_kappa_max_is_the_inverse_square_of_the_smallest_sigma():
     assert inverse_square(double(0.05)).item() == pytest.approx(KAPPA_MAX, rel=1e-14)
     assert inverse_square(double(INF)).item() == 0
 
@@ -555,7 +555,7 @@ def test_an_infinite_scale_or_domain_is_refused_and_an_infinite_bandwidth_is_the
                 called(function, **{name: INF})
 
 
-def test_the_normaliser_takes_the_least_sigma_as_it_is_rounded():
+def test_the_normaliser_accepts_the_rounded_smallest_sigma():
     for function in LIKELIHOOD:
         called(function, sigma=torch.tensor(KAPPA_MAX).rsqrt() * (1 - 1e-6))
         with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
@@ -564,7 +564,7 @@ def test_the_normaliser_takes_the_least_sigma_as_it_is_rounded():
 
 
 @pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
-def test_under_vmap_parameters_go_through_as_they_are(function):
+def test_parameters_are_not_checked_under_vmap(function):
     sigma = torch.tensor([[2.0, -2.0], [1.0, 3.0]])
     found = vmap(lambda s: called(function, sigma=s))(sigma)
     torch.testing.assert_close(found, torch.stack([called(function, sigma=s.abs()) for s in sigma]))
@@ -572,7 +572,7 @@ def test_under_vmap_parameters_go_through_as_they_are(function):
 
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
-def test_compiled_parameters_are_looked_at_where_they_are_numbers():
+def test_compiled_code_checks_parameters_that_are_numbers():
     compiled = torch.compile(mkc_nll, fullgraph=True)
     error = torch.linspace(-3.0, 3.0, 7)
     torch.testing.assert_close(compiled(error, 2.0, 1.0, 5.0), mkc_nll(error, 2.0, 1.0, 5.0))
@@ -583,13 +583,13 @@ def test_compiled_parameters_are_looked_at_where_they_are_numbers():
 
 
 @pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
-def test_what_is_no_number_is_refused_by_name(function):
+def test_parameters_that_are_not_numbers_are_refused_by_name(function):
     for value in ("2", None, 2j):
         with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got"):
             called(function, sigma=value)
 
 
-def test_errors_are_tensors_and_the_primitives_take_nothing_else():
+def test_errors_and_arguments_of_the_primitives_must_be_tensors():
     for error in (np.ones(2), [1.0, 2.0]):
         with pytest.raises(TypeError, match=r"`error` to be a real tensor but got .*torch\.as_tensor\(error\)"):
             mkc_energy(error, 1.0, 1.0)

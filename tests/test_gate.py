@@ -138,7 +138,7 @@ def test_where_nothing_is_to_be_named_the_verdict_decides(name, verdict):
     assert not judged(row(finding("input_delay"), verdict=verdict), CASES[name])["right"]
 
 
-def test_recordings_have_names_of_their_own_and_files_that_are_asked_for():
+def test_recordings_have_unique_names_and_existing_files():
     everything = [*known.real(), *known.cases()]
     assert len({one.name for one in everything}) == len(everything) == 29
     arm = next(one for one in everything if "propeller_arm" in one.name)
@@ -254,7 +254,7 @@ def test_scenarios_are_scored_by_their_keys(tmp_path):
     assert family.outcomes(rows)[useless] == {"false_alarm": True}
 
 
-def test_what_one_run_cannot_tell_is_counted_apart(tmp_path):
+def test_undecidable_single_runs_are_counted_apart(tmp_path):
     (family, _) = drawn.all_scenarios(tmp_path, match="scenario dynamics lasting_push empty", empty=2, hidden=0)
     assert len(family.jobs) == 2
     rival = finding("backlash", alternatives=("dead_zone",))

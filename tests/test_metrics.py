@@ -58,7 +58,7 @@ def test_metric_equals_the_learned_loss_in_float32():
 
 
 @pytest.mark.parametrize("cut", [1, 13, 25])
-def test_parts_add_up_to_the_whole(cut):
+def test_the_mean_does_not_depend_on_the_batches(cut):
     loss, (x, y) = made(), data(50, 2)
     weight = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     whole, parts = MKCNegativeLogLikelihood(loss, per_channel=True), MKCNegativeLogLikelihood(loss, per_channel=True)
@@ -70,7 +70,7 @@ def test_parts_add_up_to_the_whole(cut):
     torch.testing.assert_close(whole.compute(), expected, rtol=1e-13, atol=0)
 
 
-def test_states_of_ranks_added_are_the_whole():
+def test_summed_states_of_ranks_equal_the_whole():
     loss, (x, y) = made(), data(50, 2)
     whole, *ranks = (MKCNegativeLogLikelihood(loss) for _ in range(3))
     whole.update(x, y)
@@ -87,7 +87,7 @@ def test_states_of_ranks_added_are_the_whole():
     torch.testing.assert_close(ranks[0].compute(), whole.compute(), rtol=1e-14, atol=0)
 
 
-def test_forward_gives_the_batch_and_adds_it_and_reset_forgets():
+def test_forward_returns_the_batch_value_and_adds_it_and_reset_clears():
     loss, (x, y) = made(), data(50, 2)
     metric = MKCNegativeLogLikelihood(loss)
     first = metric(x[:10], y[:10])
@@ -100,7 +100,7 @@ def test_forward_gives_the_batch_and_adds_it_and_reset_forgets():
     torch.testing.assert_close(metric.compute(), nll(loss, x[:3], y[:3]).mean(), rtol=1e-13, atol=0)
 
 
-def test_what_is_masked_does_not_count_even_if_nan():
+def test_masked_elements_are_ignored_even_if_nan():
     loss, (x, y) = made(channel_dim=1), data(6, 2, 4)
     mask = torch.ones(6, 4, dtype=torch.bool)
     mask[2, 3] = mask[5, 0] = False
@@ -113,7 +113,7 @@ def test_what_is_masked_does_not_count_even_if_nan():
         metric.update(x, y)
 
 
-def test_nothing_that_counts_is_nan_not_zero():
+def test_without_counted_elements_the_metric_is_nan():
     metric = MKCNegativeLogLikelihood(made(), per_channel=True)
     weight = torch.tensor([[1.0, 0.0]] * 4)
     metric.update(*data(4, 2), weight)
@@ -139,7 +139,7 @@ def test_millions_of_small_batches_lose_no_digits():
     assert metric.half().total.dtype == torch.float64
 
 
-def test_the_metric_owns_no_parameters_and_its_clones_follow_the_loss():
+def test_the_metric_has_no_parameters_and_its_clones_refer_to_the_loss():
     loss, (x, y) = made(), data(8, 2)
     metric = MKCNegativeLogLikelihood(loss)
     assert list(metric.parameters()) == []
@@ -151,7 +151,7 @@ def test_the_metric_owns_no_parameters_and_its_clones_follow_the_loss():
         torch.testing.assert_close(twin.compute(), nll(loss, x, y).mean())
 
 
-def test_a_module_copied_with_its_loss_has_a_metric_of_its_own_loss():
+def test_a_metric_copied_with_its_loss_refers_to_the_copy():
     module = nn.Module()
     module.criterion = made()
     module.nll = MKCNegativeLogLikelihood(module.criterion)
@@ -161,11 +161,11 @@ def test_a_module_copied_with_its_loss_has_a_metric_of_its_own_loss():
         assert set(dict(twin.named_parameters())) == {"criterion.raw_kappa", "criterion.raw_d"}
 
 
-def test_what_is_no_loss_and_what_the_loss_refuses_is_refused():
+def test_another_loss_and_bad_batches_are_refused():
     with pytest.raises(TypeError, match="`loss` to be an MKCLoss but got MSELoss"):
         MKCNegativeLogLikelihood(nn.MSELoss())
     metric = MKCNegativeLogLikelihood(made())
-    with pytest.raises(ValueError, match="Expected `input` and `target` of one shape"):
+    with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 1))
     with pytest.raises(TypeError, match="`target` to be a real floating-point tensor"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 2, dtype=torch.int64))
@@ -179,12 +179,12 @@ def test_what_is_no_loss_and_what_the_loss_refuses_is_refused():
 
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
-def test_the_loss_may_be_compiled():
+def test_a_compiled_loss_is_accepted():
     loss = made()
     assert MKCNegativeLogLikelihood(torch.compile(loss)).loss is loss
 
 
-def test_without_torchmetrics_the_error_says_what_to_install(monkeypatch):
+def test_without_torchmetrics_the_error_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "torchmetrics", None)
     path = Path(mkc_torch.__file__).parent / "metrics.py"
     spec = importlib.util.spec_from_file_location("without_torchmetrics", path)

@@ -41,7 +41,7 @@ def test_what_the_sensor_adds_is_of_its_kind():
     assert alike(slow, 5) == pytest.approx(share * np.exp(-5.0 / samples), abs=0.05)
 
 
-def test_pushes_are_new_at_each_sample_or_last():
+def test_disturbances_are_white_or_correlated():
     anew, lasting = (courses(kind, 1) for kind in ("process noise, white", "process noise, lasting"))
     assert abs(alike(anew, 1)) < 0.03
     samples = null_recordings.LASTING_SHARE * SAMPLES
@@ -65,7 +65,7 @@ def test_the_true_course_is_that_of_scipy(held):
     np.testing.assert_allclose(moved(held, force), expected, atol=0.01 * NOISE)
 
 
-def test_a_push_moves_what_is_measured_by_more_than_its_noise():
+def test_a_disturbance_exceeds_the_measurement_noise():
     force = np.zeros(SAMPLES)
     for kind in ("process noise, white", "process noise, lasting"):
         push = KINDS[kind][1](np.random.default_rng(2))

@@ -79,7 +79,7 @@ def wrong(name: str, argument: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(("name", "argument"), [case for case in CASES if not case[0].startswith(SLOW)])
-def test_a_spoilt_argument_is_refused_or_answered_with_numbers(name, argument):
+def test_a_contaminated_argument_is_refused_or_gives_numbers(name, argument):
     assert wrong(name, argument) == {}
 
 

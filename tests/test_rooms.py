@@ -119,7 +119,7 @@ def test_the_face_shows_public_names_alone():
     assert all(getattr(mkc_torch, name) is not None for name in shown)
 
 
-def test_every_room_says_what_it_is():
+def test_every_package_has_a_docstring():
     for name in PACKAGES:
         assert ast.get_docstring(ast.parse(MODULES[name].read_text(encoding="utf-8"))), name
 

@@ -1,4 +1,4 @@
-"""Vehicles that hardly tilt, with a gyroscope or at a known place: `calibrate` beside an ellipsoid by least squares.
+"""Vehicles that hardly tilt, with a gyroscope or at a known place: `calibrate` and an ellipsoid by least squares.
 
 python examples/calibration/hardly_tilting.py [--draws 200] [--by place] [--picture hardly_tilting.png]
 """
@@ -23,20 +23,20 @@ from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients, monomials, symmetric_root
 
 RATE, SECONDS = 50.0, 120.0
-"""Of a recording, in Hz and s."""
+"""Sampling rate in Hz, and length in s."""
 
 NOISE = 0.5
-"""Of each axis of the magnetometer, in µT."""
+"""Noise of each axis of the magnetometer, µT."""
 
 RATE_NOISE, RATE_BIAS, RATE_DRIFT, RATE_GAIN, RATE_TURNED = 0.01, 1.0, 0.003, 0.01, 0.01
-"""Of a cheap gyroscope: noise in °/s/√Hz, a constant bias in °/s (standard deviation of each axis), what it wanders by
-in a recording in °/s, and standard deviations of gains and of cross-axis sensitivity."""
+"""A cheap gyroscope: noise in °/s/√Hz, standard deviation of the constant bias in °/s, drift of the bias over a
+recording in °/s, and standard deviations of gains and of cross-axis sensitivity."""
 
 DISTURBED = 0.1
-"""Share of samples that something magnetic disturbs."""
+"""Share of samples with a magnetic disturbance."""
 
 JUDGED_FROM = 100_000
-"""First seed of the draws that are judged; thresholds were set on seeds below."""
+"""First seed of the scored draws; thresholds were set on lower seeds."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Draw:
     Attributes:
         recording: time, magnetometer in µT, gyroscope in rad/s.
         to_world: (N, 3, 3), from the body to east, north, up.
-        field: (3,), of the world, in µT.
-        offset, response: of the sensor, ``measured = response @ field + offset``.
-        tilt: greatest angle from the vertical, in °.
-        disturbed: (N,).
+        field: (3,), field in world axes, µT.
+        offset, response: sensor parameters, ``measured = response @ field + offset``.
+        tilt: largest angle from the vertical, °.
+        disturbed: (N,), mask of disturbed samples.
     """
 
     recording: Recording
@@ -62,7 +62,7 @@ class Draw:
 
 
 def drawn(seed: int, least: float = 5.0, most: float = 20.0, seconds: float = SECONDS) -> Draw:
-    """A vehicle that drives about for two minutes; its greatest tilt is drawn between two angles in °."""
+    """Simulate a vehicle that drives for two minutes; its largest tilt is drawn between two angles in °."""
     g = Generator().manual_seed(seed)
     count = round(seconds * RATE)
     time = torch.arange(count, dtype=torch.float64) / RATE
@@ -93,7 +93,7 @@ def drawn(seed: int, least: float = 5.0, most: float = 20.0, seconds: float = SE
 
 
 def rates(g: Generator, to_world: Tensor) -> Tensor:
-    """Of a cheap gyroscope, in rad/s."""
+    """Return the rates of a cheap gyroscope, rad/s."""
     step = to_world[:-1].mT @ to_world[1:]
     skew = 0.5 * (step - step.mT)
     turn = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
@@ -101,15 +101,15 @@ def rates(g: Generator, to_world: Tensor) -> Tensor:
     between = turn * torch.asin(sine.clamp(max=1.0)) / sine * RATE
     true = torch.cat([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
     count = len(true)
-    wandering = normal(g, count, 3).cumsum(0) * RATE_DRIFT / math.sqrt(count)
-    degrees = RATE_BIAS * normal(g, 3) + wandering + RATE_NOISE * math.sqrt(RATE) * normal(g, count, 3)
+    drift = normal(g, count, 3).cumsum(0) * RATE_DRIFT / math.sqrt(count)
+    degrees = RATE_BIAS * normal(g, 3) + drift + RATE_NOISE * math.sqrt(RATE) * normal(g, count, 3)
     gains = torch.eye(3, dtype=torch.float64) + RATE_TURNED * normal(g, 3, 3)
     gains = gains - torch.diag(gains.diagonal()) + torch.diag(1.0 + RATE_GAIN * normal(g, 3))
     return true @ gains.mT + torch.deg2rad(degrees)
 
 
 def bursts(g: Generator, count: int) -> Tensor:
-    """Which samples are disturbed: bursts of half a second to four seconds, and single ones."""
+    """Draw the disturbed samples: bursts of 0.5 to 4 s, and single samples."""
     hit = torch.rand(count, generator=g) < 0.2 * DISTURBED
     while float(hit.double().mean()) < DISTURBED:
         begin, length = int(uniform(g, 0.0, 1.0) * count), int(uniform(g, 0.5, 4.0) * RATE)
@@ -118,7 +118,7 @@ def bursts(g: Generator, count: int) -> Tensor:
 
 
 def disturbances(g: Generator, count: int, hit: Tensor) -> Tensor:
-    """What passing iron and currents add, in µT: another field in each burst, and another in each single sample."""
+    """Draw the field of passing iron and currents, µT: constant in a burst, independent in single samples."""
     single = 15.0 * normal(g, count, 3)
     burst = torch.zeros(count, 3, dtype=torch.float64)
     number = torch.cat([torch.zeros(1), (hit[1:] != hit[:-1]).cumsum(0)]).long()
@@ -130,9 +130,9 @@ def disturbances(g: Generator, count: int, hit: Tensor) -> Tensor:
 
 
 def heading_errors(draw: Draw, offset: Tensor, matrix: Tensor) -> Tensor:
-    """Of the corrected field in each sample's attitude, in °, as a compass that knows its tilt has them.
+    """Return the heading errors of the corrected field at each attitude, °, for a compass with known tilt.
 
-    The noise and the disturbances are left out: the error is the calibration's alone.
+    Noise and disturbances are left out: the error is that of the calibration.
     """
     seen = (draw.to_world.mT @ draw.field) @ draw.response.mT + draw.offset
     field = (draw.to_world @ ((seen - offset) @ matrix.mT).unsqueeze(-1)).squeeze(-1)
@@ -140,7 +140,7 @@ def heading_errors(draw: Draw, offset: Tensor, matrix: Tensor) -> Tensor:
 
 
 def by_calibrate(draw: Draw) -> Tensor | None:
-    """Heading errors of what `calibrate` finds; None where it refuses."""
+    """Return the heading errors of `calibrate`; None if it refuses."""
     try:
         found = calibrate(draw.recording)
     except NotIdentifiableError:
@@ -149,7 +149,10 @@ def by_calibrate(draw: Draw) -> Tensor | None:
 
 
 def by_place(draw: Draw) -> Tensor | None:
-    """The same without the gyroscope, at a known place, less a constant: lengths do not tell how a sensor is turned."""
+    """Return the heading errors of `calibrate` at a known place without gyroscope, minus their mean.
+
+    Lengths of the field do not determine a rotation of the sensor.
+    """
     kept = {name: values for name, values in draw.recording.columns.items() if not name.startswith("gyro")}
     strength = float(torch.linalg.vector_norm(draw.field))
     earth = Field(strength, -math.asin(float(draw.field[2]) / strength), 0.0)
@@ -164,7 +167,7 @@ def by_place(draw: Draw) -> Tensor | None:
 
 
 def by_least_squares(draw: Draw) -> Tensor | None:
-    """The same of an ellipsoid by least squares, with no questions asked; None where the quadric is no ellipsoid."""
+    """Return the heading errors of an unchecked ellipsoid by least squares; None if the quadric is not an ellipsoid."""
     points = draw.recording.magnetometer()
     middle = points.mean(0)
     size = torch.linalg.vector_norm(points - middle, dim=-1).mean()
@@ -179,7 +182,7 @@ WAYS = {"gyroscope": by_calibrate, "place": by_place}
 
 
 def judged(draws: range, least: float, most: float, by: str = "gyroscope") -> dict[str, list[float]]:
-    """Root mean square heading error of each draw, in °; infinite where there is no result."""
+    """Return the RMS heading error of each draw, °; infinite without a result."""
     ways = {f"calibrate, by the {by}": WAYS[by], "ellipsoid by least squares": by_least_squares}
     found: dict[str, list[float]] = {name: [] for name in ways}
     for seed in draws:
@@ -199,7 +202,7 @@ def row(name: str, sizes: list[float]) -> tuple[str, ...]:
 
 
 def picture(found: dict[str, list[float]], path: Path) -> None:
-    """Share of draws with at most an error."""
+    """Return the share of draws with at most this error."""
     figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
     for name, sizes in found.items():
         ordered = sorted(min(size, 180.0) for size in sizes)
@@ -217,7 +220,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--tilt", type=float, nargs=2, default=(5.0, 20.0), metavar=("LEAST", "MOST"), help="in °")
-    parser.add_argument("--by", choices=sorted(WAYS), default="gyroscope", help="what is known beside the field")
+    parser.add_argument(
+        "--by", choices=sorted(WAYS), default="gyroscope", help="what is known in addition to the field"
+    )
     parser.add_argument("--picture", type=Path, help="file to draw into")
     arguments = parser.parse_args()
     least, most = arguments.tilt
@@ -241,7 +246,7 @@ def normal(g: Generator, *shape: int) -> Tensor:
 
 
 def slow(g: Generator, count: int, seconds: float) -> Tensor:
-    """A random course of standard deviation 1 that changes within so many seconds."""
+    """Draw a smooth path of standard deviation 1 with a time scale in s."""
     time = torch.arange(count, dtype=torch.float64) / RATE
     course = torch.zeros(count, dtype=torch.float64)
     for _ in range(12):

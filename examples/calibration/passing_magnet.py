@@ -26,7 +26,7 @@ USED, REJECTED, GAUSSIAN = "#0072b2", "#d55e00", "#555555"
 
 
 def outline(fit: EllipsoidFit) -> np.ndarray:
-    """The ellipsoid cut by the x-z plane through its centre, (361, 2)."""
+    """Return the outline (361, 2) of the ellipsoid in the x-z plane through its centre."""
     angle = np.linspace(0, 2 * np.pi, 361)
     circle = np.stack([np.cos(angle), 0 * angle, np.sin(angle)])
     shape = (fit.calibration_matrix_ / fit.radius_).numpy()
@@ -47,7 +47,7 @@ def draw_cut(axes: Any, points: np.ndarray, rejected: np.ndarray, robust: Ellips
 def draw_residual(axes: Any, time: np.ndarray, residual: np.ndarray, rejected: np.ndarray) -> None:
     for mask, colour in ((~rejected, USED), (rejected, REJECTED)):
         axes.plot(time[mask], residual[mask], ".", color=colour, ms=2)
-    axes.set(title="length of the calibrated field less its mean", xlabel="time (s)", ylabel="residual (µT)")
+    axes.set(title="length of the calibrated field minus its mean", xlabel="time (s)", ylabel="residual (µT)")
 
 
 def draw_density(axes: Any, residual: Tensor, sigma: float, d: float, bound: float) -> None:

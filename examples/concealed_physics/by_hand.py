@@ -1,6 +1,6 @@
-"""What is known of each recording beside the right effect: words for it, and what a fit by hand reaches.
+"""Known facts on each recording: the missing physics in words, and the result of a fit by hand.
 
-The recordings' READMEs say how each is known.
+The READMEs of the recordings give the sources.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ByHand:
-    """Words for the missing physics, and what a fit by hand reaches.
+    """The missing physics in words, and the result of a fit by hand.
 
     Attributes:
         left_out: the missing physics, in words.
         sizes: parameters of the missing physics, as simulated or fitted by hand, by effect and name.
-        parameters: those of the simulation.
-        residual: output to the root mean square of recording less open-loop simulation of the fit by hand.
-        where: states, and sides of them as a diagnosis names them, in which the missing physics acts most.
+        parameters: parameters of the simulation.
+        residual: RMS residual of the open-loop simulation of the fit by hand, by output.
+        where: regions of the states in which the missing physics acts most, in the words of a diagnosis.
     """
 
     left_out: str = "nothing"
@@ -40,7 +40,7 @@ def _coast(noise: float) -> ByHand:
 _MODE = {("hidden_mode", "share"): 0.833, ("hidden_mode", "period"): 0.1405, ("hidden_mode", "damping"): 0.0224}
 _LIGHT = ("Baseball", "Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
 _LIGHTER = ("Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2")
-_PUSH = "no physics: an unrecorded push"
+_PUSH = "no physics: an unrecorded force"
 
 BY_HAND: Mapping[str, ByHand] = {
     "real house house_1 House": ByHand("a second thermal mass"),
@@ -92,4 +92,4 @@ BY_HAND: Mapping[str, ByHand] = {
     "data quadrotor_compass1": ByHand("the recorded heading jumps"),
     "data quadrotor_compass3": ByHand("the current's field"),
 }
-"""By the recording's name; a recording that is not here has nothing left out."""
+"""By name of the recording; in other recordings no physics is missing."""

@@ -1,4 +1,4 @@
-"""The right answer for a recording, and whether a row gives it."""
+"""Compare a row with the right answer for its recording."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mkc_torch.challenge.verdict import StatedCandidate, StatedDiagnosis, answer
+from mkc_torch.challenge.verdict import StatedCandidate, StatedDiagnosis, stated_diagnosis
 
 if TYPE_CHECKING:
     from known import Expected, Size
 
 
 def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
-    """Whether a row is right, by name, verdict, sizes and residual, and what is wrong with it.
+    """Judge a row by names, verdict, sizes and residual.
 
     Args:
-        row: of a diagnosis, as `row.row` gives it.
+        row: row of a diagnosis, from `row.row`.
         expected: the right answer.
 
     Returns:
@@ -28,14 +28,14 @@ def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
         >>> judged(row, Expected(verdicts=("adequate",)))
         {'right': False, 'wrong': ['the verdict is unfit, not adequate']}
     """
-    said = answer(row if row["verdict"] else None)
+    stated = stated_diagnosis(row if row["verdict"] else None)
     wrong = []
-    if expected.verdicts and said.verdict not in expected.verdicts:
-        wrong.append(f"the verdict is {said.verdict}, not {' or '.join(expected.verdicts)}")
-    if said.verdict == "failed":
+    if expected.verdicts and stated.verdict not in expected.verdicts:
+        wrong.append(f"the verdict is {stated.verdict}, not {' or '.join(expected.verdicts)}")
+    if stated.verdict == "failed":
         wrong = [f"no diagnosis: {row.get('failed') or 'no reason given'}"]
     elif not (expected.display_name and _says(row, expected.display_name)):
-        wrong += _wrong_names(said, expected) + _wrong_sizes(row, expected.sizes)
+        wrong += _wrong_names(stated, expected) + _wrong_sizes(row, expected.sizes)
         wrong += _wrong_residuals(row["residual_after"], expected.residual)
     return {"right": not wrong, "wrong": wrong}
 
@@ -44,16 +44,16 @@ def _says(row: Mapping[str, Any], words: Sequence[str]) -> bool:
     return any(all(word in sentence for word in words) for sentence in row["sentences"])
 
 
-def _wrong_names(said: StatedDiagnosis, expected: Expected) -> list[str]:
-    claimed = [finding.named.effect for finding in said.claims]
+def _wrong_names(stated: StatedDiagnosis, expected: Expected) -> list[str]:
+    claimed = [finding.named.effect for finding in stated.claims]
     if not expected.names:
-        return [f"{', '.join(claimed)} claimed where nothing is to be named"] if claimed else []
-    told = ", ".join(claimed) or "nothing"
+        return [f"{', '.join(claimed)} claimed, but no physics is missing"] if claimed else []
+    found = ", ".join(claimed) or "nothing"
     wrong = [
-        f"{' or '.join(group)} is not claimed but {told}" for group in expected.names if not _is_named(said, group)
+        f"{' or '.join(group)} is not claimed but {found}" for group in expected.names if not _is_named(stated, group)
     ]
     accepted = {name for group in expected.names for name in group}
-    first = said.claims[0] if said.claims else None
+    first = stated.claims[0] if stated.claims else None
     if first and not {first.named.effect, *(other.effect for other in first.others)} & accepted:
         wrong.append(f"{first.named.effect} is claimed first")
     wrong += [f"{name} is claimed" for name in expected.refused if name in claimed]
@@ -62,9 +62,9 @@ def _wrong_names(said: StatedDiagnosis, expected: Expected) -> list[str]:
     return wrong
 
 
-def _is_named(said: StatedDiagnosis, group: Sequence[str]) -> bool:
-    """Claimed, or rightly undecided: among the alternatives of a claim that the recording cannot rule out."""
-    return any(candidate.effect in group for finding in said.claims for candidate in (finding.named, *finding.others))
+def _is_named(stated: StatedDiagnosis, group: Sequence[str]) -> bool:
+    """Whether the effect is claimed, or is among the alternatives that the recording cannot rule out."""
+    return any(candidate.effect in group for finding in stated.claims for candidate in (finding.named, *finding.others))
 
 
 def _is_at(named: StatedCandidate, places: Sequence[str]) -> bool:
@@ -98,6 +98,6 @@ def _wrong_residuals(after: Mapping[str, float | None], most: Mapping[str, float
     for output, limit in most.items():
         residual = after.get(output)
         if residual is None or not residual <= limit:
-            told = "unknown" if residual is None else f"{residual:.4g}"
-            wrong.append(f"the residual of {output} is {told}, not at most {limit:.4g}")
+            found = "unknown" if residual is None else f"{residual:.4g}"
+            wrong.append(f"the residual of {output} is {found}, not at most {limit:.4g}")
     return wrong

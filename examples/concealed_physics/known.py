@@ -1,4 +1,4 @@
-"""The recordings whose missing physics is known, and their right answers by the tables beside them."""
+"""The recordings with known missing physics, and their right answers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
-"""Folder of the recordings, beside the project's."""
+"""Folder of the recordings, next to the project's folder."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """A parameter's right value: ``within`` is the relative tolerance, ``errors`` the number of standard errors."""
+    """Right value of a parameter; ``within`` is the relative tolerance, ``errors`` the number of standard errors."""
 
     effect: str
     parameter: str
@@ -31,13 +31,13 @@ class Expected:
     """The accepted answers for a recording.
 
     Attributes:
-        names: groups of accepted effects; each group needs a claimed effect, or an alternative that the diagnosis says
-            it cannot rule out. None stands for a recording in which no effect may be claimed.
+        names: groups of accepted effects; each group needs a claimed effect, or an alternative that cannot be ruled
+            out. None: no effect may be claimed.
         places: substrings, one of which has to be in a channel of the claimed effect; empty for any place.
         refused: effects that may not be claimed.
         verdicts: accepted verdicts; empty for any.
         sizes: right values of parameters.
-        residual: output to the largest accepted root mean square of recording less open-loop simulation, in its unit.
+        residual: largest accepted RMS residual of the open-loop simulation, by output, in its unit.
         display_name: phrases of an advice or warning, all of which together are accepted in place of a claim.
     """
 
@@ -71,13 +71,13 @@ class Known:
 
     @property
     def file(self) -> Path:
-        """The simulation's file; the recording's own for a simulation of the library."""
+        """File of the simulation; that of the recording for a simulation of the library."""
         if self.simulation == MAGNETOMETER:
             return self.recording
         return Path(self.simulation.rpartition(":")[0] or self.simulation)
 
     def file_in(self, folder: Path) -> Path:
-        """The file to diagnose; what is cut is written into a folder."""
+        """Return the file to diagnose; cut columns are written into a folder."""
         if self.cut is None:
             return self.recording
         from mkc_torch.recording.recording import write_table
@@ -98,7 +98,7 @@ SYSTEMS = Path(__file__).resolve().parent / "dynamics" / "systems.py"
 
 _COLOURED = ("Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
 HEAVY = ("Bowling_Ball", "Golf_Ball")
-"""Balls whose drag is too small to be seen in a drop."""
+"""Balls whose drag is too small to be detected in a drop."""
 
 BALLS = ("Baseball", *_COLOURED, "Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2", *HEAVY)
 
@@ -115,7 +115,7 @@ def real(shared: Path = SHARED) -> Iterator[Known]:
     hidden_mass = Expected(((HIDDEN_STORE,),), verdicts=USEFUL)
     for number in (1, 2):
         yield _known(folder, "house", f"house_{number}.csv", "House", hidden_mass)
-    # this simulation has a lag of its own, which takes up the delay
+    # this simulation has a lag that absorbs the delay
     pan = Expected((("backlash",),), sizes=(Size("backlash", "half_gap", 0.010, within=0.1),), residual={"pan": 0.0029})
     yield _known(folder, "so101", "pan.csv", "Servo", pan)
     play = Expected(
@@ -163,7 +163,7 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
 
 
 def _simulated(folder: Path) -> Iterator[Known]:
-    """Six runs of a driven pendulum: nothing missing, driven by an unrecorded disturbance, or not to be followed."""
+    """Six runs of a driven pendulum: nothing missing, with a disturbance, or not explained by the simulation."""
     adequate, pushed, unfit = Expected(verdicts=("adequate",)), Expected(verdicts=("unexplained",)), ("unfit",)
     for name in ("held_input", "linear_input"):
         yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", adequate)
@@ -205,7 +205,7 @@ def first_drop(ball: str, drops: Path) -> Mapping[str, Any]:
 
 
 def multisine(table: Path) -> Mapping[str, Any]:
-    """The part of a multisine that the Silverbox is learned from."""
+    """The part of a multisine on which the Silverbox is trained."""
     found: Mapping[str, Any] = runpy.run_path(str(SYSTEMS))["silverbox"](table.parents[1]).train.columns
     return found
 

@@ -1,18 +1,19 @@
-"""Diagnoses of all recordings whose missing physics is known, in one table beside a fit by hand.
+"""Diagnoses of all recordings with known missing physics, in a table with fits by hand.
 
-The recordings, real and simulated, lie beside the project; one that is absent is named and left out. Columns:
+The recordings, real and simulated, are next to the project's folder; absent recordings are named and left out.
+Columns:
 
-    told       effects that are claimed, and whether the whole answer is right
+    claimed    effects that are claimed, and whether the whole answer is right
     located    share of the first finding's gain, share of the time in which it arises, and where; whether the place is
                right, where that is known
     size       parameters of the missing physics with standard error, and the fit by hand
-    bias       the simulation's own parameters, less those by hand
-    open loop  root mean square of recording less simulation running freely, before and after
-    bound      that of the fit by hand
+    bias       the simulation's own parameters, minus those by hand
+    open loop  RMS residual of the open-loop simulation, before and after
+    bound      RMS residual of the fit by hand
     CPU        seconds of the diagnosis
 
-A search that runs into `--limit` is stopped; its row has what was known then and says so. What the balls, the heaters,
-the Silverbox and the servo of `shared/data` predict of runs that are not diagnosed here, the folder `dynamics` shows.
+A search that reaches `--limit` is stopped; its row has the results so far and is marked. The folder `dynamics` shows
+predictions of unseen runs by the balls, the heaters, the Silverbox and the servo of `shared/data`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from known import SHARED, Known, cases, data, real
 
 from mkc_torch.challenge.verdict import CLAIMS
 
-COLUMNS = ("recording", "left out", "told", "located", "size", "bias", "open loop", "bound", "CPU, s")
+COLUMNS = ("recording", "left out", "claimed", "located", "size", "bias", "open loop", "bound", "CPU, s")
 
 
 NOTHING: Mapping[str, Any] = {
@@ -50,41 +51,41 @@ NOTHING: Mapping[str, Any] = {
 
 
 def recordings(shared: Path, only: str) -> Iterator[Known]:
-    """Known recordings with this text in their name; what is absent is printed by its file's name."""
-    for one in (*real(shared), *cases(shared), *data(shared)):
-        if only not in one.name:
+    """Return the known recordings with a text in their name; absent files are printed."""
+    for known in (*real(shared), *cases(shared), *data(shared)):
+        if only not in known.name:
             continue
-        absent = [str(file) for file in (one.recording, one.file) if not file.exists()]
+        absent = [str(file) for file in (known.recording, known.file) if not file.exists()]
         if absent:
             print(f"left out: {', '.join(dict.fromkeys(absent))} is absent", file=sys.stderr)
         else:
-            yield one
+            yield known
 
 
 def diagnosed(task: tuple[Known, Path, float]) -> tuple[str, dict[str, Any]]:
-    """The name and row of a recording, diagnosed in this process; a row that is there already is kept."""
-    one, output, limit_s = task
-    folder = output / re.sub(r"\W", "_", one.name)
+    """Return name and row of a recording, diagnosed in this process; an existing row is kept."""
+    known, output, limit_s = task
+    folder = output / re.sub(r"\W", "_", known.name)
     file = folder / "row.json"
     if not file.is_file():
         from row import write_row
 
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            write_row(one.file_in(folder), replace(one.request, time_limit=limit_s), folder)
-        except Exception as error:  # a fault of a recording costs its row, not the table
-            return one.name, {**NOTHING, "failed": f"{type(error).__name__}: {error}"}
+            write_row(known.file_in(folder), replace(known.request, time_limit=limit_s), folder)
+        except Exception as error:  # a failed recording costs its row, not the table
+            return known.name, {**NOTHING, "failed": f"{type(error).__name__}: {error}"}
     found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return one.name, found
+    return known.name, found
 
 
-def line(one: Known, row: Mapping[str, Any], hand: ByHand) -> list[str]:
-    """The table's row of a recording."""
-    right = judged(row, one.expected)["right"]
+def line(known: Known, row: Mapping[str, Any], hand: ByHand) -> list[str]:
+    """Return the row of a recording in the table."""
+    right = judged(row, known.expected)["right"]
     claimed = [found for found in row["findings"] if found["grade"] in CLAIMS]
     names = ", ".join(found["effect"].replace("_", " ") for found in claimed) or row["verdict"] or "no answer"
     return [
-        one.name,
+        known.name,
         hand.left_out,
         f"{names} ({'right' if right else 'wrong'}){stopped(row)}",
         located(claimed, hand),
@@ -97,13 +98,13 @@ def line(one: Known, row: Mapping[str, Any], hand: ByHand) -> list[str]:
 
 
 def stopped(row: Mapping[str, Any]) -> str:
-    """That the search was stopped, and after how long."""
-    told = row.get("stopped")
-    return f", search stopped after {told['seconds']:.0f} s" if told else ""
+    """Return a note if the search was stopped, with its time."""
+    stop = row.get("stopped")
+    return f", search stopped after {stop['seconds']:.0f} s" if stop else ""
 
 
 def located(claimed: Sequence[Mapping[str, Any]], hand: ByHand) -> str:
-    """Where the first finding's gain arises."""
+    """Return the region in which the gain of the first finding arises."""
     region = next((found["region"] for found in claimed if found.get("region")), None)
     if region is None:
         return "-"
@@ -114,7 +115,7 @@ def located(claimed: Sequence[Mapping[str, Any]], hand: ByHand) -> str:
 
 
 def sizes(row: Mapping[str, Any], hand: ByHand) -> str:
-    """Sizes with standard errors beside those by hand."""
+    """Return sizes with standard errors, and those by hand."""
     parts = []
     for (effect, name), value in hand.sizes.items():
         found = [p for entry in row["findings"] if entry["effect"] == effect for p in entry["parameters"]]
@@ -126,14 +127,14 @@ def sizes(row: Mapping[str, Any], hand: ByHand) -> str:
 
 
 def bias(parameters: Mapping[str, float], hand: ByHand) -> Iterator[str]:
-    """Relative differences of the simulation's parameters to those by hand."""
+    """Return relative differences of the simulation's parameters from those by hand."""
     for name, value in hand.parameters.items():
         if name in parameters:
             yield f"{name} {(parameters[name] - value) / value:+.1%}"
 
 
 def open_loop(row: Mapping[str, Any]) -> Iterator[str]:
-    """Residuals of the open loop by output, before and after."""
+    """Return open-loop residuals by output, before and after."""
     for output, before in row["residual_before"].items():
         after = row["residual_after"].get(output)
         numbers = [f"{value:.3g}" for value in (before, after) if value is not None]
@@ -143,22 +144,24 @@ def open_loop(row: Mapping[str, Any]) -> Iterator[str]:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=SHARED, help="folder with real, cases and data")
-    parser.add_argument("--only", default="", help="recordings whose name has this text in it")
-    parser.add_argument("--output", type=Path, default=Path("known"), help="folder; rows that are there are kept")
+    parser.add_argument("--only", default="", help="only recordings with this text in their name")
+    parser.add_argument(
+        "--output", type=Path, default=Path("known"), help="folder; existing rows are kept"
+    )
     parser.add_argument("--limit", type=float, default=300.0, help="seconds after which each search is stopped")
     options = parser.parse_args(arguments)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that begin below
-    chosen = {one.name: one for one in recordings(options.data, options.only)}
-    tasks = [(one, options.output, options.limit) for one in chosen.values()]
+    chosen = {known.name: known for known in recordings(options.data, options.only)}
+    tasks = [(known, options.output, options.limit) for known in chosen.values()]
     rows: dict[str, dict[str, Any]] = {}
     with multiprocessing.get_context("spawn").Pool(2, maxtasksperchild=1) as pool:
         for name, row in pool.imap_unordered(diagnosed, tasks):
             rows[name] = row
             print(f"{len(rows)}/{len(tasks)} {name}: {row['verdict']}, {row['cpu_seconds']} s", file=sys.stderr)
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * (len(COLUMNS) - 1)}---:|")
-    for name, one in chosen.items():
-        print(f"| {' | '.join(line(one, rows[name], BY_HAND.get(name, ByHand())))} |")
-    wrong = {name: judged(rows[name], one.expected)["wrong"] for name, one in chosen.items()}
+    for name, known in chosen.items():
+        print(f"| {' | '.join(line(known, rows[name], BY_HAND.get(name, ByHand())))} |")
+    wrong = {name: judged(rows[name], known.expected)["wrong"] for name, known in chosen.items()}
     seconds = sum(row["cpu_seconds"] or 0.0 for row in rows.values())
     print(f"\n{sum(not faults for faults in wrong.values())} of {len(rows)} right, {seconds:.0f} CPU seconds")
     for name, faults in wrong.items():

@@ -1,4 +1,4 @@
-"""A diagnosis as a row: what it says, in the few numbers that are judged and compared, and what it took."""
+"""A diagnosis as a row: the numbers that are judged and compared, and its cost."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _ALTERNATIVE = ("effect", "drivers", "separable")
 
 
 def row(folder: Path, recording: Path, request: Request) -> dict[str, Any]:
-    """The row of a diagnosis in a folder; ``verdict`` is "" where there is none.
+    """Return the row of a diagnosis in a folder; ``verdict`` is "" if there is none.
 
     Args:
-        folder: with ``diagnosis.json`` and ``model.json``.
-        recording: the file that was diagnosed.
-        request: what was asked of it.
+        folder: folder of ``diagnosis.json`` and ``model.json``.
+        recording: the diagnosed file.
+        request: options of the diagnosis.
     """
     content = content_of(folder / "diagnosis.json") or {}
     fits = content.get("goodness_of_fit") or {}
@@ -43,7 +43,7 @@ def row(folder: Path, recording: Path, request: Request) -> dict[str, Any]:
 
 
 def finding(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A finding of ``diagnosis.json`` with the alternatives and parameters that are judged.
+    """Return the judged parts of a finding of ``diagnosis.json``.
 
     Example:
         >>> finding({"effect": "backlash"})["parameters"]
@@ -57,25 +57,25 @@ def finding(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parameters(model: Path, request: Request) -> dict[str, float]:
-    """The simulation's own parameters as fitted with the findings, by name."""
+    """Return the simulation's own parameters, fitted with the findings, by name."""
     if not model.is_file() or request.simulated is not None or request.simulation == MAGNETOMETER:
         return {}
     values = json.loads(model.read_text(encoding="utf-8"))["parameters"]
     names = getattr(simulation_of(request), "parameters", {})
-    return dict(zip(names, values, strict=False))  # first states follow
+    return dict(zip(names, values, strict=False))  # initial states follow
 
 
 def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, float | None]:
-    """Root mean square of recording less open-loop simulation with the findings, by output.
+    """Return the RMS residual of the open-loop simulation with the findings, by output.
 
-    Empty for a magnetometer, whose corrected field has no recorded counterpart, and where no model was written.
+    Empty for a magnetometer, whose corrected field has no recorded counterpart, and without a model.
     """
     if not model.is_file() or (request.simulated is None and request.simulation == MAGNETOMETER):
         return {}
     table = Recording.read(recording, recognise=False)
     try:
         simulated = correct(read_correction(model, simulation_of(request)), table).columns
-    except ValueError:  # a model that does not carry over
+    except ValueError:  # a model that does not transfer
         return {}
     outputs = [name for name in simulated if name not in ("time", "experiment") and name in table]
     found = {}
@@ -87,9 +87,9 @@ def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, floa
 
 
 def write_row(recording: Path, request: Request, folder: Path) -> None:
-    """Diagnose in this process, one thread, and write ``row.json`` beside ``diagnosis.json`` and ``model.json``.
+    """Diagnose in this process, one thread, and write ``row.json``, ``diagnosis.json`` and ``model.json``.
 
-    The row also has CPU and wall seconds and the greatest memory of the process; ``failed`` says why there is no
+    The row also has CPU and wall seconds and the peak memory of the process; ``failed`` is the error of a failed
     diagnosis.
     """
     from mkc_torch._parallel.pool import allow_copies
@@ -111,11 +111,11 @@ def write_row(recording: Path, request: Request, folder: Path) -> None:
     }
     failed = "; ".join(outcome.text for outcome in outcomes if outcome.failed)
     found = row(folder, recording, request) | ({"failed": failed} if failed else {}) | seconds
-    folder.mkdir(parents=True, exist_ok=True)  # a diagnosis that fails leaves no empty folder
+    folder.mkdir(parents=True, exist_ok=True)  # a failed diagnosis leaves no folder
     (folder / "row.json").write_text(json.dumps(found), encoding="utf-8")
 
 
 def _cpu_seconds() -> float:
-    """User and system time of this process and of its children that have ended."""
+    """Return user and system time of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(part.ru_utime + part.ru_stime for part in used)

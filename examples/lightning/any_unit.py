@@ -1,6 +1,6 @@
-"""Targets of any unit and offset, and a fifth of them wrong: the loss as it comes, with nothing set.
+"""Targets of any unit and offset, a fifth of them wrong: the loss with its default settings.
 
-The network's last step is the unit of the target, as a model of a physical quantity has it; the loss is told nothing.
+The last layer of the network has the unit of the target, as in a model of a physical quantity; the loss has not.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SCALES, OFFSETS = (1e-6, 1e-3, 1.0, 1e3, 1e6), (0.0, 100.0)
 
 
 class InUnit(nn.Module):
-    """A perceptron times a unit, plus an offset."""
+    """A perceptron whose output is scaled by a unit and shifted by an offset."""
 
     def __init__(self, scale: float, offset: float) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class InUnit(nn.Module):
 
 
 def drawn(seed: int, share: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Inputs, the truth, and targets of which a share is anywhere within ten."""
+    """Draw inputs, the truth, and targets of which a share is uniform in [-10, 10]."""
     g = torch.Generator().manual_seed(seed)
     x = torch.rand(ROWS, 3, generator=g)
     truth = torch.sin(4.0 * x[:, :1]) + x[:, 1:2] * x[:, 2:]
@@ -43,7 +43,7 @@ def drawn(seed: int, share: float) -> tuple[Tensor, Tensor, Tensor]:
 def error(
     loss: nn.Module, seed: int, share: float, scale: float = 1.0, offset: float = 0.0, *, steps: int = STEPS
 ) -> float:
-    """Root mean square error against the truth after training, over the scale."""
+    """Return the RMS error against the truth after training, over the scale."""
     x, truth, target = drawn(seed, share)
     torch.manual_seed(seed)
     model = InUnit(scale, offset * scale)

@@ -2,14 +2,13 @@
 
     python examples/lightning/bursty_series.py [--seeds 5] [--share 0.2] [--output PICTURE.png]
 
-The Mackey-Glass equation, a sensor's noise of 5 %, and bursts that lift 20 % of the samples. A perceptron learns from
-windows of 24 samples as recorded, bursts included, what was recorded 1, 2, 4 and 8 steps later. Prints the root mean
-square error of each loss against the undisturbed series that follows, in its standard deviations and as mean ± standard
-error over seeds: from quiet windows, and from windows with as many bursts as in training; then what it loses where no
-burst was.
+The Mackey-Glass equation with sensor noise of 5 %, and bursts that lift 20 % of the samples. A perceptron learns from
+recorded windows of 24 samples, bursts included, to predict the recording 1, 2, 4 and 8 steps later. Prints the RMS
+error of each loss against the undisturbed series that follows, in standard deviations of the series, as mean ±
+standard error over seeds: from quiet windows, from windows with as many bursts as in training, and without bursts.
 
-A window with a burst in it says less of what follows, so the noise differs from window to window. The rows "each
-window" have a head that predicts it.
+A window with a burst predicts less well, so the noise differs between windows. The rows "each window" have a head
+that predicts the noise.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class StudentTHeadLoss(nn.Module):
 
 
 class MKCHeadLoss(nn.Module):
-    """MKC's negative log-likelihood of what an MKCHead predicts."""
+    """Negative log-likelihood of MKC with the parameters that an MKCHead predicts."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -101,7 +100,7 @@ def mackey_glass(samples: int, seed: int) -> Tensor:
 
 
 def bursts(samples: int, share: float, generator: torch.Generator) -> Tensor:
-    """Rectified noise in gates of 3 to 10 samples, of a strength of 2 to 8 each; 0 between them."""
+    """Draw bursts of rectified noise: 3 to 10 samples long, strength 2 to 8; 0 between them."""
     out = torch.zeros(samples)
     while int((out > 0.0).sum()) < share * samples:
         length = int(torch.randint(3, 11, (1,), generator=generator))
@@ -113,7 +112,7 @@ def bursts(samples: int, share: float, generator: torch.Generator) -> Tensor:
 
 @dataclass(frozen=True)
 class Series:
-    """A series and its recording, (samples,); `interference` is 0 where no burst was."""
+    """A series and its recording, (samples,); `interference` is 0 outside bursts."""
 
     clean: Tensor
     quiet: Tensor
@@ -125,7 +124,7 @@ class Series:
 
 
 def sample(share: float, seed: int) -> tuple[Series, Series]:
-    """The series to train on and the one that follows."""
+    """Return the training series, and the series that follows it."""
     generator = torch.Generator().manual_seed(seed)
     clean = mackey_glass(TRAINING + HELD_OUT, seed)
     quiet_recording = clean + NOISE * torch.randn(len(clean), generator=generator)
@@ -135,18 +134,18 @@ def sample(share: float, seed: int) -> tuple[Series, Series]:
 
 
 def windows(series: Tensor) -> Tensor:
-    """Each window that has all its targets, (windows, WINDOW)."""
+    """Return the windows with complete targets, (windows, WINDOW)."""
     return series[: -max(AHEAD)].unfold(0, WINDOW, 1)
 
 
 def ahead(series: Tensor) -> Tensor:
-    """What follows each window, (windows, AHEAD)."""
+    """Return the targets of each window, (windows, AHEAD)."""
     last = torch.arange(WINDOW - 1, len(series) - max(AHEAD))
     return torch.stack([series[last + h] for h in AHEAD], -1)
 
 
 def trained(name: str, share: float, seed: int, epochs: int = EPOCHS) -> Regression:
-    """The network after training with a loss on the first series."""
+    """Train the network with a loss on the first series."""
     series, _ = sample(share, seed)
     target = ahead(series.recorded)
     if name == ORACLE:
@@ -159,13 +158,13 @@ def trained(name: str, share: float, seed: int, epochs: int = EPOCHS) -> Regress
 
 @torch.no_grad()
 def forecast(module: Regression, series: Tensor) -> Tensor:
-    """What is expected after each window, (windows, AHEAD)."""
+    """Return the forecasts of each window, (windows, AHEAD)."""
     out = module.net(windows(series))
     return out[0] if isinstance(out, tuple) else out
 
 
 def errors(module: Regression, share: float, seed: int) -> Tensor:
-    """Root mean square against the clean series that follows, from quiet windows and disturbed ones, (2, AHEAD)."""
+    """Return the RMS errors against the clean series, from quiet and from disturbed windows, (2, AHEAD)."""
     _, series = sample(share, seed)
     truth = ahead(series.clean)
     found = [forecast(module, recording) - truth for recording in (series.quiet, series.recorded)]
@@ -173,7 +172,7 @@ def errors(module: Regression, share: float, seed: int) -> Tensor:
 
 
 def table(share: float, seeds: int) -> dict[str, Tensor]:
-    """Print the losses side by side; their errors with bursts, (seeds, 2, AHEAD)."""
+    """Print a table of the losses. Returns their errors with bursts, (seeds, 2, AHEAD)."""
     print(f"{share:.0%} of the samples in bursts, {seeds} seeds, {EPOCHS} epochs")
     print(f"{'':24}{'from quiet windows':^32}{'from disturbed windows':^32}{'no burst,':>16}")
     print(f"{'steps ahead':24}" + 2 * f"{AHEAD[0]:>16}{AHEAD[-1]:>16}" + f"{'over MSE':>16}")
@@ -196,7 +195,7 @@ def table(share: float, seeds: int) -> dict[str, Tensor]:
 
 
 def picture(path: str, disturbed: dict[str, Tensor], share: float) -> None:
-    """What MKC-EM believes of the recording, forecasts of a quiet stretch that it has not seen, and the errors."""
+    """Draw the weights of MKC-EM, forecasts of an unseen quiet stretch, and the errors."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 8.0), layout="constrained")
@@ -213,7 +212,7 @@ def picture(path: str, disturbed: dict[str, Tensor], share: float) -> None:
     dots = recording.scatter(
         time, series.recorded[time], c=weight[stretch], s=14.0, cmap="coolwarm_r", vmin=0.0, vmax=1.0, label="recorded"
     )
-    recording.set_title("how far MKC-EM believes each sample, one step ahead of it", loc="left")
+    recording.set_title("weight of each sample in MKC-EM, one step ahead", loc="left")
     recording.set_xlabel("time")
     recording.set_ylabel("standard deviations")
     low, high = recording.get_ylim()

@@ -1,11 +1,11 @@
-"""Two tables with 20 % of the training targets two to ten times too large: the error on held-out rows that are right.
+"""Two tables with 20 % of the training targets two to ten times too large: the error on clean held-out rows.
 
     python examples/lightning/corrupted_tabular.py [--seeds 10] [--share 0.2] [--output PICTURE.png]
 
 Diabetes progression (442 patients, ships with scikit-learn) and Friedman's first function (1000 rows, noise 1). Prints
-the root mean square error of each loss, and its ratio to that of the mean squared error on the same rows without the
-wrong ones, both as mean ± standard error over seeds: each has a split, wrong rows and a network of its own. Then what a
-loss costs where no target is wrong, and which ones MKC takes for wrong.
+the RMS error of each loss, and its ratio to that of the mean squared error without the wrong rows, as mean ± standard
+error over seeds; each seed has its own split, wrong rows and network. Then the cost of a loss without wrong targets,
+and the targets that MKC flags.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ NAMES = (*losses(1, 2.0), LINEAR, ORACLE)
 
 @dataclass(frozen=True)
 class Table:
-    """Rows to train on with targets as recorded, and held-out rows with targets as they are.
+    """Training rows with recorded targets, and held-out rows with true targets.
 
-    ``wrong`` says which recorded targets are not right: for the oracle and the score alone.
+    ``wrong`` is the mask of wrong targets, for the oracle and the score only.
     """
 
     x: Tensor
@@ -41,7 +41,7 @@ class Table:
 
 
 def corrupted(x: Tensor, y: Tensor, new_x: Tensor, new_y: Tensor, share: float, seed: int) -> Table:
-    """That share of the training targets two to ten times what they were; columns standardised."""
+    """Multiply a share of the training targets by 2 to 10, and standardise the columns."""
     generator = torch.Generator().manual_seed(seed)
     wrong = torch.rand(len(y), generator=generator) < share
     recorded = torch.where(wrong, (2.0 + 8.0 * torch.rand(len(y), generator=generator)) * y, y)
@@ -66,7 +66,7 @@ def friedman(share: float, seed: int) -> Table:
 
 @dataclass(frozen=True)
 class Task:
-    """A table with the width, weight decay and epochs that suited the mean squared error on its clean targets."""
+    """A table with the width, weight decay and epochs that are best for the mean squared error on clean targets."""
 
     draw: Callable[[float, int], Table]
     width: int
@@ -82,7 +82,7 @@ TASKS = {
 
 @dataclass
 class Outcome:
-    """What one run came to: the held-out error, and of MKC its loss and what it makes of each training row."""
+    """Result of a run: the held-out error; for MKC also its loss and the weight of each training row."""
 
     error: float
     criterion: nn.Module | None = None
@@ -93,7 +93,7 @@ class Outcome:
 
 
 def outcome(task: Task, name: str, share: float, seed: int) -> Outcome:
-    """Train with a loss; targets are in units of their median absolute deviation for every one."""
+    """Train with a loss; the targets are in units of their median absolute deviation."""
     table = task.draw(share, seed)
     centre = table.y.median()
     scale = 1.4826 * (table.y - centre).abs().median()
@@ -107,7 +107,7 @@ def outcome(task: Task, name: str, share: float, seed: int) -> Outcome:
         return Outcome(error_of(torch.tensor(linear.predict(table.held_out_x.numpy()))))
     torch.manual_seed(seed)
     net = perceptron(table.x.shape[1], task.width, task.width, 1)
-    # no prediction among the targets is farther from one of them
+    # the largest error of a prediction within the range of the targets
     makers = losses(1, bound=float(y.max() - y.min()))
     module = Regression(net, makers["MSE" if name == ORACLE else name](), weight_decay=task.weight_decay, annealed=True)
     used = ~table.wrong if name == ORACLE else torch.ones_like(table.wrong)
@@ -127,12 +127,12 @@ Outcomes = dict[str, list[Outcome]]
 
 
 def ratio(outcomes: Outcomes, name: str, reference: str) -> tuple[float, float]:
-    """Mean over seeds, and its standard error, of a loss's error over that of another on the same rows."""
+    """Return mean and standard error over seeds of the ratio of two losses' errors on the same rows."""
     return mean_and_error([a.error / b.error for a, b in zip(outcomes[name], outcomes[reference], strict=True)])
 
 
 def report(title: str, bad: Outcomes, good: Outcomes, share: float) -> None:
-    """Print the losses side by side."""
+    """Print a table of the losses."""
     print(f"\n{title}, {len(good['MSE'])} seeds")
     print(f"{'':26}{f'{share:.0%} wrong targets':^36}{'no wrong target':^18}")
     print(f"{'':26}{'error':>18}{'over oracle':>18}{'over MSE':>18}")
@@ -150,7 +150,7 @@ def report(title: str, bad: Outcomes, good: Outcomes, share: float) -> None:
 
 
 def picture(path: str, bad: dict[str, Outcomes], good: dict[str, Outcomes], share: float) -> None:
-    """Errors of each loss, and how far MKC-EM believes each recorded target of the first seed."""
+    """Draw the errors of each loss, and the weights of MKC-EM for the targets of the first seed."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 7.5), layout="constrained")
@@ -187,7 +187,7 @@ def picture(path: str, bad: dict[str, Outcomes], good: dict[str, Outcomes], shar
             )
             weights.plot([], [], marker, color="0.5", label=label)
         weights.set_yscale("log")
-        weights.set_title("how far MKC-EM believes each training target", loc="left")
+        weights.set_title("weight of each training target in MKC-EM", loc="left")
         weights.set_ylim(top=4.0 * float(table.y.max()))  # room for the legend
         weights.set_xlabel("predicted target")
         weights.set_ylabel("recorded target")

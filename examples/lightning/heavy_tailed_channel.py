@@ -29,7 +29,7 @@ def clean(x: Tensor) -> Tensor:
 
 
 def sample(share: float, seed: int) -> tuple[Tensor, Tensor]:
-    """Inputs and targets; that share of the second channel's targets is 1 to 10 too high."""
+    """Draw inputs and targets; a share of the second channel's targets is 1 to 10 too high."""
     generator = torch.Generator().manual_seed(seed)
     x = 2.0 * torch.rand(SAMPLES, 4, generator=generator) - 1.0
     y = clean(x) + NOISE * torch.randn(SAMPLES, 2, generator=generator)
@@ -39,7 +39,7 @@ def sample(share: float, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def trained(name: str, share: float, seed: int, epochs: int) -> Regression:
-    """The network after training with a loss."""
+    """Train the network with a loss."""
     torch.manual_seed(seed)
     module = Regression(perceptron(4, 64, 64, 2), LOSSES[name]())
     train(module, *sample(share, seed), epochs=epochs)
@@ -48,14 +48,14 @@ def trained(name: str, share: float, seed: int, epochs: int) -> Regression:
 
 @torch.no_grad()
 def errors(module: Regression) -> Tensor:
-    """Root mean square against the clean function of both channels, on inputs of its own (2,)."""
+    """Return the RMS error of both channels (2,) against the clean function, on new inputs."""
     x = 2.0 * torch.rand(4000, 4, generator=torch.Generator().manual_seed(10_000)) - 1.0
     out: Tensor = (module.net(x) - clean(x)).square().mean(0).sqrt()
     return out
 
 
 def table(share: float, seeds: int, epochs: int) -> None:
-    """Print the losses side by side."""
+    """Print a table of the losses."""
     print(f"\n{share:.0%} one-sided outliers in the second channel, {seeds} seeds, {epochs} epochs")
     print(f"{'loss':16} {'clean channel':>14} {'dirty channel':>14} {'both, over MSE':>15}")
     reference = 0.0
@@ -72,7 +72,7 @@ def table(share: float, seeds: int, epochs: int) -> None:
 
 
 def curve(path: str, seeds: int, epochs: int) -> None:
-    """Errors over the share of outliers, as a picture."""
+    """Draw the errors over the share of outliers."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")

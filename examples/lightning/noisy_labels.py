@@ -2,7 +2,7 @@
 
     python examples/lightning/noisy_labels.py [--seeds 5] [--epochs 60] [--output PICTURE.png]
 
-Prints a table, and what the graduated loss says of single training labels; ``--output`` writes the picture.
+Prints a table, and the weights of wrong and right training labels; ``--output`` writes the picture.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ LOSSES: dict[str, Callable[[], nn.Module]] = {
 
 
 class Digits(NamedTuple):
-    """Images (N, 64) in [0, 1] to learn from, with labels as given and as they are, and those to test on."""
+    """Training images (N, 64) in [0, 1] with given and true labels, and test images."""
 
     images: Tensor
     given: Tensor
@@ -67,7 +67,7 @@ class Digits(NamedTuple):
 
 
 def digits(share: float, seed: int) -> Digits:
-    """A split of the 1797 images; that share of the training labels is another digit, each as likely."""
+    """Split the 1797 images; a share of the training labels becomes another digit at random."""
     generator = torch.Generator().manual_seed(seed)
     data, target = load_digits(return_X_y=True)
     order = torch.randperm(len(target), generator=generator)
@@ -79,7 +79,7 @@ def digits(share: float, seed: int) -> Digits:
 
 
 class Classifier(LightningModule):
-    """A perceptron large enough to memorise its labels; the error on right labels is kept after each epoch."""
+    """A perceptron large enough to memorise its labels; it records the test error after each epoch."""
 
     def __init__(self, criterion: nn.Module, graduated: bool, test: tuple[Tensor, Tensor]) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class Classifier(LightningModule):
 
 
 def trained(name: str, data: Digits, seed: int, epochs: int) -> Classifier:
-    """The network after training with a loss."""
+    """Train the network with a loss."""
     torch.manual_seed(seed)
     module = Classifier(LOSSES[name](), name == GRADUATED, (data.test_images, data.test_labels))
     loader = DataLoader(TensorDataset(data.images, data.given), batch_size=64, shuffle=True)
@@ -123,7 +123,7 @@ def trained(name: str, data: Digits, seed: int, epochs: int) -> Classifier:
 
 @torch.no_grad()
 def doubted(module: Classifier, data: Digits) -> tuple[float, float]:
-    """Shares of the wrong and of the right training labels whose weight is below 0.1; NaN if there is none."""
+    """Return the shares of wrong and right training labels with a weight below 0.1; NaN without such labels."""
     assert isinstance(module.criterion, GeneralizedCrossEntropyLoss)
     low = (module.criterion.inlier_weight(module.net(data.images), data.given) < 0.1).double()
     wrong = data.given != data.true
@@ -131,7 +131,7 @@ def doubted(module: Classifier, data: Digits) -> tuple[float, float]:
 
 
 def table(seeds: int, epochs: int) -> dict[str, dict[float, Tensor]]:
-    """Print the losses side by side; the errors (seeds, epochs) by loss and share of wrong labels."""
+    """Print a table of the losses. Returns errors (seeds, epochs) by loss and share of wrong labels."""
     print(f"error on right labels after {epochs} epochs, {seeds} seeds, mean ± standard error (%)")
     print(f"{'wrong labels':26}" + "".join(f"{share:>14.0%}" for share in SHARES))
     found: dict[str, dict[float, Tensor]] = {}
@@ -167,7 +167,7 @@ def row(name: str, errors: list[Tensor]) -> None:
 
 
 def picture(path: str, found: dict[str, dict[float, Tensor]]) -> None:
-    """Errors over the share of wrong labels, and over the epochs at 40 % of them."""
+    """Draw the errors over the share of wrong labels, and over the epochs at 40 %."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.4), layout="constrained")

@@ -1,4 +1,4 @@
-"""What the examples of losses in networks share: the peers of MKC, and one way to train with each of them."""
+"""Shared by the examples: the losses compared with MKC, and the training."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ class AdaptiveLoss(nn.Module):
 
 
 def losses(num_channels: int, bound: float) -> dict[str, Callable[[], nn.Module]]:
-    """Makers of the losses to be compared, each as its documentation starts it.
+    """Return constructors of the compared losses, with the defaults of their documentation.
 
     Args:
-        num_channels: the number of outputs.
-        bound: that of MKC, in the unit of the targets: what an error can physically reach.
+        num_channels: number of outputs.
+        bound: bound of MKC in the unit of the targets: the largest possible error.
     """
     return {
         "MSE": nn.MSELoss,
@@ -97,13 +97,13 @@ def losses(num_channels: int, bound: float) -> dict[str, Callable[[], nn.Module]
 
 
 class Regression(LightningModule):
-    """A network with the loss to be tried; the loss's own parameters are learned with it, if it has any.
+    """A network and its loss; learnable parameters of the loss are trained, too.
 
     Args:
         net: the network; its output is what the loss takes first.
         criterion: the loss.
-        weight_decay: of the network's weights alone.
-        annealed: whether the learning rate falls to 0 along a cosine, or stays.
+        weight_decay: weight decay of the network only.
+        annealed: whether the learning rate follows a cosine to 0, or is constant.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ def perceptron(*sizes: int) -> nn.Sequential:
 
 
 def train(module: Regression, x: Tensor, y: Tensor, *, epochs: int) -> None:
-    """Train on batches of 64; an MKC loss that does not learn σ and d by itself takes the callback of MKC-EM."""
+    """Train on batches of 64; an MKC loss with fixed σ and d uses the callback of MKC-EM."""
     owns = isinstance(module.criterion, MKCLoss) and not list(module.criterion.parameters())
     callbacks: list[Callback] = [MKCExpectationMaximization(log=False)] if owns else []
     trainer = Trainer(
@@ -155,13 +155,13 @@ def train(module: Regression, x: Tensor, y: Tensor, *, epochs: int) -> None:
 
 
 def quiet() -> None:
-    """One thread, since the arrays are small, and none of Lightning's advice."""
+    """Use one thread, because the arrays are small, and silence Lightning's hints."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
     torch.set_num_threads(1)
 
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over seeds and its standard error, which is NaN for one seed."""
+    """Return the mean over seeds and its standard error, NaN for one seed."""
     each = torch.tensor(values, dtype=torch.float64)
     return float(each.mean()), float(each.std()) / math.sqrt(len(values)) if len(values) > 1 else math.nan

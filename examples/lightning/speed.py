@@ -1,4 +1,4 @@
-"""Forward and backward of the loss beside PyTorch's own, timed in turns in one run.
+"""Time of forward and backward passes of the loss and of PyTorch's losses, interleaved in one run.
 
     python examples/lightning/speed.py [--device cpu] [--rounds 15]
 
@@ -31,7 +31,7 @@ def milliseconds(step: Callable[[], None], times: int, device: torch.device) -> 
 def measured(
     losses: dict[str, nn.Module], rows: int, times: int, rounds: int, device: torch.device
 ) -> dict[str, float]:
-    """Median time of a forward and backward pass of each loss, the losses taking turns."""
+    """Return the median time of a forward and backward pass of each loss; the losses are interleaved."""
     generator = torch.Generator().manual_seed(0)
     target = torch.randn(rows, 4, generator=generator).to(device)
     input = (target + torch.randn(rows, 4, generator=generator).to(device)).requires_grad_()

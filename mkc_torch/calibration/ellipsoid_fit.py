@@ -35,10 +35,10 @@ from mkc_torch.calibration.ellipsoid_errors import derived_slopes
 from mkc_torch.calibration.noise_effect import Bias, algebraic_rows, bias_by_noise, distance_rows, moments_of
 from mkc_torch.calibration.not_identifiable import (
     NotIdentifiableError,
-    middle_of,
-    not_identifiable,
     equal_points_message,
     flat_points_message,
+    middle_of,
+    not_identifiable,
 )
 from mkc_torch.calibration.points import MIN_POINTS, prepared, refuse_no_points
 from mkc_torch.linear import MKCRegression, RankDeficientError
@@ -343,12 +343,12 @@ class EllipsoidFit(Fitted):
         directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[:2]), strict=True)]
         found = [coverage(d) for d in directions]
         self.coverage_: Coverage | list[Coverage] = found[0] if field.dim() == 2 else found
-        for index, found_coverage in enumerate(found):
+        for index, covered in enumerate(found):
             where = _problem(index, field.dim() > 2)
-            if found_coverage.information < MIN_INFORMATION:
+            if covered.information < MIN_INFORMATION:
                 raise not_identifiable(
                     f"{where}Not identifiable: too few directions are covered to separate the offset from the shape "
-                    f"({found_coverage.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed).",
+                    f"({covered.information:.1e} of the information of even coverage; {MIN_INFORMATION:g} is needed).",
                     directions[index],
                 )
             if MAX_STANDARD_ERROR < errors[0][index] < math.inf:
@@ -411,8 +411,8 @@ class EllipsoidFit(Fitted):
                 less = "" if self.finish else '; finish="maximum_likelihood" has a smaller bias'
                 raise not_identifiable(
                     f"{_problem(index, len(errors) > 1)}Not identifiable: {what} points that scatter about the "
-                    f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. Including the bias by that scatter, the centre "
-                    f"or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
+                    f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. Including the bias by that scatter, "
+                    f"the centre or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
                     f"{100.0 * MAX_STANDARD_ERROR:.0f} %{less}.",
                     directions[index],
                 )
@@ -422,10 +422,10 @@ class EllipsoidFit(Fitted):
         wide = (scatter > self.max_scatter).nonzero().flatten()
         if len(wide) > 0:
             raise NotIdentifiableError(
-                f"{_problem(int(wide[0]), field.dim() > 2)}Not identifiable: the points do not form a surface. They scatter "
-                f"about the ellipsoid by {100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
-                f"{100.0 * self.max_scatter:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
-                "through all directions."
+                f"{_problem(int(wide[0]), field.dim() > 2)}Not identifiable: the points do not form a surface. They "
+                f"scatter about the ellipsoid by {100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, "
+                f"more than {100.0 * self.max_scatter:.0f} %, like the noise of a sensor that hardly turns. Turn the "
+                "sensor through all directions."
             )
 
 

@@ -28,8 +28,8 @@ _LONGER = 4.0
 """Smallest ratio to the longest usual repeat; a log that is written faster than the sensor samples has many repeats."""
 
 _JUMP = 1.5
-"""Smallest ratio of a jump after a repeat to the 99th percentile of usual moves. A sensor that rested continues where it
-was; a sensor that froze has moved."""
+"""Smallest ratio of a jump after a repeat to the 99th percentile of usual moves. A sensor that rested continues where
+it was; a sensor that froze has moved."""
 
 _STEPS = 5.0
 """Smallest jump, in digital steps."""

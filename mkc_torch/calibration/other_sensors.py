@@ -80,8 +80,8 @@ def accelerometer(recording: Recording, calibrate: Callable[[Recording], Calibra
     warnings = found.warnings
     if found.unit == "m/s²" and not _GRAVITY[0] < found.radius < _GRAVITY[1]:
         warnings = (
-            f"The radius of the ellipsoid is {found.radius:.3g} m/s², which is not gravity; the columns may be in g, or "
-            "in counts. The corrected acceleration is still in m/s²; offset and semi-axes are in the columns' own unit.",
+            f"The radius of the ellipsoid is {found.radius:.3g} m/s², which is not gravity; the columns may be in g or "
+            "counts. The corrected acceleration is still in m/s²; offset and semi-axes are in the columns' own unit.",
             *warnings,
         )
     return dataclasses.replace(found, warnings=warnings, field_unit="m/s²", sensor="accel")

@@ -57,7 +57,7 @@ def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tupl
     Example:
         >>> row = torch.arange(1, 1001)
         >>> disturbed_places(Recording({"mag_x": row}), (row > 200) & (row <= 350))
-        (Interval(start=201.0, end=350.0),)
+        (RejectedInterval(start=201.0, end=350.0),)
     """
     if recording.time is not None:
         return disturbed_intervals(recording.time, rejected)

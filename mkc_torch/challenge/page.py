@@ -68,14 +68,14 @@ def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str,
     lines += ["", "| hidden | named first |", "|---|---|"]
     for hidden, row in score.confusion.items():
         counts = ", ".join(f"{name} {count}" for name, count in sorted(row.items(), key=lambda item: -item[1]))
-        lines.append(f"| {hidden} | {told} |")
+        lines.append(f"| {hidden} | {counts} |")
     return "\n".join(lines) + "\n"
 
 
 def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, list[str]]]:
     """Return the rows that compare the diagnosis with the baselines; a row without recordings is left out."""
     scores = [score, *baselines.values()]
-    asked: Sequence[tuple[str, Callable[[Score], Share]]] = (
+    shares: Sequence[tuple[str, Callable[[Score], Share]]] = (
         ("false alarms on empty recordings", lambda s: s.false_alarms),
         ("named right, z and z_sep ≥ 10", lambda s: s.named),
         ("driver right", lambda s: s.driver),
@@ -83,14 +83,14 @@ def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, 
         ("named right with the driver withheld", lambda s: s.withheld_named),
         ("more findings than effects", lambda s: s.extra),
     )
-    rows = [(label, [share_text(of(s)) for s in scores]) for label, of in asked if any(of(s).total for s in scores)]
+    rows = [(label, [share_text(of(s)) for s in scores]) for label, of in shares if any(of(s).total for s in scores)]
     if sum(score.doubles.values()):
         rows.append(("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]))
-    said = [
+    verdicts = [
         (f"empty recordings: {verdict}", [str(s.verdicts[verdict]) for s in scores])
         for verdict in (ADEQUATE, UNEXPLAINED, UNFIT)
     ]
-    return [*rows, *said, ("failed", [str(len(s.failed)) for s in scores])]
+    return [*rows, *verdicts, ("failed", [str(len(s.failed)) for s in scores])]
 
 
 def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:

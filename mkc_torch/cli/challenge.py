@@ -84,7 +84,7 @@ def challenge(
     own = {"--only": only or None, "--per-scenario": per_scenario, "--hidden-per-scenario": hidden_per_scenario}
     _refuse_mixed(not scenarios, own, "needs --scenarios; add --scenarios")
     if family is Family.dynamics and duration is not None:
-        raise typer.BadParameter("--duration applies to the magnetometer; each dynamic system has a length of its own.")
+        raise typer.BadParameter("--duration applies to the magnetometer; each system has a length of its own.")
     with loading():
         from mkc_torch._parallel.pool import allow_copies
         from mkc_torch._parallel.processes import cores, keep_memory, one_thread

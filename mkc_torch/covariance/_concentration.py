@@ -37,7 +37,7 @@ _EXCHANGED = 20
 
 
 class Ellipsoids(NamedTuple):
-    """Stack of ellipsoids: mean, whitening matrix W with distance ``|W (x - mean)|``, log determinant (-inf if flat)."""
+    """Stack of ellipsoids: mean, whitening matrix W (distance ``|W (x - mean)|``), log determinant (-inf if flat)."""
 
     mean: Float[Tensor, "B S p"]
     whitening: Float[Tensor, "B S p p"]
@@ -94,7 +94,7 @@ def _closest(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> 
     return distance.topk(h, dim=-1, largest=False, sorted=False).indices
 
 
-def _taken(points: Float[Tensor, "B N p"], index: Int[Tensor, "#B S k"]) -> Float[Tensor, "B S k p"]:
+def _points_at(points: Float[Tensor, "B N p"], index: Int[Tensor, "#B S k"]) -> Float[Tensor, "B S k p"]:
     batch = torch.arange(points.shape[0], device=points.device).view(-1, 1, 1)
     return points[batch, index]
 
@@ -103,7 +103,7 @@ def _step(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Ell
     """A concentration step of every ellipsoid, in chunks."""
     size = max(1, _CHUNK // points.numel())
     parts = zip(*(part.split(size, dim=1) for part in ellipsoids), strict=True)
-    moved = [_ellipsoids(_taken(points, _closest(points, Ellipsoids(*part), h))) for part in parts]
+    moved = [_ellipsoids(_points_at(points, _closest(points, Ellipsoids(*part), h))) for part in parts]
     return Ellipsoids(*(torch.cat(part, dim=1) for part in zip(*moved, strict=True)))
 
 
@@ -111,7 +111,7 @@ def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generat
     """Ellipsoids of ``count`` random sets of p + 1 points, and the ellipsoid of all points."""
     N, p = points.shape[-2:]
     keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(points.device)
-    elemental = _ellipsoids(_taken(points, keys.topk(p + 1, dim=-1).indices.unsqueeze(0)))
+    elemental = _ellipsoids(_points_at(points, keys.topk(p + 1, dim=-1).indices.unsqueeze(0)))
     whole = _ellipsoids(points.unsqueeze(1))
     return Ellipsoids(*(torch.cat(both, dim=1) for both in zip(elemental, whole, strict=True)))
 
@@ -119,10 +119,10 @@ def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generat
 def concentrate(
     points: Float[Tensor, "B N p"], h: int, *, starts: int = 500, max_iter: int = 100, seed: int = 0
 ) -> Support:
-    """The support of smallest determinant: two steps from every start on at most 1500 points, then the best candidates
-    to convergence on all points.
+    """The support of smallest determinant.
 
-    Up to 200 points, the best supports are then improved by exchanging points.
+    Two steps from every start on at most 1500 points, then the best candidates to convergence on all points. Up to 200
+    points, the best supports are then improved by exchanging points.
 
     Args:
         points: standardised points.
@@ -197,5 +197,5 @@ def _exchanged(points: Float[Tensor, "B N p"], found: Ellipsoids, h: int) -> Int
     problem, _ = differs.nonzero(as_tuple=True)
     counts[differs] = exchange(points[problem], counts[differs])
     index = counts.nonzero()[:, -1].reshape(index.shape)
-    best = _ellipsoids(_taken(points, index)).log_determinant.argmin(1).view(-1, 1, 1)
+    best = _ellipsoids(_points_at(points, index)).log_determinant.argmin(1).view(-1, 1, 1)
     return index.gather(1, best.expand(-1, 1, h))

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 def smallest_variance(values: Float[Tensor, "B N"], h: int) -> Bool[Tensor, "B N"]:
     """Mask of the h > N / 2 values of smallest variance, of values standardised about their median; ties: the first.
 
-    They are contiguous in the sorted values (Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 171).
+    They are contiguous in the sorted values (Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987),
+    p. 171).
     """
     ordered, order = values.sort(-1)
-    # the window contains the median, so values beyond the reach are outside it; clipping them saves digits of the sums
+    # the window contains the median, so it has no values beyond the reach; clipping them saves digits of the sums
     reach = 2.0 * math.sqrt(2.0 * h) * values.abs().kthvalue(h, dim=-1, keepdim=True).values
     reach = torch.where(reach > 0, reach, 1.0)  # h equal values
     ordered = torch.maximum(torch.minimum(ordered, reach), -reach)

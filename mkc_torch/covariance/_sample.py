@@ -63,7 +63,7 @@ class Sample:
         return self.points.shape[-2], self.points.shape[-1]
 
     def restore(self, values: Float[Tensor, B * rest]) -> Float[Tensor, "*batch *rest"]:
-        """Values of the flattened problems in the user's batch dimensions; floating-point values in the user's dtype."""
+        """Values of the flattened problems in the user's batch dimensions and, if floating-point, dtype."""
         values = values.reshape((*self.batch, *values.shape[1:]))
         return values.to(self.dtype) if values.is_floating_point() else values
 

@@ -91,8 +91,8 @@ def refuse_exact_fit(sample: Sample, counts: Bool[Tensor, "B N"]) -> None:
     b = int(flat.nonzero()[0])
     if float(deviation[b].max()) > FAR:
         raise ValueError(
-            f"Expected argument `X` whose support has no far outlier but h = {int(counts[b].sum())} includes an outlier "
-            "so far out that rounding hides the other samples; take a smaller `h`."
+            f"Expected argument `X` whose support has no far outlier but h = {int(counts[b].sum())} includes an "
+            "outlier so far out that rounding hides the other samples; take a smaller `h`."
         )
     across = direction[b] / deviation[b]
     height = torch.matmul(points[b] - mean[b], across).abs()

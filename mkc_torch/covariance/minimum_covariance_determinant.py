@@ -252,7 +252,7 @@ def _restored(sample: Sample, covariance: Float[Tensor, "B p p"]) -> Float[Tenso
     kind = torch.finfo(sample.dtype)
     if not ((variance >= kind.tiny) & (variance <= kind.max)).all():
         raise ValueError(
-            f"Expected argument `X` with variances in the range of {sample.dtype} but got {float(variance.min()):.3g} to "
-            f"{float(variance.max()):.3g}; choose another unit."
+            f"Expected argument `X` with variances in the range of {sample.dtype} but got {float(variance.min()):.3g} "
+            f"to {float(variance.max()):.3g}; choose another unit."
         )
     return sample.restore(covariance)

@@ -79,8 +79,8 @@ class OutlierMap:
 
         if self.residuals.dim() != 1:
             raise ValueError(
-                f"Expected the map of a single problem but got a batch of shape {tuple(self.residuals.shape[:-1])}; make "
-                "a map from each problem's fit and data."
+                f"Expected the map of a single problem but got a batch of shape {tuple(self.residuals.shape[:-1])}; "
+                "make a map from each problem's fit and data."
             )
         x, y = (values.detach().cpu().double() for values in (self.distances, self.residuals))
         return draw(Places(x, y, self.kind.cpu(), self.distance_cutoff, self.residual_cutoff), ax, labels)
@@ -161,7 +161,7 @@ def _standardised(fit: LinearEstimator, X: Tensor, Y: Tensor) -> Float[Tensor, "
     if X.dim() < 2 or X.shape[-1] != n or Y.dim() < 1 or Y.shape[-1] != X.shape[-2]:
         raise ValueError(
             f"Expected `X` of shape (*, N, {n}), as many columns as the fit has coefficients, with `Y` (*, N), but got "
-            f"{tuple(X.shape)} and {tuple(Y.shape)}; the map is of one channel."
+            f"{tuple(X.shape)} and {tuple(Y.shape)}; a map is of a single channel."
         )
     if X.dtype != coef.dtype or Y.dtype != coef.dtype:
         raise TypeError(
@@ -172,7 +172,7 @@ def _standardised(fit: LinearEstimator, X: Tensor, Y: Tensor) -> Float[Tensor, "
     if not isinstance(scale, Tensor) or scale.shape != (*coef.shape[:-1], 1):
         raise ValueError(
             f"Expected argument `fit` to have a `scale_` for each problem but {type(fit).__name__} has none, or was "
-            "fitted to several channels; take MMRegression, SRegression or LeastTrimmedSquares on a single channel."
+            "fitted to several channels; take MMRegression, SRegression or LeastTrimmedSquares on one channel."
         )
     if not (scale > 0).all():
         raise ValueError(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from numpy import ndarray
 
-__all__ = ["few", "log_partition_and_slopes"]
+__all__ = ["is_few", "log_partition_and_slopes"]
 
 _FEW = 64
 """Channels up to which NumPy is faster than torch."""
@@ -23,7 +23,7 @@ _SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
 """Coefficients of ``(1 - exp(-x) (1 + x)) / x²``, accurate to all digits for x below 0.05."""
 
 
-def few(*values: Tensor) -> bool:
+def is_few(*values: Tensor) -> bool:
     """Whether these are plain tensors of few numbers on the CPU: not of a subclass, not under a function transform."""
     return all(
         type(value) is Tensor and value.device.type == "cpu" and value.numel() <= _FEW and not is_wrapped(value)

@@ -41,7 +41,7 @@ def domain_rule(
 
 
 def refuse_bad_bound(bound: Tensor, scale: Tensor) -> None:
-    """Raise ValueError for a domain shorter than the head of the density, or one whose square overflows."""
+    """Raise ValueError for a domain shorter than the head of the density, or whose square overflows."""
     most = torch.finfo(scale.dtype).max ** 0.4
     if not bool((bound <= most).all()):
         raise ValueError(

@@ -13,7 +13,7 @@ from mkc_torch.density.likelihood import DensityState, initial_state
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["gaussian_state", "normalised", "spread", "written"]
+__all__ = ["gaussian_state", "normalised", "replace_problems", "weighted_rms"]
 
 
 def normalised(weight: Float[Tensor, "*batch N m"] | None) -> Float[Tensor, "*batch N m"] | None:
@@ -21,7 +21,7 @@ def normalised(weight: Float[Tensor, "*batch N m"] | None) -> Float[Tensor, "*ba
     return None if weight is None else weight / weight.sum(-2, keepdim=True)
 
 
-def spread(
+def weighted_rms(
     residual: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None, least: Float[Tensor, "*batch m"]
 ) -> Float[Tensor, "*batch m"]:
     """Root mean square of each channel under normalised weights (the d of a Gaussian), at least ``least``, (*, m)."""
@@ -38,7 +38,7 @@ def gaussian_state(
     return initial_state(residual, weight, least, torch.exp(state.log_bound), least, kappa=torch.zeros_like(least))
 
 
-def written(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
+def replace_problems(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
     """Copy of ``whole`` with the problems at ``index`` replaced by ``part``."""
     names = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
     return replace(whole, **{name: getattr(whole, name).index_copy(0, index, getattr(part, name)) for name in names})

@@ -66,7 +66,7 @@ class DiagnosisInputs:
         terms: the candidates.
         base: the fitted simulation without findings, with its noise.
         final: the fit with all findings, under the remaining process noise.
-        options: options of the search.
+        options: of the search.
         cut: whether there was a further finding beyond the limit.
         stop: why the search was stopped before its end, and what was not done.
     """
@@ -137,7 +137,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
     )
     there = first is not None and first.p_value <= options.level and not findings
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
-    # for differential equations the fitted process noise has accounted for correlation already
+    # for differential equations the noise model includes the correlation already
     white = known.noise is not None or _white(diagnosis)
     verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
     if whole.stop is not None and verdict != "unfit":
@@ -259,7 +259,7 @@ def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
     shape = described(first.term.effect, first.term.shape)
     what = f"{called(first.term)} ({shape})" if shape else called(first.term)
     return [
-        f"{what} explains the residual best, but measurement and process noise gain as much by chance: p = "
+        f"{what} would explain the residual best, but measurement and process noise gain as much by chance: p = "
         f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide whether it "
         "is real."
     ]

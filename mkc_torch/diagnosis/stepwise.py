@@ -173,7 +173,7 @@ def next_step(
     search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = _kept_nowhere
 ) -> StepwiseSearch:
     """Run the next search with the findings in the model; skip it if the screening shows nothing."""
-    if _screening_p_value(search, options):
+    if _is_screened_out(search, options):
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
@@ -221,7 +221,7 @@ def _located(
     )
 
 
-def _screening_p_value(search: StepwiseSearch, options: SearchOptions) -> bool:
+def _is_screened_out(search: StepwiseSearch, options: SearchOptions) -> bool:
     """Whether the screening p-value after the last finding is too large for a further finding."""
     return _further_p_value(search, options) > max(options.settings.confirmation.screening_level, options.level)
 
@@ -315,7 +315,7 @@ def _in_two_steps(
     Args:
         before: the search without the last finding.
         after: the search with it.
-        options: options.
+        options: of the diagnosis.
         generator: of the surrogates.
     """
     settings = options.settings

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
-from mkc_torch.diagnosis.findings.disturbances import forcing_of, pushes_of
+from mkc_torch.diagnosis.findings.disturbances import forcing_of, process_noise_of
 from mkc_torch.diagnosis.findings.reasons import reasons_of, wrong_turns
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -95,7 +95,7 @@ def noise_environment(
     return NoiseEnvironment(
         known.follows,
         reasons,
-        pushes_of(prepared, noise),
+        process_noise_of(prepared, noise),
         dict(prepared.input_hold),
         () if unfit else forcing_of(final, noise),
         base.starts,

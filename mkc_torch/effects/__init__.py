@@ -1,6 +1,6 @@
 """The catalogue of effects: one piece of physics a file, with its drivers, units, size and source.
 
-A user's own effect is a class derived from :class:`Effect`; :class:`GainEffect` makes it a dozen lines. Each class says
+A user's own effect is a class derived from :class:`Effect`; :class:`GainEffect` makes it a dozen lines. Each class states
 what the physics is, how it changes the simulation, what drives it, its units, the size that is plausible, and where
 that is from.
 

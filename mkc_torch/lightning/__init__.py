@@ -1,4 +1,4 @@
-"""The EM callback for Lightning: the network by its optimiser, sigma and d of the loss by maximum likelihood."""
+"""MKC-EM callback for Lightning: the optimiser trains the network, EM fits sigma and d of the loss."""
 
 from importlib.util import find_spec
 

@@ -1,4 +1,4 @@
-"""A loss whose sigma and d the callback has taken over from the optimiser."""
+"""A loss whose sigma and d the callback fits instead of the optimiser."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ if TYPE_CHECKING:
 __all__ = ["SIGMA_CAP"]
 
 SIGMA_CAP = 1000.0
-"""The largest σ that is logged, and that a loss with ``learn_sigma=True`` is set to. Two d from 0 its energy is the
-Gaussian's to one part in a million."""
+"""Largest σ that is logged, and that a loss with ``learn_sigma=True`` gets. At an error of two d its energy equals the
+Gaussian's to 1e-6."""
 
-_D_MARGIN = 1e-6  # a learned d lies strictly between its floor and the bound
+_D_MARGIN = 1e-6
+"""Relative margin of a learned d to its floor and to the bound, which it must not reach."""
 
 
 @dataclass
 class OwnedLoss:
-    """A loss in the callback's hands: its name in the module, the hook on it, and what had gradients before."""
+    """A loss owned by the callback: its name in the module, its hook, and the parameters that were learned before."""
 
     name: str
     loss: MKCLoss
@@ -46,12 +47,12 @@ class OwnedLoss:
         return cls(name, loss, loss.register_forward_hook(hook, with_kwargs=True), learned)
 
     def histogram(self) -> ResidualHistogram:
-        """An empty histogram up to the loss's bound, or as far as the residuals reach where the bound follows them."""
+        """An empty histogram, up to the loss's bound if that is fixed."""
         bound = None if self.loss.fixed_bound is None else self.loss.bound
         return ResidualHistogram(bound, num_channels=self.loss.num_channels)
 
     def guide(self, guide: Guide | None, trainer: Trainer) -> None:
-        """Let the network learn by a schedule, at the pace of this training: a guide's, or the loss's own."""
+        """Train the network by a schedule, the guide's or the loss's own, at the pace of this training."""
         own = self.loss.schedule
         if own is not None:
             set_pace(own, trainer)
@@ -62,20 +63,20 @@ class OwnedLoss:
             self.loss.guide(guide.residual_scale, guide.schedule)
 
     def freeze(self) -> Guide | None:
-        """Freeze a scale that follows the residuals before the first E-step; return what has guided the network."""
+        """Freeze the loss's running scale before the first E-step; return scale and schedule as a guide."""
         scale, schedule = self.loss.residual_scale, self.loss.schedule
         self.loss.freeze_scale()
         return None if scale is None or schedule is None else Guide(scale, schedule)
 
     def release(self) -> None:
-        """Give the loss back: no hook, no guide, its parameters learned again."""
+        """Release the loss: remove hook and guide, and make its parameters learnable again."""
         self.handle.remove()
         self.loss.guide(None, None)
         for parameter in self.learned:
             parameter.requires_grad_(True)
 
     def refuse_optimised(self, trainer: Trainer) -> None:
-        """Refuses a loss whose own parameters an optimiser would move as well."""
+        """Raise ValueError if an optimiser has parameters of the loss."""
         optimised = {id(p) for o in trainer.optimizers for group in o.param_groups for p in group["params"]}
         own = [f"{self.name}.{key}" for key, p in self.loss.named_parameters() if id(p) in optimised]
         if own:
@@ -86,7 +87,7 @@ class OwnedLoss:
             )
 
     def assign(self, channels: Bool[Tensor, " m"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"]) -> None:
-        """Sets κ and d of the chosen channels and leaves those of the others as they are, to the last bit."""
+        """Set κ and d of the chosen channels; those of the other channels keep every bit."""
         loss = self.loss
         stored = [t for t in (loss.raw_kappa, loss.raw_d, loss.fixed_kappa, loss.fixed_d) if t is not None]
         before = [t.detach().clone() for t in stored]

@@ -1,4 +1,4 @@
-"""The schedule by which a network learns under the callback, at the pace of its training."""
+"""The schedule that trains the network under the callback, and its pace."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mkc_torch.losses.residual_scale import ResidualScale
 __all__ = ["Guide", "set_pace"]
 
 WARMUP_EPOCHS = 3
-"""Epochs for which the initial loss is used alone, where they have fewer than the usual batches. Annealing takes twice
-as many. Few enough to leave most of thirty epochs to the likelihood."""
+"""Epochs in which the initial loss is used alone, if they have fewer batches than ``WARMUP_STEPS``. Annealing takes
+twice as many. This leaves most of thirty epochs to the likelihood."""
 
 
 class Guide(nn.Module):
-    """A running scale and a schedule that are no part of the loss they guide, and are saved with the callback."""
+    """Running scale and schedule of a loss, outside of its state; saved with the callback."""
 
     def __init__(self, residual_scale: ResidualScale, schedule: BandwidthSchedule) -> None:
         super().__init__()
@@ -24,11 +24,11 @@ class Guide(nn.Module):
 
     @classmethod
     def of_channels(cls, num_channels: int) -> Guide:
-        """A guide that has seen nothing."""
+        """A guide in its initial state."""
         return cls(ResidualScale(num_channels), BandwidthSchedule(num_channels))
 
 
 def set_pace(schedule: BandwidthSchedule, trainer: Trainer) -> None:
-    """Set the warm-up by the epochs of a training, so that a run that is resumed goes on as it was."""
+    """Set the warm-up by the length of an epoch: a resumed training gets the same warm-up."""
     schedule.warmup_steps = max(1, int(min(WARMUP_STEPS, WARMUP_EPOCHS * trainer.num_training_batches)))
     schedule.anneal_step = 0.5 / schedule.warmup_steps

@@ -1,4 +1,4 @@
-"""What the callback has done so far: its history, and what it warned of."""
+"""Progress of the callback: histogram, history of the E-steps, and issued warnings."""
 
 from __future__ import annotations
 
@@ -21,39 +21,40 @@ if TYPE_CHECKING:
 __all__ = ["MIN_RESIDUALS"]
 
 MIN_RESIDUALS = 30
-"""A channel with fewer residuals keeps its σ and d."""
+"""Residuals of a channel, at least, for an E-step; with fewer it keeps its σ and d."""
 
 _WARNINGS = {
     "silent": (
-        "No residual of the loss `{name}` came in since the last E-step, so its sigma and d stay. Call the module "
-        "itself in `training_step`, `self.criterion(input, target)`, not its `forward`; if the loss is compiled, "
+        "No residual of the loss `{name}` was collected since the last E-step, so its sigma and d are unchanged. Call "
+        "the module in `training_step`, `self.criterion(input, target)`, not its `forward`; if the loss is compiled, "
         "compile the network instead; or pass MKCExpectationMaximization(residuals=...)."
     ),
     "few": (
-        "Fewer than {least} residuals of positive weight came in since the last E-step in channel {channels} of the "
-        "loss `{name}`, which keeps its sigma and d. Take more steps to an E-step, `every_n_steps`, or give that "
-        "channel weights that are not 0."
+        "Fewer than {least} residuals of positive weight were collected since the last E-step in channel {channels} of "
+        "the loss `{name}`, which keeps its sigma and d. Raise `every_n_steps`, or pass positive weights for that "
+        "channel."
     ),
     "narrow": (
         "The bound of the loss `{name}` is less than twice the typical residual in channel {channels}: least squares "
-        "is used there until the residuals fit in. Make MKCLoss with a `bound` that errors can physically reach."
+        "is used there until the residuals are smaller. Make MKCLoss with a `bound` as large as the largest possible "
+        "error."
     ),
     "beyond": (
-        "More than 1 % of the residuals of the loss `{name}` lie beyond its bound in channel {channels}; they count as "
-        "the flat tail does. Make MKCLoss with a `bound` that errors can physically reach."
+        "More than 1 % of the residuals of the loss `{name}` lie beyond its bound in channel {channels}; they get the "
+        "density of the flat tail. Make MKCLoss with a `bound` as large as the largest possible error."
     ),
     "collapsed": (
         "The d of the loss `{name}` collapses in channel {channels}: it reached its floor `d_min`, or a hundredth of "
         "its first value while the likelihood grows. Either the noise is that small, or the network interpolates its "
-        "targets. Look at the loss of a validation set, stop early, use weight decay or a smaller network, or make "
-        "MKCLoss with a `d_min` below which the noise cannot be."
+        "targets. Check the loss on a validation set, stop early, use weight decay or a smaller network, or make "
+        "MKCLoss with the smallest possible noise as `d_min`."
     ),
 }
 
 
 @dataclass
 class Progress:
-    """What an interrupted run needs to go on: residuals not yet used, and what is known of each channel.
+    """State of the callback that a checkpoint saves: residuals not yet used, and the results of each channel.
 
     ``start_d``, ``log_likelihood`` and ``share_beyond`` are NaN before the first E-step.
     """
@@ -73,22 +74,22 @@ class Progress:
     def record(
         self, loss: MKCLoss, usable: Bool[Tensor, " m"], log_likelihood: Float[Tensor, " m"]
     ) -> Bool[Tensor, " m"]:
-        """Takes down what an E-step found, and says which channels became likelier."""
+        """Record the result of an E-step; return the mask of channels whose log-likelihood increased."""
         seen = (self.histogram.weight() > 0).cpu()
         first = usable.cpu() & torch.isnan(self.start_d)
         found = log_likelihood.cpu()
-        likelier = seen & (found > self.log_likelihood)
+        improved = seen & (found > self.log_likelihood)
         self.start_d = torch.where(first, loss.d.detach().cpu().double(), self.start_d)
         self.log_likelihood = torch.where(seen, found, self.log_likelihood)
         self.share_beyond = torch.where(seen, self.histogram.share_beyond().cpu(), self.share_beyond)
-        return likelier
+        return improved
 
     def warn(
-        self, owned: OwnedLoss, *, usable: Bool[Tensor, " m"], narrow: Bool[Tensor, " m"], likelier: Bool[Tensor, " m"]
+        self, owned: OwnedLoss, *, usable: Bool[Tensor, " m"], narrow: Bool[Tensor, " m"], improved: Bool[Tensor, " m"]
     ) -> None:
-        """Warns of what is wrong, of each thing once for each channel."""
+        """Issue each warning once per channel."""
         d, d_min = (t.detach().cpu().double() for t in (owned.loss.d, owned.loss.d_min))
-        collapsed = (d <= d_min * (1.0 + 1e-3)) | ((d < 0.01 * self.start_d) & likelier)
+        collapsed = (d <= d_min * (1.0 + 1e-3)) | ((d < 0.01 * self.start_d) & improved)
         self.warn_once("few", owned.name, ~usable)
         self.warn_once("narrow", owned.name, narrow)
         if owned.loss._bound_was_given:
@@ -96,7 +97,7 @@ class Progress:
         self.warn_once("collapsed", owned.name, usable & collapsed)
 
     def warn_once(self, kind: str, name: str, channels: Bool[Tensor, " m"]) -> None:
-        """Warns of one thing, naming those channels that it has not been said of."""
+        """Issue a warning, for the channels that have not had it yet."""
         new = [i for i in channels.nonzero().flatten().tolist() if (kind, i) not in self.warned]
         if new:
             self.warned.update((kind, i) for i in new)
@@ -117,7 +118,7 @@ class Progress:
         if state["start_d"].shape != self.start_d.shape:
             raise ValueError(
                 f"Expected a checkpoint of {self.start_d.shape[0]} channels but got {state['start_d'].shape[0]}; "
-                "load it into a module whose loss has as many."
+                "load it into a module whose loss has that many."
             )
         self.histogram.load_state_dict(state["histogram"])
         self.start_d, self.log_likelihood = state["start_d"], state["log_likelihood"]

@@ -1,4 +1,4 @@
-"""MKC-EM for networks: a Lightning callback that owns the σ and d of a loss and fits them to each epoch's residuals."""
+"""MKC-EM for networks: a Lightning callback that fits σ and d of a loss to the residuals of each epoch."""
 
 from __future__ import annotations
 
@@ -30,58 +30,60 @@ __all__ = ["MKCExpectationMaximization"]
 
 
 class MKCExpectationMaximization(Callback):
-    """Alternates between the network's weights and the loss's (σ, d): MKC-EM with an optimiser for the M-step.
+    """Alternate between the network's weights and the loss's (σ, d): MKC-EM with an optimiser for the M-step.
 
-    The optimiser sees σ and d as constants. At the end of each training epoch, before its validation, or every
-    ``every_n_steps`` optimiser steps, they are set to the values that are likeliest for the residuals of the training
-    steps since the last time. These are collected as the loss is called, in a histogram of bounded memory, so there is
-    no second pass over the data and nothing to add to the ``LightningModule``. In distributed training the residuals
-    of all processes count and all end with the same values.
+    The optimiser treats σ and d as constants. At the end of each training epoch, before its validation, or every
+    ``every_n_steps`` optimiser steps, an E-step sets them to the maximum-likelihood values for the residuals of the
+    training steps since the last E-step. The residuals are collected from the calls of the loss, in a histogram of
+    bounded memory: there is no second pass over the data, and the ``LightningModule`` needs no change. In distributed
+    training the residuals of all processes are used, and all processes get the same values.
 
-    Residuals of an epoch come from weights that were changing, and from a network in training mode (dropout); with
-    ``residuals`` they come from a pass of their own.
+    The weights change during an epoch, and the network is in training mode (dropout), while residuals are collected.
+    With ``residuals`` they come from a separate pass.
 
-    Best is a loss ``MKCLoss(m, learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters, reaches σ = ∞
-    exactly, and with the normaliser its values, those of a validation say, compare between epochs. Without a ``d`` and
-    a ``bound`` they follow the residuals until the first E-step and are then frozen; a physical bound is better. The σ
-    and d of a loss that learns them are taken out of its hands while the fit lasts: they must be in no optimiser, and
-    their σ ends at ``SIGMA_CAP`` at most.
+    Recommended is a loss ``MKCLoss(m, learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters,
+    reaches σ = ∞ exactly, and its values, for example on a validation set, are comparable between epochs. Without a
+    given ``d`` and ``bound``, both follow the residuals until the first E-step and are then frozen; a physical bound is
+    better. If the loss learns σ and d, their gradients are switched off during the fit: no optimiser may have these
+    parameters, and σ is at most ``SIGMA_CAP``.
 
-    The gradient of the loss goes with 1/d². Adam and its like do not mind; with plain SGD the learning rate should.
+    The gradient of the loss is proportional to 1/d². Adam and similar optimisers are not affected; for plain SGD adapt
+    the learning rate.
 
-    Logged at each epoch's end, and where ``every_n_steps`` is given at each E-step, i being the channel and the prefix
-    the loss's name in the module: ``criterion/sigma_i`` (∞ as ``SIGMA_CAP``), ``criterion/d_i``,
-    ``criterion/log_likelihood_i`` (nats per residual, with the values set) and ``criterion/share_beyond_bound_i``.
+    Logged at the end of each epoch and, with ``every_n_steps``, at each E-step: ``criterion/sigma_i`` (∞ as
+    ``SIGMA_CAP``), ``criterion/d_i``, ``criterion/log_likelihood_i`` (nats per residual, at the new σ and d) and
+    ``criterion/share_beyond_bound_i``, for channel i and the loss's name in the module as prefix.
 
-    The state is saved in checkpoints; a run resumed at an epoch's end goes on as if it had not stopped. In distributed
-    training a checkpoint amid the collection keeps the residuals of the first process.
+    Checkpoints contain the state; a run resumed at the end of an epoch continues as if uninterrupted. In distributed
+    training a checkpoint within a collection keeps the residuals of the first process only.
 
     Args:
-        loss: the name of the loss in the module, ``"criterion"`` say; None takes the only one. Several losses take one
-            callback each.
-        every_n_steps: an E-step every so many optimiser steps (``trainer.global_step``); None: at each epoch's end.
-        warmup_epochs: epochs before the first E-step, with σ and d as the loss was given them.
-        damping: the part in [0, 1) that the values before an E-step keep, in log d and log(1/σ² + 0.02); the first
-            E-step of a channel is not damped.
-        anneal_epochs: T epochs after the warm-up over which σ comes down from large values: in the t-th, t/T of the
-            likeliest 1/σ² is used, and d fitted for it. None: all of it from the start.
-        graduated: whether the network begins with a loss sharper than the absolute value and goes over to the
-            likelihood, no wider than its residuals speak for; else the likelihood's gradient moves it throughout.
+        loss: name of the loss in the module, for example ``"criterion"``; None if there is a single loss. Several
+            losses need a callback each.
+        every_n_steps: optimiser steps (``trainer.global_step``) per E-step; None: an E-step at the end of each epoch.
+        warmup_epochs: epochs before the first E-step, with the initial σ and d of the loss.
+        damping: share in [0, 1) of the previous values after an E-step, in log d and log(1/σ² + 0.02); the first E-step
+            of a channel is not damped.
+        anneal_epochs: number T of epochs after the warm-up in which σ decreases from large values: the t-th epoch uses
+            t/T of the maximum-likelihood 1/σ², and d fitted for it. None: no annealing.
+        graduated: whether the network starts with a loss sharper than the absolute value and is annealed to the
+            likelihood, no wider than its residuals support; else the likelihood trains it throughout.
         residuals: ``(pl_module, batch) -> (input, target)`` or ``(input, target, weight)``, as for the loss. If given,
-            each E-step makes a pass over the training data, the module in evaluation mode and without gradients,
-            instead of taking the training steps' residuals. A loader's random order draws from its own generator if it
-            has one; torch's is restored.
+            each E-step makes a pass over the training data, with the module in evaluation mode and without gradients,
+            instead of using the residuals of the training steps. A loader with its own generator shuffles by it;
+            torch's generator is restored.
         log: whether to log.
 
     Raises:
-        ValueError: an argument out of range. When the trainer runs: no loss, or several and no name; the loss's σ or d
-            in an optimiser, or owned by another callback; a residual that is not finite, or a weight that is negative.
-        TypeError: an argument of another kind, or ``residuals`` returned something else.
+        ValueError: an argument out of range. When the trainer runs: no loss, or several losses and no name; the loss's
+            σ or d in an optimiser, or owned by another callback; a residual that is not finite, or a negative weight.
+        TypeError: an argument of another type, or another return type of ``residuals``.
 
     Warns:
-        UserWarning: no residual came in: the loss was called by its ``forward``, or a compiler left out its hooks. Once
-            for each channel: too few residuals, more than 1 % of them beyond the bound, a bound too narrow for them
-            (least squares is used until they fit in), or a d that collapses as the network interpolates its targets.
+        UserWarning: no residual was collected, because the loss was called by its ``forward`` or a compiler removed its
+            hooks. Once per channel: too few residuals; more than 1 % of them beyond the bound; a bound too narrow for
+            them (least squares is used until they are smaller); a d that collapses as the network interpolates its
+            targets.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), Algorithm 2 (MKC-EM).
@@ -128,13 +130,13 @@ class MKCExpectationMaximization(Callback):
         ):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < low):
                 raise ValueError(f"Expected argument `{name}` to be an integer >= {low} but got {value!r}.")
-        checked_number("damping", damping, 0.0, 1.0, "[)", "0 keeps nothing of the values before")
+        checked_number("damping", damping, 0.0, 1.0, "[)", "0 is no damping")
         if loss is not None:
-            refuse_other_type("loss", loss, str, "the loss's name in the module, or None", "write 'criterion' say")
+            refuse_other_type("loss", loss, str, "the loss's name in the module, or None", "for example 'criterion'")
         if residuals is not None and not callable(residuals):
             raise TypeError(
                 f"Expected argument `residuals` to be a function (pl_module, batch) -> (input, target) but got "
-                f"{format_value(residuals)}; None takes those of the training steps."
+                f"{format_value(residuals)}; None uses the residuals of the training steps."
             )
         self.loss = loss
         self.every_n_steps = every_n_steps
@@ -143,7 +145,7 @@ class MKCExpectationMaximization(Callback):
         self.anneal_epochs = anneal_epochs
         self.graduated = graduated
         self.residuals = residuals
-        self._logs = log  # the trainer puts a method in the place of an attribute `log`
+        self._logs = log  # the trainer overwrites an attribute `log`
         self._owned: OwnedLoss | None = None
         self._progress: Progress | None = None
         self._restored: dict[str, Any] | None = None
@@ -157,7 +159,7 @@ class MKCExpectationMaximization(Callback):
 
     @override
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        # before DistributedDataParallel looks for the parameters that have gradients
+        # before DistributedDataParallel collects the parameters with gradients
         if stage == "fit" and _losses(pl_module):
             self._take(trainer, pl_module)
 
@@ -170,9 +172,9 @@ class MKCExpectationMaximization(Callback):
         if self._restored is not None:
             progress.load_state_dict(self._restored)
             self._restored = None
-            if not trainer.is_global_zero:  # what was saved are the residuals of the first process
+            if not trainer.is_global_zero:  # the saved residuals are those of the first process
                 progress.histogram.clear()
-        if owned.loss.fixed_bound is not None:  # that of the checkpoint
+        if owned.loss.fixed_bound is not None:  # the bound of the checkpoint
             progress.histogram.set_bound(owned.loss.bound)
         progress.histogram.to(pl_module.device)
 
@@ -241,7 +243,7 @@ class MKCExpectationMaximization(Callback):
             if isinstance(other, MKCExpectationMaximization) and other._owned is not None and other._owned.loss is loss:
                 raise ValueError(
                     f"Expected one MKCExpectationMaximization for the loss `{name}` but got two; "
-                    "give each callback the name of another loss, or remove one."
+                    "give each callback the name of another loss, or remove a callback."
                 )
         self._owned = OwnedLoss.of(name, loss, self._collect)
         if self._progress is None or len(self._progress.histogram.bound) != loss.num_channels:
@@ -268,7 +270,7 @@ class MKCExpectationMaximization(Callback):
                 raise ValueError(f"In step {self._step} of the loss `{owned.name}`: {error}") from None
 
     def _expectation(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """The E-step: every process comes here at the same step."""
+        """The E-step, which every process makes at the same step."""
         owned, progress = self._running()
         if self.residuals is not None:
             _collect_by_pass(progress.histogram, owned.loss, self.residuals, trainer, pl_module)
@@ -289,7 +291,7 @@ class MKCExpectationMaximization(Callback):
     def _update(self, trainer: Trainer) -> None:
         owned, progress = self._running()
         loss, histogram = owned.loss, progress.histogram
-        if loss.residual_scale is not None:  # d and bound were the residuals'; from here on they are the E-step's
+        if loss.residual_scale is not None:  # d and bound followed the residuals; from here on the E-step sets d
             guide = owned.freeze()
             if self.graduated:
                 progress.guide = guide
@@ -310,14 +312,14 @@ class MKCExpectationMaximization(Callback):
             d[usable] = damped(d[usable], found.d, keep)
             narrow[usable] = found.narrow
             if trainer.world_size > 1:
-                # sums are equal in all processes, processors need not be
+                # the sums are equal in all processes, but processors may round differently
                 kappa, d = (t.to(kappa) for t in trainer.strategy.broadcast((kappa.cpu(), d.cpu())))
             owned.assign(usable, kappa, d)
-        likelier = progress.record(loss, usable, _log_likelihood(loss, error, weight))
-        progress.warn(owned, usable=usable.cpu(), narrow=narrow.cpu(), likelier=likelier)
+        improved = progress.record(loss, usable, _log_likelihood(loss, error, weight))
+        progress.warn(owned, usable=usable.cpu(), narrow=narrow.cpu(), improved=improved)
 
     def _share_of_kappa(self, epoch: int) -> float:
-        """The part of the likeliest 1/σ² that is used in an epoch."""
+        """Share of the maximum-likelihood 1/σ² used in an epoch."""
         return 1.0 if self.anneal_epochs is None else min(1.0, (epoch - self.warmup_epochs + 1) / self.anneal_epochs)
 
     def _log_values(self, trainer: Trainer, pl_module: LightningModule, *, on_step: bool) -> None:
@@ -331,20 +333,20 @@ class MKCExpectationMaximization(Callback):
             ("share_beyond_bound", progress.share_beyond),
         ):
             for i, value in enumerate(values.tolist()):
-                if value == value:  # nothing is known of a channel before its first E-step
+                if value == value:  # NaN before the first E-step of a channel
                     pl_module.log(
                         f"{owned.name}/{name}_{i}",
                         value,
                         on_step=on_step,
                         on_epoch=not on_step,
                         batch_size=1,
-                        # the values are equal; a reduction spares the advice to make one
+                        # the values are equal; without sync_dist Lightning warns
                         sync_dist=trainer.world_size > 1,
                     )
 
 
 def _losses(module: nn.Module) -> dict[str, MKCLoss]:
-    """Every MKCLoss of a module under each of its names; that of a compiled one is its name before."""
+    """Every MKCLoss of a module by each of its names; a compiled loss has its uncompiled name."""
     return {
         ".".join(part for part in name.split(".") if part != "_orig_mod"): child
         for name, child in module.named_modules(remove_duplicate=False)
@@ -353,7 +355,7 @@ def _losses(module: nn.Module) -> dict[str, MKCLoss]:
 
 
 def _find_loss(module: nn.Module, name: str | None) -> tuple[str, MKCLoss]:
-    """The loss of that name, or the only one."""
+    """The loss of a name, or the single loss for None."""
     losses = _losses(module)
     names = ", ".join(f"`{n}`" for n in losses)
     if not losses:
@@ -368,7 +370,7 @@ def _find_loss(module: nn.Module, name: str | None) -> tuple[str, MKCLoss]:
     if len({id(loss) for loss in losses.values()}) > 1:
         raise ValueError(
             f"Expected argument `loss` to name one of {names} but got None; "
-            "each loss takes a callback of its own, MKCExpectationMaximization(loss=...)."
+            "pass a callback for each loss, MKCExpectationMaximization(loss=...)."
         )
     return next(iter(losses.items()))
 
@@ -376,7 +378,7 @@ def _find_loss(module: nn.Module, name: str | None) -> tuple[str, MKCLoss]:
 def _add_residuals(
     histogram: ResidualHistogram, loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None = None
 ) -> None:
-    """Adds what the loss was called with; it has checked the shapes."""
+    """Add the residuals of a call of the loss, which has checked the shapes."""
     half = input.dtype in (torch.float16, torch.bfloat16)
     finite = torch.isfinite(input.detach())
     input, target = (t.detach().to(torch.promote_types(t.dtype, torch.float32)) for t in (input, target))
@@ -385,7 +387,7 @@ def _add_residuals(
         if weight.dim() < error.dim():
             weight = weight.unsqueeze(loss.channel_dim % error.dim())
         weight = weight.detach().expand(error.shape)
-    if half:  # an overflow is the gradient scaler's, and no residual
+    if half:  # the gradient scaler handles overflows; they are not residuals
         weight = finite if weight is None else weight * finite
     histogram.add(error, weight, loss.channel_dim)
 
@@ -393,7 +395,7 @@ def _add_residuals(
 def _collect_by_pass(
     histogram: ResidualHistogram, loss: MKCLoss, residuals: Residuals, trainer: Trainer, pl_module: LightningModule
 ) -> None:
-    """Fills the histogram with the residuals of the training data under the weights as they are."""
+    """Fill the histogram with the residuals of the training data at the current weights."""
     histogram.clear()
     with _evaluating(pl_module), trainer.precision_plugin.forward_context():
         for batch in _training_batches(trainer, pl_module):
@@ -403,13 +405,13 @@ def _collect_by_pass(
                     "Expected `residuals` to return (input, target) or (input, target, weight) "
                     f"but got {type(found).__name__}."
                 )
-            loss(*found)  # refuses what it would refuse in training
+            loss(*found)  # raises for arguments that it refuses in training
             _add_residuals(histogram, loss, *found)
 
 
 @contextmanager
 def _evaluating(module: nn.Module) -> Iterator[None]:
-    """Evaluation mode without gradients; then every part is in its own mode again, and torch's random numbers go on."""
+    """Evaluation mode without gradients; on exit each submodule's mode and torch's random state are restored."""
     modes = [(m, m.training) for m in module.modules()]
     module.eval()
     try:
@@ -421,8 +423,8 @@ def _evaluating(module: nn.Module) -> Iterator[None]:
 
 
 def _training_batches(trainer: Trainer, pl_module: LightningModule) -> Iterator[Any]:
-    """The batches of a training epoch, on the module's device, through the module's own hooks."""
-    # a loader of its own, since the trainer's is being iterated
+    """The batches of a training epoch, on the module's device, passed through the module's hooks."""
+    # a separate loader, because the trainer's is being iterated
     mode: Any = getattr(trainer.fit_loop._combined_loader, "_mode", "max_size_cycle")
     loader = CombinedLoader(trainer.train_dataloader, mode)
     for batch, index, _ in loader:
@@ -436,12 +438,13 @@ def _refuse_persistent_workers(trainer: Trainer) -> None:
     for loader in CombinedLoader(trainer.train_dataloader).flattened:
         if getattr(loader, "persistent_workers", False):
             raise ValueError(
-                "Expected a training loader with `persistent_workers=False` where `residuals` and `every_n_steps` are "
-                "given: its workers serve one pass at a time, and a pass of an E-step would end the epoch's."
+                "Expected a training loader with `persistent_workers=False` if `residuals` and `every_n_steps` are "
+                "given but got True: persistent workers serve a single pass, and the pass of an E-step would end the "
+                "epoch's."
             )
 
 
 def _log_likelihood(loss: MKCLoss, error: Float[Tensor, "N m"], weight: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """Mean log-density of the residuals of each channel; NaN for one without any."""
+    """Mean log-density of the residuals of each channel, in nats; NaN for a channel without residuals."""
     sigma, d, bound = (t.detach().to(error) for t in (loss.sigma, loss.d, loss.bound))
     return -(weight * mkc_nll(error, sigma, d, bound)).sum(0) / weight.sum(0)

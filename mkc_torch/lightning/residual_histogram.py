@@ -1,8 +1,8 @@
-"""Residuals of any number in bounded memory: a histogram per channel that a density can be fitted to.
+"""Histograms of any number of residuals per channel in bounded memory, to which a density can be fitted.
 
-The bins are a hundredth of the residual's size wide, and each keeps the sum of its weights and of its squares. A bin
-then stands for its residuals as one residual of their root mean square, which leaves an error of second order in the
-width. Sums of histograms are histograms of all the residuals, so batches, epochs and processes add up.
+The width of a bin is about a hundredth of the residual. A bin keeps the sum of its weights and of its weighted squares;
+it represents its residuals by their root mean square, with an error of second order in the width. The sum of histograms
+is the histogram of all residuals, so batches, epochs and processes add up.
 """
 
 from __future__ import annotations
@@ -18,32 +18,43 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int32
 
 _MANTISSA_BITS = 6
-_OCTAVES = 27
-_FIRST, _LAST = (127 - _OCTAVES) << _MANTISSA_BITS, 127 << _MANTISSA_BITS
-BINS = _LAST - _FIRST + 1
-"""Bins of a channel: 64 in each octave from 2⁻²⁷ (7e-9) to 1 times the reach, and one for what lies beyond it."""
+"""Leading bits of the mantissa that select a bin: 64 bins per octave."""
 
-# a residual clipped at the bound, a saturated sensor's, lies inside whatever way the division rounds
+_OCTAVES = 27
+"""Octaves below the reach."""
+
+_FIRST = (127 - _OCTAVES) << _MANTISSA_BITS
+"""Leading bits of the first bin."""
+
+_LAST = 127 << _MANTISSA_BITS
+"""Leading bits of the last bin."""
+
+BINS = _LAST - _FIRST + 1
+"""Bins per channel: 64 in each octave from 2⁻²⁷ (7e-9) to 1 times the reach, and a bin for residuals beyond it."""
+
 _MARGIN = 1.0 + 1e-6
-_MIN_REACH = 2.0**-126  # of the normal numbers of float32
+"""Factor on the bound: a residual clipped at the bound, of a saturated sensor, lies inside for any rounding."""
+
+_MIN_REACH = 2.0**-126
+"""Smallest reach: the smallest normal number of float32."""
 
 
 class ResidualHistogram:
-    """A histogram of the sizes of residuals for each channel; it keeps float64 sums, however many there are.
+    """Histogram of the absolute residuals of each channel, with float64 sums.
 
     Args:
-        bound: half-widths of the domain (m,), in the unit of the residuals. The bins reach up to them. None, or NaN or
-            infinity for a channel: the bins reach 64 to 128 times as far as the largest residual of the first batch
-            with a residual other than 0; each process takes its own reach, and ``all_reduce`` the largest of them.
-        num_channels: the number of channels m; needed where ``bound`` is None.
+        bound: half-widths of the domain (m,), in the unit of the residuals; the bins extend to them. None, or NaN or
+            infinity for a channel: the bins extend to 64 to 128 times the largest residual of the first batch that has
+            a residual other than 0. Each process has its own reach; ``all_reduce`` takes the largest.
+        num_channels: the number of channels m; required if ``bound`` is None.
 
     Attributes:
         bound: half-widths of the domain, beyond which ``share_beyond`` counts, (m,); NaN where unknown.
-        reach: the size at which the last bin begins, (m,); 0 where no batch has set it yet.
-        sums: of the weights and of weight times (residual / reach)², (2, m, BINS).
-        count: how many residuals of positive weight each channel got, (m,).
-        refused: how many residuals were left out for ``check`` to report, (m,); on the CPU ``add`` raises at once.
-        batches: how many batches came, with or without residuals of positive weight, a scalar.
+        reach: lower end of the last bin, in the unit of the residuals, (m,); 0 where no batch has set it yet.
+        sums: sums of the weights and of weight times (residual / reach)², (2, m, BINS).
+        count: number of residuals of positive weight in each channel, (m,).
+        refused: number of residuals left out, which ``check`` reports, (m,); on the CPU ``add`` raises instead.
+        batches: number of batches, with or without residuals of positive weight, a scalar.
 
     Example:
         >>> histogram = ResidualHistogram(torch.tensor([10.0]))
@@ -66,11 +77,11 @@ class ResidualHistogram:
         self.set_bound(flat[:m] * torch.nan if bound is None else bound)
 
     def _place(self, flat: Tensor, reach: Tensor, bound: Tensor) -> None:
-        """Takes the sums and counts from one tensor, so that one message adds them up over processes."""
+        """Make sums and counts views of a single tensor, so that one reduction adds them up over processes."""
         m = len(bound)
         self._flat, self.reach, self.bound = flat, reach, bound
         self.sums = flat[: 2 * m * BINS].view(2, m, BINS)
-        self._counts = flat[2 * m * BINS : -1].view(2, m)  # of residuals counted, and of all with a weight other than 0
+        self._counts = flat[2 * m * BINS : -1].view(2, m)  # residuals used, and all residuals of weight other than 0
         self.count = self._counts[0]
         self.batches = flat[-1]
         self._offset = BINS * torch.arange(m, dtype=torch.int32, device=flat.device) - _FIRST
@@ -80,9 +91,9 @@ class ResidualHistogram:
         return self._counts[1] - self._counts[0]
 
     def set_bound(self, bound: Float[Tensor, " m"]) -> None:
-        """Sets the bound beyond which ``share_beyond`` counts; NaN for a channel whose bound is unknown.
+        """Set the bound beyond which ``share_beyond`` counts; NaN for a channel whose bound is unknown.
 
-        Before the first batch it is the reach of the bins as well; afterwards they stay as they are.
+        Before the first batch this also sets the reach of the bins; later the bins are unchanged.
         """
         self.bound = bound.detach().to(self.reach, copy=True)
         if not self._begun:
@@ -91,7 +102,7 @@ class ResidualHistogram:
             self._reach_is_set = bool(known.all())
 
     def to(self, device: torch.device) -> ResidualHistogram:
-        """Moves the histogram; to the CPU instead of an MPS device, which has no float64."""
+        """Move the histogram; to the CPU instead of an MPS device, which lacks float64."""
         device = torch.device("cpu") if device.type == "mps" else device
         if self._flat.device != device:
             parts = (self._flat, self.reach, self.bound)
@@ -100,15 +111,15 @@ class ResidualHistogram:
 
     @torch.no_grad()
     def add(self, error: Float[Tensor, "*shape"], weight: Tensor | None = None, channel_dim: int = -1) -> None:
-        """Adds a batch.
+        """Add a batch.
 
-        On the CPU it raises a ValueError if a residual that counts, or a weight, is not finite, or a weight negative.
-        On an accelerator no value is read: such elements are left out, and ``check`` raises the error. Residuals of
-        float16 or bfloat16 that overflowed are left out on every device, without an error.
+        On the CPU it raises ValueError for an unmasked residual that is not finite, and for a weight that is negative
+        or not finite. On an accelerator no value is read: such elements are left out, and ``check`` raises the error.
+        Overflowed residuals of float16 or bfloat16 are left out on every device, without an error.
 
         Args:
             error: residuals whose ``channel_dim`` has size m.
-            weight: weights ≥ 0 or a boolean mask of the same shape. What an element of weight 0 holds is not looked at.
+            weight: weights ≥ 0 or a boolean mask of the same shape. Elements of weight 0 are ignored.
             channel_dim: the dimension of the channels.
         """
         axis = channel_dim % error.dim()
@@ -128,7 +139,7 @@ class ResidualHistogram:
         if not self._reach_is_set and error.numel():
             self._set_reach(size if weight is None else size * (weight > 0), others)
         along = [-1 if i == axis else 1 for i in range(error.dim())]
-        # a channel without a reach got nothing but zeros, and 0 / inf is 0
+        # a channel without a reach has had zeros only, and 0 / inf is 0
         unit = self.reach if self._reach_is_set else torch.threshold(self.reach, 0.0, math.inf)
         # clamped, so that its square stays finite
         ratio = size.div_(unit.to(size.dtype).view(along)).clamp_(max=1e18).float()
@@ -144,7 +155,7 @@ class ResidualHistogram:
         self._begun = True
 
     def _leave_out(self, size: Tensor, weight: Tensor | None, others: list[int]) -> tuple[Tensor, Tensor]:
-        """Sizes and weights with 0 in place of what is not finite and of negative weights; counts the elements."""
+        """Sizes and weights with 0 for elements that are not finite or of negative weight; counts the elements."""
         counted = size < math.inf  # False for NaN
         if weight is None:
             self._counts[1].add_(size.numel() / len(self.reach))
@@ -159,8 +170,8 @@ class ResidualHistogram:
         return size.nan_to_num_(0.0, posinf=0.0), weight
 
     def _set_reach(self, size: Tensor, others: list[int]) -> None:
-        """Sets the reach of the channels that have none and get a residual other than 0."""
-        # the power of two below, a float64 without its other bits: bins of another reach are the same bins, moved on
+        """Set the reach of channels without a reach that get a residual other than 0."""
+        # the power of two below, by masking the mantissa: bins for another reach are the same bins, shifted
         power = (size.amax(others).double().view(torch.int64) & 0x7FF0000000000000).view(torch.float64)
         found = torch.threshold_(128.0 * power, _MIN_REACH, 0.0).clamp_(max=1.0 / _MIN_REACH)
         torch.where(self.reach > 0, self.reach, found, out=self.reach)
@@ -172,7 +183,7 @@ class ResidualHistogram:
             sums.view(-1).index_add_(0, index, added.flatten())
 
     def check(self) -> None:
-        """Raises the ValueError that ``add`` did not raise on an accelerator; after ``all_reduce`` in every process."""
+        """Raise the ValueError that ``add`` defers on an accelerator; after ``all_reduce`` in every process."""
         refused, reach = torch.stack((self.refused, self.reach)).tolist()
         self._reach_is_set = all(r > 0 for r in reach)
         if any(refused):
@@ -180,10 +191,10 @@ class ResidualHistogram:
             raise _refusal("residuals and weights >= 0", f"{sum(refused):.0f} others", bad)
 
     def all_reduce(self) -> None:
-        """Adds up the histograms of all processes, in each of them; alone it changes nothing.
+        """Replace the histogram of each process by the sum over all processes; without processes it changes nothing.
 
-        The largest reach becomes that of all. A process whose reach grows moves its bins by whole octaves, and what it
-        had beyond its reach, to the bin of its root mean square.
+        All processes get the largest reach. A process whose reach grows shifts its bins by whole octaves, and moves its
+        residuals beyond the old reach to the bin of their root mean square.
         """
         if dist.is_available() and dist.is_initialized():
             reach = self.reach.clone()
@@ -198,11 +209,11 @@ class ResidualHistogram:
             self._begun = True
 
     def clear(self) -> None:
-        """Empties the histogram; the reach stays."""
+        """Empty the histogram; the reach is kept."""
         self._flat.zero_()
 
     def residuals(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
-        """Root mean square and summed weight of each bin that is filled in any channel, float64."""
+        """Root mean square and summed weight of each bin that is not empty in every channel, float64."""
         weight, square = self.sums[:, :, (self.sums[0] > 0).any(0)]
         return (_rms(weight, square) * self.reach.unsqueeze(-1)).mT, weight.mT
 
@@ -211,13 +222,13 @@ class ResidualHistogram:
         return self.sums[0].sum(-1)
 
     def share_beyond(self) -> Float[Tensor, " m"]:
-        """The share of the weight beyond the bound; 0 for a channel without weight, NaN for one without a bound.
+        """Share of the weight beyond the bound; 0 for a channel without weight, NaN for a channel without a bound.
 
-        Exact where the bins reach up to the bound. Else a bin counts as its root mean square does.
+        Exact if the bins extend to the bound. Otherwise the root mean square of a bin decides.
         """
         weight, square = self.sums
         edge = _MARGIN * self.bound / torch.where(self.reach > 0, self.reach, 1.0)
-        # the last bin begins at 1, and the largest float32 below 1 is 6e-8 less
+        # the last bin begins at 1; the largest float32 below it is 1 - 6e-8
         beyond = _rms(weight, square) >= (1.0 - 1e-9) * edge.unsqueeze(-1)
         total = self.weight()
         share = torch.where(beyond, weight, 0.0).sum(-1) / torch.where(total > 0, total, 1.0)
@@ -233,11 +244,11 @@ class ResidualHistogram:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Takes over the state of another histogram; raises a ValueError if that has other channels or bins."""
+        """Load the state of another histogram; ValueError if that has other channels or bins."""
         sums, reach = state["sums"], state["reach"]
         if reach.shape != self.reach.shape or (sums is not None and sums.shape != self._flat.shape):
             raise ValueError(
-                f"Expected a histogram of {len(self.reach)} channels but got one of {len(reach)}; it was saved with "
+                f"Expected a histogram of {len(self.reach)} channels but got {len(reach)} channels; it was saved with "
                 "another number of channels, or by another version."
             )
         self.clear()
@@ -260,16 +271,16 @@ def _rms(weight: Tensor, square: Tensor) -> Tensor:
 
 
 def _leading_bits(ratio: Float[Tensor, "*shape"]) -> Int32[Tensor, "*shape"]:
-    """The bin of sizes ≥ 0 in units of the reach, counted from _FIRST to _LAST.
+    """Bin of each size ≥ 0 in units of the reach, from _FIRST to _LAST.
 
-    The leading bits of a float32, its exponent and six of its mantissa, count bins that grow with the number: as good
-    as a logarithm, and the same on every device.
+    The leading bits of a float32, its exponent and six bits of its mantissa, are the bin's number: nearly logarithmic,
+    and the same on every device.
     """
     return (ratio.view(torch.int32) >> (23 - _MANTISSA_BITS)).clamp_(_FIRST, _LAST)
 
 
 def _checked_size(error: Tensor, weight: Tensor | None, axis: int) -> Tensor:
-    """Sizes of the residuals that count; raises an error unless they and the weights are finite, and weights >= 0."""
+    """Absolute residuals, 0 where masked; ValueError unless residuals and weights are finite and weights >= 0."""
     size = error.abs()
     if weight is not None and not _has_finite_sum(size):
         size = torch.where(weight != 0, size, 0.0)
@@ -281,12 +292,12 @@ def _checked_size(error: Tensor, weight: Tensor | None, axis: int) -> Tensor:
 
 
 def _has_finite_sum(values: Tensor) -> bool:
-    """Whether no value is NaN or infinite, in a fraction of the time; False also where the sum overflows."""
+    """Whether the sum is finite: a fast check for NaN and infinity; False also if the sum overflows."""
     return math.isfinite(values.sum().item())
 
 
 def _refuse_by_channel(what: str, values: Tensor, good: Tensor, axis: int) -> None:
-    """Names the channels of the values that are not good, if there are any."""
+    """Raise ValueError with the channels of values that are not ``good``, if any."""
     if bool(good.all()):
         return
     bad = (~good).movedim(axis, 0).flatten(1).any(1).nonzero().flatten().tolist()
@@ -295,5 +306,5 @@ def _refuse_by_channel(what: str, values: Tensor, good: Tensor, axis: int) -> No
 
 def _refusal(what: str, got: object, channels: list[int]) -> ValueError:
     named = f"channel{'s' if len(channels) > 1 else ''} {', '.join(map(str, channels))}"
-    hint = "an element without a value gets the weight 0 or False, as in loss(input, target, torch.isfinite(target))."
+    hint = "mask missing values by the weight 0 or False, as in loss(input, target, torch.isfinite(target))."
     return ValueError(f"Expected finite {what} but got {got} in {named}; {hint}")

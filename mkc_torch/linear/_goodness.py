@@ -45,11 +45,11 @@ def robust_r_squared(
 def _holds_constant(problem: LinearProblem) -> Tensor:
     """Whether a combination of the columns is 1 in a channel's rows and 0 in the other channels', (B or 1, m)."""
     N, m = problem.num_samples, problem.num_channels
-    ones = torch.eye(m, dtype=problem.Y.dtype, device=problem.Y.device).expand(N, m, m).flatten(0, 1)
+    constant = torch.eye(m, dtype=problem.Y.dtype, device=problem.Y.device).expand(N, m, m).flatten(0, 1)
     rows = problem.basis.detach().flatten(-3, -2)
     if problem.sample_weight is not None and rows.shape[0] == problem.Y.shape[0]:
         used = (problem.sample_weight > 0).flatten(-2).unsqueeze(-1)
-        rows, ones = rows * used, ones * used
-    left = ones - torch.matmul(rows, torch.matmul(rows.mT, ones))
+        rows, constant = rows * used, constant * used
+    left = constant - torch.matmul(rows, torch.matmul(rows.mT, constant))
     tolerance = math.sqrt(torch.finfo(rows.dtype).eps)
-    return torch.linalg.vector_norm(left, dim=-2) <= tolerance * torch.linalg.vector_norm(ones, dim=-2)
+    return torch.linalg.vector_norm(left, dim=-2) <= tolerance * torch.linalg.vector_norm(constant, dim=-2)

@@ -154,9 +154,9 @@ def homoscedastic(problem: LinearProblem, equation: Scores) -> Float[Tensor, "B 
     variance = correction * weighted(problem, equation.psi.square()).sum(-2) / left / square  # of ψ(z) / E ψ'
     precision = equation.precision()
     least = equation.scale.amin(-1, keepdim=True).unsqueeze(-1).square()
-    ones = torch.ones_like(equation.psi)
-    inverse = torch.linalg.pinv(problem.normal_equations(ones * precision)[0], hermitian=True)
-    middle = problem.normal_equations(ones * precision * variance.unsqueeze(-2))[0]
+    unit_weight = torch.ones_like(equation.psi)
+    inverse = torch.linalg.pinv(problem.normal_equations(unit_weight * precision)[0], hermitian=True)
+    middle = problem.normal_equations(unit_weight * precision * variance.unsqueeze(-2))[0]
     return least * torch.matmul(torch.matmul(inverse, middle), inverse)
 
 

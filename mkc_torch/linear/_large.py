@@ -1,6 +1,6 @@
 """MKC-EM on many rows: a pilot fit to few rows, Newton steps on more rows, and at last on all.
 
-Each fit starts at the result and with the curvature of the one before, so that few passes over all rows are needed;
+Each fit starts at the result and with the curvature of the fit before, so that few passes over all rows are needed;
 four or five are usual. The last fit ends where a Newton step with the curvature of all rows would be shorter than a
 millionth of a standard error.
 """
@@ -36,7 +36,7 @@ LARGE = 20_000
 _GROWTH = 16
 """Growth factor of the rows between fits: each fit starts some ten of its standard errors from its maximum."""
 
-_LEAST_ROWS_LEFT = 8
+_LEAST_FACTOR_TO_ALL = 8
 """An intermediate fit is made if all rows are at least this many times its rows; else passes over all cost less."""
 
 _NEAR = 0.03
@@ -152,7 +152,7 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     if (
         end is None
         or end.curvature_sums is None
-        or _d_is_at_least(end, fit_state)
+        or _d_is_at_its_least(end, fit_state)
         or _gaussian_is_likelier(rows, fit_state, end, slopes.grams)
     ):
         return None
@@ -209,7 +209,7 @@ def _intermediate_subsets(
 ) -> Iterator[Rows]:
     """Yield random subsets of growing size, smaller than all rows."""
     count *= _GROWTH
-    while _LEAST_ROWS_LEFT * count < values.Y.shape[-2]:
+    while _LEAST_FACTOR_TO_ALL * count < values.Y.shape[-2]:
         yield _drawn(values, count, frame, seed)
         count *= _GROWTH
 
@@ -246,7 +246,7 @@ def _is_valid(rows: Rows) -> bool:
     return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
 
 
-def _d_is_at_least(end: DescentEnd, fit_state: FitState) -> bool:
+def _d_is_at_its_least(end: DescentEnd, fit_state: FitState) -> bool:
     """Whether d ended at its least, which is that of the pilot."""
     assert fit_state.log_d_min is not None
     return fit_state.free_d and bool((end.place.point.log_d <= fit_state.log_d_min).any())

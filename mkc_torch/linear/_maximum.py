@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.domain import domain_rule, refuse_bad_bound
-from mkc_torch.density.em import gaussian_state, normalised, spread, written
+from mkc_torch.density.em import gaussian_state, normalised, replace_problems, weighted_rms
 from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
@@ -66,7 +66,7 @@ def _alternate(
         done = stalled >= patience
         if bool(done.any()) or len(history) > max_iter:
             out_beta[index] = beta
-            out_state = written(out_state, index, state)
+            out_state = replace_problems(out_state, index, state)
             converged[index] = done & torch.isfinite(now)
             keep = (~done).nonzero().squeeze(-1)
             if keep.numel() == 0:
@@ -85,7 +85,7 @@ def _gaussian_candidate(
     beta = problem.weighted_fit(torch.ones_like(problem.Y))
     weight = normalised(problem.sample_weight)
     for _ in range(2 if problem.num_channels > 1 else 0):
-        d = spread(problem.residual(beta), weight, torch.exp(state.log_d_min))
+        d = weighted_rms(problem.residual(beta), weight, torch.exp(state.log_d_min))
         beta = fixed_point_step(problem, problem.Y, torch.zeros_like(d), d)
     gaussian = gaussian_state(problem.residual(beta), weight, state)
     better = (gaussian.value.sum(-1) < maximum.value).nonzero().squeeze(-1)
@@ -101,7 +101,7 @@ def _gaussian_candidate(
         history.append(now)
     return LikelihoodMaximum(
         beta=maximum.beta.index_copy(0, better, again.beta),
-        state=written(state, better, again.state),
+        state=replace_problems(state, better, again.state),
         value=maximum.value.index_copy(0, better, again.value),
         converged=maximum.converged.index_copy(0, better, again.converged),
         history=history,

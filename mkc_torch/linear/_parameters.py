@@ -41,7 +41,7 @@ class Parametrised:
             if name not in changed:
                 known = ", ".join(f"`{parameter}`" for parameter in changed) or "which has none"
                 raise ValueError(
-                    f"Expected parameters of {type(self).__name__}, {known}, but got `{name}`; use one of these names."
+                    f"Expected parameters of {type(self).__name__}, {known}, but got `{name}`; use a listed name."
                 )
             if inside:
                 nested.setdefault(name, {})[rest] = value

@@ -42,7 +42,7 @@ class MKCRegression(Inference):
 
     The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or
     under a transform of ``torch.func``, ``coef_``, ``sigma_``, ``d_``, ``weights_`` and ``log_likelihood_`` carry the
-    derivatives of the maximum by implicit differentiation, jointly in all its unknowns: first and second ones, in
+    derivatives of the maximum by implicit differentiation, jointly in all its unknowns: first and second order, in
     reverse and forward mode and under ``vmap``. Newton steps then polish the solution until the gradient of the
     likelihood is rounding. A domain that follows from the data counts as a constant, and so does an unknown that ends
     at a limit: σ at ``inf`` or 0.05, d at its least. A fit that has not converged, or that ended at a point other than

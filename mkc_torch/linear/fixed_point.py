@@ -127,7 +127,7 @@ class FixedPointLinear(Inference):
 
     The fit is a differentiable layer: where X, Y, ``sample_weight``, σ, d or the noise covariance require a gradient,
     or under a transform of ``torch.func``, ``coef_`` and ``weights_`` carry the derivatives of the solution by implicit
-    differentiation, first and second ones, in reverse and forward mode and under ``vmap``. Newton steps then polish
+    differentiation, first and second order, in reverse and forward mode and under ``vmap``. Newton steps then polish
     ``coef_`` until the gradient of the loss is rounding. A fit that has not converged, or that ended at a point other
     than a strict minimum, has no derivative: taking it raises. Start, ``covariance_`` and ``history_`` are constants.
 

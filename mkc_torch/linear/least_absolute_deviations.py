@@ -139,9 +139,9 @@ class _Iterate:
     def first(cls, rows: Tensor, target: Tensor, floor: Tensor) -> _Iterate:
         spread = target.abs().mean(-1, keepdim=True)
         above, below = target.clamp(min=0) + spread, (-target).clamp(min=0) + spread
-        ones = torch.ones_like(target)
+        unit = torch.ones_like(target)
         beta = target.new_zeros(target.shape[0], rows.shape[-1])
-        return cls(rows, target, floor, beta, above, below, ones, ones)
+        return cls(rows, target, floor, beta, above, below, unit, unit)
 
     def select(self, keep: Tensor) -> _Iterate:
         rows = self.rows if self.rows.shape[0] == 1 else self.rows[keep]

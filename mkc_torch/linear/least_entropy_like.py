@@ -89,7 +89,7 @@ class LeastEntropyLike(LinearEstimator):
     ) -> None:
         super().__init__()
         if start is not None and starts is not None:
-            raise ValueError("Expected argument `start` or `starts` but got both; pass only one of them.")
+            raise ValueError("Expected argument `start` or `starts` but got both; pass one argument only.")
         for name, value, least in (("start", start, 1), ("starts", starts, 2)):
             if value is None:
                 continue

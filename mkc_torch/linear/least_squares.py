@@ -53,9 +53,9 @@ class LeastSquares(Inference):
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
-        ones = torch.ones_like(problem.Y)
-        beta = problem.weighted_fit(ones)
-        self._set_common(problem, beta, ones)
+        unit_weight = torch.ones_like(problem.Y)
+        beta = problem.weighted_fit(unit_weight)
+        self._set_common(problem, beta, unit_weight)
         self.dof_ = problem.restore(values_left(problem))
         unit = torch.ones_like(problem.Y[:, 0])
         self.covariance_ = coefficient_covariance(

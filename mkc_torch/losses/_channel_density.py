@@ -123,7 +123,7 @@ class ChannelDensity(nn.Module):
             if bool((kappa == 0).any()):
                 raise ValueError(
                     "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
-                    "start large, at 10 say, or pass `learn_sigma=False`."
+                    "start large, for example at 10, or pass `learn_sigma=False`."
                 )
             self.raw_kappa.copy_(logit_of_kappa(kappa))
         elif self.fixed_kappa is not None:

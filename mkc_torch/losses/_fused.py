@@ -150,14 +150,14 @@ def reduced_loss(
             _array(xp, batch.weight),
             _array(xp, batch.counts),
             batch.axis,
-            looks=batch.input.device.type == "cpu",
+            can_read=batch.input.device.type == "cpu",
         )
         divisor = _divisor(xp, work, settings)
         if xp is torch and _is_large(batch):
             sums, by_input = _in_pieces(work, table, divisor, wants_input=wants_input)
         else:
-            sums, by_input = _at_once(xp, work, table, divisor, wants_input=wants_input)
-        value, by_raw_kappa, by_raw_d = _assembled(xp, work, sums, table, divisor)
+            sums, by_input = _whole_batch(xp, work, table, divisor, wants_input=wants_input)
+        value, by_raw_kappa, by_raw_d = _value_and_gradients(xp, work, sums, table, divisor)
     return ReducedLoss(
         torch.scalar_tensor(value, dtype=dtype) if xp is np else value.to(dtype),
         by_input,
@@ -171,14 +171,14 @@ def _tensor(xp: Any, values: Any, dtype: torch.dtype) -> Tensor:
 
 
 class Elements(NamedTuple):
-    """A batch as arrays of NumPy or torch; ``looks``: whether values can be read without waiting for a device."""
+    """A batch as arrays of NumPy or torch; ``can_read``: whether values can be read without waiting for a device."""
 
     input: Any
     target: Any
     weight: Any
     counts: Any
     axis: int
-    looks: bool
+    can_read: bool
 
     @property
     def others(self) -> tuple[int, ...]:
@@ -211,7 +211,7 @@ def _summed(xp: Any, values: Any, dims: tuple[int, ...] | None) -> Any:
     return values.sum() if dims is None else values.sum(dims)
 
 
-def _at_once(
+def _whole_batch(
     xp: Any, batch: Elements, table: ChannelTable, divisor: Any, *, wants_input: bool
 ) -> tuple[ChannelSums, Tensor | None]:
     error = batch.input - batch.target
@@ -226,7 +226,7 @@ def _at_once(
         return (values.astype(dtype) if xp is np else values.to(dtype)).reshape(shape)
 
     shaped = ChannelTable(*(along(value) for value in table))
-    values, by_input = _element_values(xp, error, batch.weight, shaped, divisor, looks=batch.looks)
+    values, by_input = _element_values(xp, error, batch.weight, shaped, divisor, can_read=batch.can_read)
     sums = ChannelSums(*(None if value is None else _summed(xp, value, batch.others) for value in values))
     if not wants_input:
         return sums, None
@@ -234,19 +234,19 @@ def _at_once(
 
 
 def _element_values(
-    xp: Any, error: Any, weight: Any, table: ChannelTable, divisor: Any, *, looks: bool
+    xp: Any, error: Any, weight: Any, table: ChannelTable, divisor: Any, *, can_read: bool
 ) -> tuple[ChannelSums, Any]:
     """Summands of each element, and the gradient by the input; the table must broadcast with ``error``."""
     z = error / table.d
     learns_kappa, learns_d = table.kappa_by_raw is not None, table.d_by_raw is not None
-    has_gaussian = not looks or bool((table.kappa == 0).any())
-    each_kappa = learns_kappa and (not looks or bool((table.kappa < SMALL_KAPPA).any()))
+    has_gaussian = not can_read or bool((table.kappa == 0).any())
+    each_kappa = learns_kappa and (not can_read or bool((table.kappa < SMALL_KAPPA).any()))
     density = element_energy(xp, z, table.kappa, wants_kappa=each_kappa, has_gaussian=has_gaussian)
     by_d = -z * density.by_z if learns_kappa or learns_d else None
     if table.share is None:
         network, by_input = None, density.by_z * (1.0 / (table.d * divisor))
     else:
-        network, by_input = _network(xp, error, table, divisor, looks=looks)
+        network, by_input = _network(xp, error, table, divisor, can_read=can_read)
     if weight is not None:
         by_input = by_input * weight
     values = (network, density.value, density.by_kappa, by_d)
@@ -254,14 +254,14 @@ def _element_values(
     return ChannelSums(*sums), by_input
 
 
-def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, looks: bool) -> tuple[Any, Any]:
+def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, can_read: bool) -> tuple[Any, Any]:
     """The network term of each element, and its derivative by the error over the divisor."""
     share = table.share
     parts = []
-    if not looks or bool((share > 0).any()):
+    if not can_read or bool((share > 0).any()):
         own = element_energy(xp, error / table.annealed_d, table.annealed_kappa, wants_kappa=False)
         parts.append((share * own.value, own.by_z * (share / (table.annealed_d * divisor))))
-    if not looks or bool((share < 1).any()):
+    if not can_read or bool((share < 1).any()):
         z = error / table.scale
         influence = initial_influence(xp, z)[0]
         parts.append(((1.0 - share) * initial_loss(xp, z), influence * ((1.0 - share) / (table.scale * divisor))))
@@ -300,7 +300,7 @@ def _in_pieces(
             error = given[0] - given[1]
             if given[3] is not None:
                 error = torch.where(given[3], error, 0.0)
-            values, slope = _element_values(torch, error, given[2], tiled, divisor, looks=True)
+            values, slope = _element_values(torch, error, given[2], tiled, divisor, can_read=True)
             if by_input is not None:
                 by_input[first:last].view(-1, r * m).copy_(slope)
             for i, value in enumerate(values):
@@ -310,7 +310,9 @@ def _in_pieces(
     return ChannelSums(*sums), None if by_input is None else by_input.view_as(batch.input)
 
 
-def _assembled(xp: Any, batch: Elements, sums: ChannelSums, table: ChannelTable, divisor: Any) -> tuple[Any, Any, Any]:
+def _value_and_gradients(
+    xp: Any, batch: Elements, sums: ChannelSums, table: ChannelTable, divisor: Any
+) -> tuple[Any, Any, Any]:
     """Value and gradients by the raw parameters, from the sums of each channel."""
     total = sums.energy if sums.network is None else sums.energy + sums.network
     by_kappa = sums.by_kappa

@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 from mkc_torch.density.tails import Tails, assess_tails
 from mkc_torch.losses._checks import checked_weight, format_channels
 
-__all__ = ["tails_of", "what_goes_wrong"]
+__all__ = ["tails_of", "training_warnings"]
 
 NEAR_FLOOR = 2.0
 """Factor on the floor of d below which a scale is reported as collapsed."""
@@ -21,7 +21,7 @@ MOST_BEYOND = 0.01
 
 
 @torch.no_grad()
-def what_goes_wrong(
+def training_warnings(
     loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None, optimizer: Optimizer | None
 ) -> tuple[str, ...]:
     """Warnings of :meth:`mkc_torch.MKCLoss.check`."""

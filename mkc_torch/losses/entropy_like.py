@@ -6,7 +6,7 @@ H is (40)-(42) of G. Indiveri, "An Entropy-Like Estimator for Robust Parameter I
     q_i = r_i² / Σ_j r_j²,    H = -Σ_i q_i log q_i / log N
 
 :func:`entropy_like` computes it, :class:`LELoss` is the loss of networks, :func:`least_entropy_like` minimises it over
-the parameters of any differentiable residual, :class:`mkc_torch.linear.LeastEntropyLike` over those of a linear one.
+the parameters of any differentiable residual, :class:`mkc_torch.linear.LeastEntropyLike` over those of a linear model.
 """
 
 from __future__ import annotations
@@ -284,7 +284,7 @@ def orthogonal_starts(theta: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch
 
 @dataclass(frozen=True)
 class EntropyLikeMinima:
-    """Local minima of H, one for each start.
+    """Local minima of H, a minimum per start.
 
     Attributes:
         starts: (S, p).

@@ -353,8 +353,8 @@ def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> 
     """``1 / sigma^2`` as a scalar tensor; a number is converted to ``dtype``, None being the default dtype."""
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError(
-            "Expected argument `sigma` without a gradient but got a tensor that requires one: the loss is smallest at "
-            "the smallest sigma, whatever the data. Pass sigma.detach(), and see graduated_sigma for a schedule."
+            "Expected argument `sigma` without a gradient but got a tensor with requires_grad=True: the loss is "
+            "smallest at the smallest sigma, whatever the data. Pass sigma.detach(); graduated_sigma is a schedule."
         )
     t = as_numbers("sigma", sigma, dtype)
     t = t.to(at_least_float32(t))

@@ -24,7 +24,7 @@ from mkc_torch.losses._checks import (
 from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._fused import fused_loss
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
-from mkc_torch.losses._inspection import tails_of, what_goes_wrong
+from mkc_torch.losses._inspection import tails_of, training_warnings
 from mkc_torch.losses._terms import Batch, LossSettings, LossTerms, loss_terms, loss_value
 
 if TYPE_CHECKING:
@@ -253,7 +253,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             >>> [text[:44] for text in loss.check(optimizer=torch.optim.Adam(net.parameters()))]
             ['The optimizer does not have sigma and d of t']
         """
-        return what_goes_wrong(self, input, target, weight, optimizer)
+        return training_warnings(self, input, target, weight, optimizer)
 
     def tails(
         self,

@@ -16,7 +16,7 @@ from mkc_torch._support.torch_internals import is_wrapped
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["ResidualScale", "alike_in_all_processes", "average_over_processes", "is_distributed", "numpy_may_read"]
+__all__ = ["ResidualScale", "average_over_processes", "is_distributed", "numpy_may_read", "synchronized_state"]
 
 QUANTILE = 0.4
 """Level of the quantile of |residual| that gives the scale: below 0.5, because half of the targets may be wrong."""
@@ -141,7 +141,7 @@ class ResidualScale(nn.Module):
             self.recent.index_copy_(-1, slots, batch.rows)
             self.position.copy_((self.position + count) % length)
             state = updated(torch, self.recent, self._state(), batch)
-        for old, new in zip(self._state(), alike_in_all_processes(state), strict=True):
+        for old, new in zip(self._state(), synchronized_state(state), strict=True):
             old.copy_(new)
 
     def _sampled(
@@ -325,7 +325,7 @@ def is_distributed() -> bool:
     return distributed and torch.distributed.get_world_size() > 1
 
 
-def alike_in_all_processes(state: ScaleState) -> ScaleState:
+def synchronized_state(state: ScaleState) -> ScaleState:
     """The common state of all processes in distributed training: the mean scales, the widest half range.
 
     Processes in which a channel has had no batch are left out of that channel's mean.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mkc_torch.density.em import gaussian_state, normalised, spread, written
+from mkc_torch.density.em import gaussian_state, normalised, replace_problems, weighted_rms
 from mkc_torch.density.likelihood import DensityState, conclusive, newton_step
 from mkc_torch.nonlinear._constraints import descend_constrained
 from mkc_torch.nonlinear._descent import damped_step
@@ -112,7 +112,7 @@ def gaussian_candidate(
     d_min = torch.exp(state.log_d_min)
 
     # the linearised residual shows whether a Gaussian can have a higher likelihood, before a fit is made
-    d = spread(point.residual, likelihood.weight, d_min)
+    d = weighted_rms(point.residual, likelihood.weight, d_min)
     residual = point.residual
     for _ in range(1 if d.shape[-1] == 1 else 2):
         quadratic = quadratic_about(problem, point, torch.zeros_like(d), d, None)
@@ -127,7 +127,7 @@ def gaussian_candidate(
         )
         change = torch.matmul(step.unsqueeze(-2), point.tangents).squeeze(-2).unflatten(-1, residual.shape[1:])
         residual = point.residual + change
-        d = spread(residual, likelihood.weight, d_min)
+        d = weighted_rms(residual, likelihood.weight, d_min)
     share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
     gaussian = gaussian_state(residual, likelihood.weight, state)
     better = tailed & ((share * gaussian.value).sum(-1) < maximum.value + tol)
@@ -151,7 +151,7 @@ def gaussian_candidate(
         )
     return AlternatingMaximum(
         point=point.write(index, winner),
-        state=written(state, index, again.state.select(won)),
+        state=replace_problems(state, index, again.state.select(won)),
         value=maximum.value.index_copy(0, index, again.value[won]),
         converged=maximum.converged.index_copy(0, index, again.converged[won]),
         n_iter=maximum.n_iter + again.n_iter,

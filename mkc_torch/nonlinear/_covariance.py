@@ -63,7 +63,7 @@ def parameter_covariance(
 
 
 def _active_normals(problem: Problem, point: ProblemPoint, gradient: Tensor, penalty: Penalty | None) -> Tensor:
-    """Normals (B, k, p) of the active bounds and constraints; 0 for inactive ones."""
+    """Normals (B, k, p) of the active bounds and constraints; 0 for inactive bounds and constraints."""
     B, p = point.theta.shape
     rows = [torch.zeros(B, 1, p, dtype=gradient.dtype, device=gradient.device)]
     if problem.box is not None:

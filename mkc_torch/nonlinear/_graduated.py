@@ -21,7 +21,7 @@ LEAST_SCALE = 0.3
 """Least d in robust scales. Outliers at most double a scale; the d of a fit that interpolates is far smaller."""
 
 _KERNELS = (10.0, 4.0, 1.6, 0.7)
-"""Successive kernel widths in robust scales: wide kernels have few local minima, narrow ones ignore outliers."""
+"""Successive kernel widths in robust scales: wide kernels have few local minima, narrow kernels ignore outliers."""
 
 
 def residual_scale(problem: Problem, point: ProblemPoint) -> Float[Tensor, "B m"]:

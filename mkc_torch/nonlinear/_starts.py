@@ -101,7 +101,7 @@ def most_likely(
 ) -> Ends:
     """Find the most likely result, with all residuals judged on one domain.
 
-    The domain is the given one, or that of the result with the smallest scale.
+    The domain is ``given``, or that of the result with the smallest scale.
 
     Args:
         problem: B problems.

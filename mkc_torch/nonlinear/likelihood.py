@@ -49,7 +49,7 @@ class NonlinearFit:
             :meth:`explained`.
         starts: number of starts.
         agreeing: number of starts that ended at this minimum, or at others within 0.01 nats of all residuals, (*,). A
-            single one of many suggests that a better minimum exists: use more starts.
+            single start of many suggests that a better minimum exists: use more starts.
     Example:
         >>> generator = torch.Generator().manual_seed(0)
         >>> y = 2.0 + 0.1 * torch.randn(200, generator=generator, dtype=torch.float64)
@@ -90,7 +90,7 @@ class NonlinearFit:
         The scales are 1.4826 times the median absolute value of the residuals, and of the targets about their median,
         without weights. A value below 0.8 for a model that should describe its targets shows a wrong local minimum. A
         robust fit may choose half of the targets, and a wrong fit explains up to 0.69 in that way (sines of unknown
-        frequency, noise of 0.1, one target in ten a gross outlier: 239 wrong minima, 61 right ones above 0.97).
+        frequency, noise of 0.1, one target in ten a gross outlier: 239 wrong minima, 61 right minima above 0.97).
 
         Args:
             target: targets of the residual, (N,), (N, m) or (*, N, m).

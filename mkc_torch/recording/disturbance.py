@@ -42,7 +42,7 @@ def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"])
     Example:
         >>> time = torch.arange(1000) / 50.0
         >>> disturbed_intervals(time, (time > 4.0) & (time < 7.0))
-        (Interval(start=4.01..., end=6.98...),)
+        (RejectedInterval(start=4.01..., end=6.98...),)
     """
     steps = time.diff()
     starts = torch.cat([torch.tensor([0]), (steps < 0).nonzero().squeeze(-1) + 1, torch.tensor([len(time)])])

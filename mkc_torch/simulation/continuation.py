@@ -21,7 +21,7 @@ Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
 """Maps the parameters of a fit to the simulation's own parameters and the changes at its ports."""
 
 _MOST_KEPT = 64
-"""Number of past evaluations that are kept, because a fit returns to one of the last."""
+"""Number of past evaluations that are kept, because a fit returns to recent parameters."""
 
 
 class ResidualTangents(NamedTuple):

@@ -64,7 +64,7 @@ def load_simulation(source: str) -> Simulation:
             ) from None
     if not _is_simulation(found):
         raise SimulationFileError(
-            f"{path}: `{name}` is no simulation, for it has no `prepare`; derive it from mkc_torch.simulation.Dynamics "
+            f"{path}: `{name}` is not a simulation: it has no `prepare`; derive it from mkc_torch.simulation.Dynamics "
             "or Static."
         )
     return found
@@ -172,7 +172,7 @@ def _free_name(path: Path) -> str:
 
 
 _loading: list[str] = []
-"""Names of the modules being loaded, each imported by the previous one."""
+"""Names of the modules being loaded, each imported by the previous module."""
 
 
 def _where_to_call(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Long work stops between its steps: when its time is over, and at an interrupt, and leaves no process behind."""
+"""Long work stops between its steps at a time limit and at an interrupt, and leaves no process behind."""
 
 import multiprocessing
 import os
@@ -16,25 +16,25 @@ from tests.started import started
 
 
 @pytest.fixture(autouse=True)
-def usual_interrupts():
+def default_interrupts():
     """A background shell may ignore interrupts."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
-posix = pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
+posix = pytest.mark.skipif(os.name == "nt", reason="no POSIX signals")
 
 
 @pytest.fixture
-def a_copy():
+def one_copy():
     allow_copies(1)
     yield
     allow_copies(0)
 
 
-def test_nothing_is_limited_outside_of_a_block():
+def test_there_is_no_deadline_outside_of_a_block():
     check_deadline()
     with limited(60.0):
         check_deadline()
@@ -42,40 +42,40 @@ def test_nothing_is_limited_outside_of_a_block():
     assert not is_limited()
 
 
-def test_time_that_is_over_stops_the_next_step():
-    with limited(60.0, begin=time.monotonic() - 61.0), pytest.raises(Stopped) as told:
+def test_an_exceeded_time_limit_stops_the_next_step():
+    with limited(60.0, begin=time.monotonic() - 61.0), pytest.raises(Stopped) as raised:
         check_deadline()
-    assert told.value.reason == "time limit"
+    assert raised.value.reason == "time limit"
 
 
-def test_stopped_is_no_failure_that_code_could_deal_with_and_can_be_sent():
+def test_stopped_is_not_an_exception_and_can_be_pickled():
     assert not issubclass(Stopped, Exception)
     assert pickle.loads(pickle.dumps(Stopped("interrupt"))).reason == "interrupt"
 
 
-def test_what_is_of_use_in_time_alone():
+def test_within_returns_none_after_the_time_limit():
     assert within(60.0, lambda: 1) == 1
     assert within(0.0, check_deadline) is None
     with limited(0.0):
-        assert within(60.0, lambda: check_deadline() or 1) == 1  # with a deadline of its own
+        assert within(60.0, lambda: check_deadline() or 1) == 1  # the inner deadline replaces the outer
 
 
 @posix
-def test_the_first_interrupt_stops_at_the_next_step_and_the_second_one_is_as_usual(monkeypatch):
+def test_first_interrupt_stops_at_the_next_step_and_second_raises_keyboard_interrupt(monkeypatch):
     monkeypatch.setattr("mkc_torch._parallel.deadline._SAME_INTERRUPT_S", 0.0)
     with stopped_by_interrupt(), limited():
         check_deadline()
         signal.raise_signal(signal.SIGINT)
-        with pytest.raises(Stopped) as told:
+        with pytest.raises(Stopped) as raised:
             check_deadline()
-        assert told.value.reason == "interrupt"
+        assert raised.value.reason == "interrupt"
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @posix
-def test_an_interrupt_that_comes_twice_at_once_is_one():
+def test_two_immediate_interrupts_count_as_a_single_interrupt():
     with stopped_by_interrupt(), limited():
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # from the terminal, and from a parent process
@@ -84,7 +84,7 @@ def test_an_interrupt_that_comes_twice_at_once_is_one():
 
 
 @posix
-def test_another_handler_and_another_thread_stay_as_they_are():
+def test_other_handlers_and_threads_are_unchanged():
     known = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with stopped_by_interrupt():
@@ -104,7 +104,7 @@ def test_another_handler_and_another_thread_stay_as_they_are():
 
 
 @pytest.mark.parametrize("copies", [0, pytest.param(1, marks=linux)])
-def test_no_work_is_begun_once_it_is_time(copies):
+def test_no_work_starts_after_the_deadline(copies):
     allow_copies(copies)
     try:
         done = []
@@ -116,18 +116,18 @@ def test_no_work_is_begun_once_it_is_time(copies):
 
 
 @linux
-@pytest.mark.usefixtures("a_copy")
-def test_a_copy_that_is_waited_for_is_ended():
+@pytest.mark.usefixtures("one_copy")
+def test_deadline_ends_a_copy_that_is_waited_for():
     with limited(0.3), speculative([signal.pause]) as answer:
-        time.sleep(0.2)  # the copy has the only work
+        time.sleep(0.2)  # the copy has started the work
         with pytest.raises(Stopped):
             answer()
     assert multiprocessing.active_children() == []
 
 
 @linux
-@pytest.mark.usefixtures("a_copy")
-def test_a_copy_stops_itself_too():
+@pytest.mark.usefixtures("one_copy")
+def test_a_copy_stops_at_the_deadline_itself():
     def work():
         while True:
             check_deadline()
@@ -146,7 +146,7 @@ from mkc_torch._parallel.pool import allow_copies, shared
 def work():
     print(flush=True)
     while os.getpid() != here:
-        time.sleep(0.1)  # a copy asks for nothing
+        time.sleep(0.1)  # a copy does not check its deadline
     while True:
         check_deadline()
         time.sleep(0.01)
@@ -163,12 +163,12 @@ with stopped_by_interrupt(), limited():
 
 @linux
 @pytest.mark.process
-def test_an_interrupt_of_all_processes_stops_work_and_ends_its_copies():
+def test_interrupt_of_all_processes_stops_work_and_ends_copies():
     with started("-c", STOPPED) as process:
         for _ in range(2):
             process.stdout.readline()
         os.killpg(process.pid, signal.SIGINT)
-        # the copies have its streams too, which end when the last one has
-        said, errors = process.communicate(timeout=60)
-    assert (said, errors) == ("interrupt\n", "")
+        # the copies share its streams, which close when the last copy ends
+        output, errors = process.communicate(timeout=60)
+    assert (output, errors) == ("interrupt\n", "")
     assert process.returncode == 0

@@ -1,4 +1,4 @@
-"""Work is shared by copies of a process; whoever does it, the results are those of this process alone."""
+"""Work is shared by copies of a process; the results do not depend on the process that does it."""
 
 import multiprocessing
 import os
@@ -17,14 +17,14 @@ from mkc_torch._parallel import pool as _pool
 from mkc_torch._parallel.pool import Serializer, allow_copies, shared, speculative
 from tests.started import started
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux alone")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux only")
 
 HERE = os.getpid()
 
 
 @pytest.fixture(autouse=True)
 def _copies():
-    # this process has threads that a copy lacks, so no work here computes with tensors of more than a few numbers
+    # copies lack the threads of this process, so no work here computes with large tensors
     allow_copies(2)
     yield
     allow_copies(0)
@@ -33,7 +33,7 @@ def _copies():
 
 
 def elsewhere(value):
-    """A value, and who gave it; slow enough for others to take the next."""
+    """A work that returns a value and its process; slow enough for other processes to take the next work."""
 
     def work():
         time.sleep(0.05)
@@ -44,18 +44,18 @@ def elsewhere(value):
 
 @contextmanager
 def begun(work):
-    """A work, and a function that waits until a copy has begun with it."""
-    ready, said = os.pipe()
+    """A work, and a function that waits until a copy has started it."""
+    ready, started_end = os.pipe()
 
-    def told():
-        os.write(said, b"x")
+    def announced():
+        os.write(started_end, b"x")
         return work()
 
     try:
-        yield told, lambda: os.read(ready, 1)
+        yield announced, lambda: os.read(ready, 1)
     finally:
         os.close(ready)
-        os.close(said)
+        os.close(started_end)
 
 
 def test_results_come_in_order_and_copies_take_part():
@@ -64,14 +64,14 @@ def test_results_come_in_order_and_copies_take_part():
     assert len({process for _, process in results}) == 3
 
 
-def test_without_copies_all_is_done_here():
+def test_without_copies_this_process_does_all_work():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
     with speculative([os.getpid]) as answer:
         assert answer() == [HERE]
 
 
-def test_nothing_is_forked_elsewhere_than_on_linux(monkeypatch):
+def test_nothing_is_forked_on_other_systems_than_linux(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     allow_copies(2)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
@@ -81,8 +81,8 @@ def test_a_single_work_needs_no_copy():
     assert shared([os.getpid]) == [HERE]
 
 
-def test_a_copy_shares_nothing_further():
-    """Also where others are at work, which are no copies of its own."""
+def test_copies_do_not_fork_copies():
+    """Also while other copies of this process are working."""
 
     def work():
         time.sleep(0.05)
@@ -93,13 +93,13 @@ def test_a_copy_shares_nothing_further():
         assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
 
 
-def test_what_a_copy_cannot_send_is_done_here():
+def test_work_with_an_unpicklable_result_is_done_here():
     results = shared([lambda k=k: (os.getpid(), lambda: k) for k in range(6)])
-    assert [one() for _, one in results] == list(range(6))
+    assert [value() for _, value in results] == list(range(6))
     assert {process for process, _ in results} == {HERE}
 
 
-def test_what_a_copy_left_undone_is_done_here():
+def test_work_of_a_killed_copy_is_done_here():
     def dies():
         if os.getpid() != HERE:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -110,7 +110,7 @@ def test_what_a_copy_left_undone_is_done_here():
         assert answer() == [HERE] * 5
 
 
-def test_without_memory_for_a_copy_all_is_done_here(monkeypatch):
+def test_without_memory_for_a_copy_this_process_does_all_work(monkeypatch):
     def fails():
         raise BlockingIOError
 
@@ -120,7 +120,7 @@ def test_without_memory_for_a_copy_all_is_done_here(monkeypatch):
         assert answer() == [HERE]
 
 
-def test_an_error_is_raised_here():
+def test_an_error_of_a_work_is_raised_here():
     def fails():
         raise ArithmeticError(f"in {os.getpid() == HERE}")
 
@@ -129,7 +129,7 @@ def test_an_error_is_raised_here():
 
 
 @pytest.mark.parametrize("most", [0, 2])
-def test_whoever_works_results_lie_in_memory_alike(most):
+def test_results_have_the_same_memory_layout_from_any_process(most):
     allow_copies(most)
     known, whole = object(), torch.arange(1000.0).double()
 
@@ -142,21 +142,21 @@ def test_whoever_works_results_lie_in_memory_alike(most):
         assert result[2].dtype == torch.float64
         assert float(result[2]) == 7.0
         assert result[3].tolist() == [[False, True], [False, True]]
-        # no view, and aligned as torch does it
+        # not a view, and aligned as by torch
         assert result[1].untyped_storage().nbytes() == 16
         assert all(tensor.data_ptr() % 64 == 0 for tensor in result[1:])
 
 
-def test_a_parcel_holds_the_number_of_what_is_known():
+def test_known_objects_are_pickled_by_their_number():
     local = type("Local", (), {})  # no module holds it by its name
     known = [local(), local()]
-    parcel = Serializer(known).packed({"one": known[1], "none": None})
-    assert Serializer(["other", "another"]).unpacked(parcel) == {"one": "another", "none": None}
+    parcel = Serializer(known).packed({"known": known[1], "none": None})
+    assert Serializer(["other", "another"]).unpacked(parcel) == {"known": "another", "none": None}
     with pytest.raises(pickle.PicklingError, match="Local"):
         Serializer().packed(known[1])
 
 
-def test_a_copy_works_meanwhile():
+def test_speculative_work_runs_in_a_copy():
     known = object()
     with begun(lambda: (os.getpid(), known)) as (work, wait), speculative([work], [known]) as answer:
         wait()
@@ -165,7 +165,7 @@ def test_a_copy_works_meanwhile():
     assert same is known
 
 
-def test_what_goes_on_meanwhile_is_shared_all_the_same_and_goes_before():
+def test_shared_work_has_priority_over_speculative_work():
     with begun(lambda: os.nice(0)) as (work, wait), speculative([work]) as answer:
         wait()
         results = shared([elsewhere(k) for k in range(9)])
@@ -173,12 +173,12 @@ def test_what_goes_on_meanwhile_is_shared_all_the_same_and_goes_before():
         assert answer() > [os.nice(0)]
 
 
-def test_without_a_free_core_what_could_go_on_meanwhile_is_done_by_who_asks():
+def test_without_a_free_core_speculative_work_is_done_on_request():
     allow_copies(1)
     with speculative([signal.pause]), speculative([os.getpid]) as answer:
         assert answer() == [HERE]
     with speculative([os.getpid]) as first:
-        first()  # its core is free from here on
+        first()  # its core is free from now on
         while not all(copy.done() for copy in _pool._ahead):
             time.sleep(0.01)
         with begun(os.getpid) as (work, wait), speculative([work]) as answer:
@@ -186,8 +186,8 @@ def test_without_a_free_core_what_could_go_on_meanwhile_is_done_by_who_asks():
             assert answer() != [HERE]
 
 
-def test_what_nobody_has_begun_is_done_by_who_asks():
-    """The copy begins with the last one."""
+def test_speculative_work_that_has_not_started_is_done_on_request():
+    """The copy starts with the last work."""
     allow_copies(1)
     with (
         begun(lambda: (time.sleep(0.5), os.getpid())) as (last, wait),
@@ -200,12 +200,12 @@ def test_what_nobody_has_begun_is_done_by_who_asks():
     assert process != HERE
 
 
-def test_meanwhile_a_work_that_fails_fails_here():
+def test_an_error_of_speculative_work_is_raised_on_request():
     with speculative([lambda: 1 / 0]) as answer, pytest.raises(ZeroDivisionError):
         answer()
 
 
-def test_a_copy_that_is_not_waited_for_is_ended():
+def test_unused_copies_are_ended():
     with speculative([signal.pause]):
         pass
     assert multiprocessing.active_children() == []
@@ -229,16 +229,16 @@ except KeyboardInterrupt:
 
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_whatever_ends_this_process_ends_its_copies(number):
+def test_the_end_of_this_process_ends_its_copies(number):
     with started("-c", ENDED) as process:
         assert process.stdout is not None
         for _ in range(2):
             process.stdout.readline()
         # a terminal interrupts all of them
         os.killpg(process.pid, number) if number == signal.SIGINT else process.kill()
-        # the copies have its streams too, which end when the last one has
-        said, errors = process.communicate(timeout=60)
-    assert said == ("interrupted\n" if number == signal.SIGINT else "")
+        # the copies share its streams, which close when the last copy ends
+        output, errors = process.communicate(timeout=60)
+    assert output == ("interrupted\n" if number == signal.SIGINT else "")
     assert errors == ""
 
 
@@ -253,16 +253,16 @@ CODE = """
 
     one_thread()
 
-    def alike(one, other):
-        # one process alone repeats a diagnosis to rounding only, which fits and free runs multiply;
-        # what a copy did of something else is further away. All that is no number is the same.
-        if isinstance(one, dict):
-            return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one)
-        if isinstance(one, list):
-            return len(one) == len(other) and all(map(alike, one, other))
-        if isinstance(one, float):
-            return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
-        return one == other
+    def alike(first, second):
+        # a process repeats a diagnosis up to rounding only, which fits and open-loop runs amplify;
+        # results of another task would differ more. Values that are not numbers must be equal.
+        if isinstance(first, dict):
+            return first.keys() == second.keys() and all(alike(first[key], second[key]) for key in first)
+        if isinstance(first, list):
+            return len(first) == len(second) and all(map(alike, first, second))
+        if isinstance(first, float):
+            return math.isclose(first, second, rel_tol=1e-6, abs_tol=1e-9)
+        return first == second
 
     class Cart(Dynamics):
         states = ("place", "speed")
@@ -287,25 +287,25 @@ CODE = """
     columns = {name: sensor[name] for name in ("time", "mag_x", "mag_y", "mag_z")}
     columns["mag_x"] = columns["mag_x"] + 6.0 * (columns["time"] > columns["time"].median())
     for simulation, recording in ((Magnetometer(), Recording(columns)), (Cart(), cart)):
-        told = []
+        results = []
         for copies in (0, 1):
             allow_copies(copies)
             diagnosis = diagnose(simulation, recording)
-            told.append(diagnosis_to_json(diagnosis))
-        same = alike(*map(json.loads, told))
+            results.append(diagnosis_to_json(diagnosis))
+        same = alike(*map(json.loads, results))
         print([f.effect for f in diagnosis.findings], same, len(forks) > 3)
         forks.clear()
-        # a second's import for a constant beside what is differentiated, which torch 2.6 makes of others too; equations
-        # of one's own may have some
+        # an import of 1 s for a constant in a differentiated expression, which torch 2.6 also does for other reasons;
+        # a user's equations may have such constants
         old = tuple(map(int, torch.__version__.split(".")[:2])) < (2, 7)
         assert old or isinstance(simulation, Dynamics) or "torch._dynamo" not in sys.modules
 """
 
 
 @pytest.mark.process
-def test_a_diagnosis_is_the_same_by_one_core_as_by_two():
+def test_a_diagnosis_does_not_depend_on_the_number_of_cores():
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(CODE)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = done.stdout.splitlines()
     assert len(found) == 2, done.stdout
-    assert all("['" in one and one.endswith("True True") for one in found), done.stdout
+    assert all("['" in line and line.endswith("True True") for line in found), done.stdout

@@ -1,4 +1,4 @@
-"""Processes of the command line's own: they keep their memory, and end without looking at every module again."""
+"""Processes of the command line keep freed memory and exclude modules from garbage collection."""
 
 import os
 import subprocess
@@ -11,18 +11,18 @@ from mkc_torch._parallel.processes import cores, keep_memory
 
 
 @pytest.mark.process
-def test_what_was_imported_is_out_of_the_collectors_sight_to_the_end():
+def test_imported_modules_are_excluded_from_garbage_collection_until_exit():
     code = (
         "import atexit, gc, torch; from mkc_torch._parallel.processes import keep_modules\n"
         "atexit.register(lambda: print('late' if len(gc.get_objects()) < 1000 else 'seen'))\n"
         "keep_modules(); print(gc.get_freeze_count() > 100_000, gc.get_threshold()[0])\n"
     )
-    # what is registered last comes first at exit
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert told == ["True", "50000", "late"]
+    # exit handlers run in reverse order of registration
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert output == ["True", "50000", "late"]
 
 
-def test_kept_memory_serves_as_before():
+def test_tensors_work_with_kept_memory():
     keep_memory()
     values = torch.ones(5_000_000)
     del values
@@ -30,15 +30,15 @@ def test_kept_memory_serves_as_before():
 
 
 @pytest.mark.process
-def test_linear_algebra_computes_in_one_thread():
+def test_linear_algebra_uses_one_thread():
     code = (
         "import torch, numpy\nfrom threadpoolctl import threadpool_info\n"
         "from mkc_torch._parallel.processes import one_thread\n"
         "one_thread()\nknown = [i['num_threads'] for i in threadpool_info() if i['user_api'] == 'blas']\n"
         "print(torch.get_num_threads(), len(known) > 0, set(known))"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told == "1 True {1}\n"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output == "1 True {1}\n"
 
 
 INTERRUPTED = """
@@ -58,32 +58,32 @@ def interrupt_and_end():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def ask(depth):
+def check(depth):
     while True:
-        with suppress(KeyboardInterrupt):  # one can come between two of these too
-            ask(depth - 1) if depth else _processes._stopped()
+        with suppress(KeyboardInterrupt):  # an interrupt can come between two of them
+            check(depth - 1) if depth else _processes._stopped()
 
 
-def asked_again_and_again(item):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # as beside work
+def check_repeatedly(item):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # as during work
     Thread(target=interrupt_and_end).start()
-    ask(20)
+    check(20)
 
 
 if __name__ == "__main__":
     try:
-        with _processes.in_processes(asked_again_and_again, range(2)) as results:
+        with _processes.in_processes(check_repeatedly, range(2)) as results:
             for result in results:
                 result()
     except (BrokenProcessPool, KeyboardInterrupt):
-        print("told")
+        print("stopped")
 """
 
 
 @pytest.mark.process
 @pytest.mark.skipif(cores() < 2 or os.name == "nt", reason="one core, or no such signal")
-def test_an_interrupt_where_it_is_asked_whether_to_stop_keeps_nobody_waiting(tmp_path):
+def test_interrupt_while_reading_the_stop_flag_does_not_block(tmp_path):
     script = tmp_path / "interrupted.py"
     script.write_text(INTERRUPTED)
-    told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
-    assert told.stdout == "told\n"
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "stopped\n"

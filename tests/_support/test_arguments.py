@@ -1,4 +1,4 @@
-"""Arguments that are refused: each sentence names the argument, what it should be, what it is, and what to do."""
+"""Checks of arguments: each message has the argument, the expected and the actual value, and the remedy."""
 
 import math
 
@@ -34,13 +34,13 @@ INF, NAN = math.inf, math.nan
         (None, r"but got NoneType; pass a tensor\."),
     ],
 )
-def test_data_that_are_no_real_tensor_are_refused_with_how_to_make_one(value, message):
+def test_data_that_are_not_a_real_tensor_are_refused_with_the_conversion(value, message):
     with pytest.raises(TypeError, match=f"^Expected argument `x` to be a real floating-point tensor {message}$"):
         refuse_not_real("x", value)
     refuse_not_real("x", torch.zeros(2, dtype=torch.bfloat16))
 
 
-def test_numbers_are_those_of_tensors_sequences_and_arrays():
+def test_as_numbers_accepts_tensors_sequences_and_arrays():
     given = torch.ones(2, dtype=torch.float64, requires_grad=True)
     assert as_numbers("x", given) is given
     for value in ([1.0, 2.0], (1, 2), np.array([1.0, 2.0])):
@@ -54,7 +54,7 @@ def test_numbers_are_those_of_tensors_sequences_and_arrays():
 @pytest.mark.parametrize("end", [1.0, 2.0])
 @pytest.mark.parametrize("ends", ["()", "[)", "(]", "[]"])
 @pytest.mark.parametrize("kind", [float, torch.tensor, lambda v: torch.tensor([1.5, v]), lambda v: [v]])
-def test_ends_of_a_range_count_where_they_are_closed(end, ends, kind):
+def test_closed_ends_belong_to_a_range(end, ends, kind):
     if ends[int(end) - 1] in "[]":
         refuse_out_of_range("x", kind(end), 1.0, 2.0, ends)
         return
@@ -63,20 +63,20 @@ def test_ends_of_a_range_count_where_they_are_closed(end, ends, kind):
 
 
 @pytest.mark.parametrize("value", [NAN, torch.tensor([1.0, NAN]), [1.0, NAN], torch.tensor(NAN)])
-def test_no_range_holds_a_nan(value):
+def test_nan_is_out_of_every_range(value):
     with pytest.raises(ValueError, match=r"`x` to be in \[-inf, inf\] but got nan"):
         refuse_out_of_range("x", value, -INF, INF, "[]")
 
 
-def test_ranges_without_an_end_are_told_in_words_with_the_first_wrong_value_and_what_to_do():
+def test_error_of_an_unbounded_range_names_the_first_wrong_value_and_the_remedy():
     for ends, words in (("()", "positive and finite"), ("(]", "positive"), ("[)", ">= 0 and finite"), ("[]", ">= 0")):
         with pytest.raises(
-            ValueError, match=f"^Expected argument `x` to be {words} but got -3 at index .0, 1.; mend.$"
+            ValueError, match=f"^Expected argument `x` to be {words} but got -3 at index .0, 1.; fix it.$"
         ):
-            refuse_out_of_range("x", torch.tensor([[1.0, -3.0], [-4.0, 1.0]]), ends=ends, advice="mend")
+            refuse_out_of_range("x", torch.tensor([[1.0, -3.0], [-4.0, 1.0]]), ends=ends, advice="fix it")
 
 
-def test_values_under_vmap_and_in_empty_tensors_are_not_looked_at():
+def test_values_under_vmap_and_of_empty_tensors_are_not_checked():
     def through(x):
         refuse_out_of_range("x", x)
         refuse_bad_weight(x)
@@ -89,7 +89,7 @@ def test_values_under_vmap_and_in_empty_tensors_are_not_looked_at():
         torch.func.grad(lambda x: through(x).sum())(torch.tensor([-1.0]))
 
 
-def test_one_number_is_no_tensor_text_or_flag():
+def test_checked_number_refuses_tensors_text_and_booleans():
     assert checked_number("x", np.float32(0.5), 0.0, 1.0) == 0.5
     assert checked_number("x", 1, 0.0, 2.0) == 1
     with pytest.raises(ValueError, match="`x` to be positive and finite but got inf"):
@@ -101,7 +101,7 @@ def test_one_number_is_no_tensor_text_or_flag():
         checked_number("x", 1.5, 0.0, 1.0, advice="half is usual")
 
 
-def test_whole_numbers():
+def test_checked_whole_accepts_integers_only():
     assert checked_whole("x", np.int64(3), 1) == 3
     assert checked_whole("seed", -5) == -5
     for value in (0, 2.0, 1.5, True, "3", None):
@@ -109,7 +109,7 @@ def test_whole_numbers():
             checked_whole("x", value, 1, "10 is ample")
 
 
-def test_what_is_no_instance_is_refused_and_a_class_is_told_to_be_made_one():
+def test_other_types_are_refused_and_for_the_class_the_remedy_is_a_call():
     refuse_other_type("x", torch.nn.ReLU(), torch.nn.Module, "a module", "write one")
     with pytest.raises(TypeError, match=r"`x` to be a module but got 'a'; write one\.$"):
         refuse_other_type("x", "a", torch.nn.Module, "a module", "write one")
@@ -119,7 +119,7 @@ def test_what_is_no_instance_is_refused_and_a_class_is_told_to_be_made_one():
         refuse_other_type("x", int, torch.nn.Module, "a module", "write one")
 
 
-def test_text_is_no_sequence_of_names():
+def test_text_is_refused_as_a_sequence_of_names():
     refuse_text("x", ("a", "b"), "names")
     with pytest.raises(TypeError, match=r"`x` to be names but got 'abc'; write \('abc',\)\."):
         refuse_text("x", "abc", "names")
@@ -140,7 +140,7 @@ def test_weights_that_are_negative_or_not_finite_are_refused_by_index(bad, dtype
         refuse_bad_weight(weight)
 
 
-def test_weights_may_be_counts_and_masks_but_no_lists_and_not_complex():
+def test_weights_may_be_counts_and_masks_but_not_lists_or_complex():
     for weight in (torch.tensor([0, 2]), torch.tensor([True, False]), torch.zeros(2), torch.empty(0)):
         refuse_bad_weight(weight)
     with pytest.raises(ValueError, match="got -2 at index"):
@@ -154,7 +154,7 @@ def test_weights_may_be_counts_and_masks_but_no_lists_and_not_complex():
         refuse_bad_weight(torch.ones(2) + 0j)
 
 
-def test_values_are_told_in_short():
+def test_format_value_is_short():
     assert format_value(torch.nn.Linear) == "the class Linear"
     assert format_value("a") == "'a'"
     assert format_value(format_value) == "a function"

@@ -1,4 +1,4 @@
-"""Arrays and data frames as tensors: every number kept, everything else refused by name."""
+"""Arrays and data frames as tensors: numbers are kept, other data are refused by name."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ def read_only(array):
     return array
 
 
-def test_a_tensor_passes_untouched():
+def test_a_tensor_is_returned_unchanged():
     for value in (torch.ones(2), torch.ones(2).long(), torch.ones(2, dtype=torch.complex64)):
         assert as_tensor("X", value) is value
 
@@ -59,7 +59,7 @@ def test_booleans_are_ones_and_zeros():
     assert as_tensor("X", np.array([True, False])).tolist() == [1.0, 0.0]
 
 
-def test_memory_is_shared_where_it_can_be_and_what_is_read_only_is_copied():
+def test_memory_is_shared_except_of_read_only_arrays():
     array = np.zeros(2)
     as_tensor("X", array)[0] = 1.0
     assert array[0] == 1.0
@@ -77,7 +77,7 @@ def test_a_frame_is_a_matrix_of_its_columns(frame):
     assert as_tensor("X", frame({"a": np.ones(2, np.float32)})).dtype == torch.float32
 
 
-def test_columns_without_names_of_text_have_none():
+def test_frames_without_text_labels_have_no_column_names():
     assert column_names(pd.DataFrame([[1, 2]])) is None
     assert column_names(pd.DataFrame(index=range(3))) is None
     assert column_names(pd.Series([1], name="a")) is None
@@ -85,7 +85,7 @@ def test_columns_without_names_of_text_have_none():
     assert as_tensor("X", pd.DataFrame(index=range(3))).shape == (3, 0)
 
 
-def test_what_follows_pandas_needs_no_more_than_its_names():
+def test_a_compatible_frame_needs_columns_and_to_numpy_only():
     class Frame:
         columns = ("a", "b")
 
@@ -129,7 +129,7 @@ TIMES = np.array(["2020-01-01", "2020-01-02"], dtype="datetime64[ms]")
         (None, r"argument `X` .* but got NoneType; pass a tensor"),
     ],
 )
-def test_what_holds_no_numbers_is_refused_by_name(value, message):
+def test_data_without_numbers_are_refused_by_name(value, message):
     with pytest.raises(TypeError, match=message):
         as_tensor("X", value)
 
@@ -144,7 +144,7 @@ def test_what_holds_no_numbers_is_refused_by_name(value, message):
         pd.Series([1, None, 3], dtype="Int64", name="a"),
     ],
 )
-def test_missing_values_are_counted_or_become_what_is_asked_for(value):
+def test_missing_values_are_counted_or_replaced(value):
     with pytest.raises(
         ValueError, match=r"column `a` of argument `X` to have a value everywhere but got 1 missing of 3"
     ):
@@ -160,17 +160,17 @@ def test_missing_booleans_and_masked_numbers_are_missing():
         assert as_tensor("X", value, missing=-1.0).tolist() == [1.0, -1.0]
 
 
-def test_arrays_take_dtype_and_device_of_the_tensor_beside_them():
+def test_arrays_take_dtype_and_device_of_the_given_tensor():
     X, Y = as_tensors(X=torch.ones(2, 1), Y=np.ones(2))
     assert X.dtype == Y.dtype == torch.float32
     X, Y = as_tensors(X=np.ones((2, 1), np.float32), Y=torch.ones(2).double())
     assert X.dtype == Y.dtype == torch.float64
-    # an integer tensor is refused later, and decides nothing
+    # an integer tensor does not determine the dtype; it is refused later
     X, Y = as_tensors(X=np.ones((2, 1), np.float32), Y=torch.ones(2).long())
     assert (X.dtype, Y.dtype) == (torch.float32, torch.int64)
 
 
-def test_arrays_alone_are_float32_only_together():
+def test_arrays_without_a_tensor_are_float32_only_if_all_are():
     X, Y = as_tensors(X=np.ones((2, 1), np.float32), Y=np.ones(2, np.float32))
     assert X.dtype == Y.dtype == torch.float32
     X, Y = as_tensors(X=np.ones((2, 1), np.float32), Y=np.ones(2, int))
@@ -178,7 +178,7 @@ def test_arrays_alone_are_float32_only_together():
 
 
 @each_frame
-def test_other_columns_than_those_of_the_fit_are_refused(frame):
+def test_columns_that_differ_from_the_fit_are_refused(frame):
     value = frame({"b": [1.0], "a": [2.0]})
     refuse_other_columns("X", value, ("b", "a"))
     refuse_other_columns("X", value, None)

@@ -40,7 +40,7 @@ def test_an_existing_file_is_replaced_on_demand(tmp_path):
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
 @pytest.mark.parametrize("before", [{}, {"a": b"old"}])
-def test_a_write_that_fails_half_way_leaves_the_folder_as_it_was(tmp_path, monkeypatch, step, error, before):
+def test_a_failed_write_leaves_the_folder_unchanged(tmp_path, monkeypatch, step, error, before):
     for name, data in before.items():
         (tmp_path / name).write_bytes(data)
     seen = []
@@ -52,7 +52,7 @@ def test_a_write_that_fails_half_way_leaves_the_folder_as_it_was(tmp_path, monke
     monkeypatch.setattr(os, step, fail)
     with pytest.raises(type(error)):
         write_atomically(tmp_path / "a", "new", overwrite=True)
-    assert seen == [1]  # the temporary file was there, in the target's folder, when the step failed
+    assert seen == [1]  # the temporary file was in the target's folder when the step failed
     assert contents(tmp_path) == before
 
 
@@ -67,7 +67,7 @@ def test_data_reach_the_disk_before_the_name(tmp_path, monkeypatch, overwrite, n
     assert contents(tmp_path) == {"a": b"x"}
 
 
-def test_a_name_that_another_process_takes_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+def test_a_file_that_another_process_creates_meanwhile_is_not_replaced(tmp_path, monkeypatch):
     fsync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda handle: (fsync(handle), (tmp_path / "a").write_text("theirs")))
     with pytest.raises(FileExistsError, match=r"a exists; use `--force`"):
@@ -94,7 +94,7 @@ with folder_held(sys.argv[1]):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
-def test_a_folder_is_held_by_one_process_and_free_when_that_is_killed(tmp_path):
+def test_a_folder_is_locked_until_its_process_is_killed(tmp_path):
     left = tmp_path / f".{'0' * 16}.tmp"
     left.write_text("half")
     with subprocess.Popen(
@@ -109,12 +109,12 @@ def test_a_folder_is_held_by_one_process_and_free_when_that_is_killed(tmp_path):
         write_atomically(tmp_path / "a", "x")
 
 
-def test_what_a_killed_process_left_half_written_is_in_nobodys_way(tmp_path):
+def test_temporary_files_of_a_killed_process_do_not_count_as_content(tmp_path):
     (tmp_path / f".{'a' * 16}.tmp").write_text("half")
     assert claim_folder(tmp_path) == tmp_path
 
 
-def test_text_that_has_no_utf8_leaves_nothing(tmp_path):
+def test_text_that_cannot_be_encoded_leaves_no_file(tmp_path):
     with pytest.raises(UnicodeEncodeError):
         write_atomically(tmp_path / "a", "\ud800")
     assert contents(tmp_path) == {}
@@ -148,13 +148,13 @@ def test_claim_folder_takes_an_empty_folder(tmp_path):
     assert claim_folder(str(tmp_path)) == tmp_path
 
 
-def test_claim_folder_refuses_a_folder_with_something_in_it(tmp_path):
+def test_claim_folder_refuses_a_folder_that_is_not_empty(tmp_path):
     (tmp_path / "a").write_text("old")
     with pytest.raises(FileExistsError, match=r"not empty; use `--force`"):
         claim_folder(tmp_path)
 
 
-def test_claim_folder_on_demand_takes_a_folder_and_removes_nothing(tmp_path):
+def test_claim_folder_with_overwrite_removes_nothing(tmp_path):
     (tmp_path / "a").write_text("old")
     assert claim_folder(tmp_path, overwrite=True) == tmp_path
     assert contents(tmp_path) == {"a": b"old"}
@@ -168,7 +168,7 @@ OWN = {
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_claim_folder_keeps_files_of_the_users_own(tmp_path, name):
+def test_claim_folder_refuses_to_replace_the_users_own_files(tmp_path, name):
     (tmp_path / name).write_text("mine")
     with pytest.raises(FileExistsError, match=f"{name} exists and was not written by mkc"):
         claim_folder(tmp_path, overwrite=True, files=OWN)
@@ -178,7 +178,7 @@ def test_claim_folder_keeps_files_of_the_users_own(tmp_path, name):
     assert claim_folder(tmp_path, overwrite=True, files=OWN) == tmp_path
 
 
-def test_a_table_goes_with_the_files_beside_it(tmp_path):
+def test_an_unmarked_file_counts_as_written_if_a_marked_file_does(tmp_path):
     names = ["recording.csv", "report.html"]
     (tmp_path / "recording.csv").write_text("a\n1\n")
     with pytest.raises(FileExistsError, match=r"recording\.csv exists and was not written by mkc"):

@@ -1,4 +1,4 @@
-"""Tangents of a function of many values, made a few directions at a time."""
+"""Jacobians of functions with many values, in batches of directions."""
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -15,7 +15,7 @@ def wave(theta):
     return (theta[0] * torch.sin(theta[1] * X) + theta[2] * torch.exp(-theta[3] * X) + theta[4]).unsqueeze(-1)
 
 
-def test_a_few_directions_at_a_time_are_all_of_them(monkeypatch):
+def test_batches_of_directions_give_the_full_jacobian(monkeypatch):
     expected = torch.func.jacrev(wave)(THETA)
     for cells in (1, 1000, 2500, 1_000_000):
         monkeypatch.setattr(forward_mode, "_CELLS", cells)
@@ -23,16 +23,16 @@ def test_a_few_directions_at_a_time_are_all_of_them(monkeypatch):
         torch.testing.assert_close(forward_tangents(wave, 1000)(THETA).movedim(0, -1), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_short_ones_are_differentiated_together():
+def test_short_functions_have_many_directions_in_a_batch():
     assert directions_at_once(1000) >= 100
     assert directions_at_once(10**9) == directions_at_once(10**7) == 1
     assert directions_at_once(0) > 1
 
 
-def test_what_is_held_on_the_way_is_bounded(monkeypatch):
+def test_memory_of_a_batch_of_tangents_is_bounded(monkeypatch):
     products = []
 
-    class Seen(TorchDispatchMode):
+    class Products(TorchDispatchMode):
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
             made = func(*args, **(kwargs or {}))
             if func is torch.ops.aten.mul.Tensor:
@@ -41,7 +41,7 @@ def test_what_is_held_on_the_way_is_bounded(monkeypatch):
 
     def largest(work):
         products.clear()
-        with Seen():
+        with Products():
             work()
         return max(products)
 
@@ -50,13 +50,13 @@ def test_what_is_held_on_the_way_is_bounded(monkeypatch):
     assert largest(lambda: forward_tangents(wave, 1000)(THETA)) == 2000
 
 
-def test_a_fit_says_how_many_values_its_residual_has(monkeypatch):
-    told = []
+def test_a_fit_passes_the_number_of_its_residuals(monkeypatch):
+    counts = []
 
     def noted(function, values):
-        told.append(values)
+        counts.append(values)
         return forward_tangents(function, values)
 
     monkeypatch.setattr(_problem, "forward_tangents", noted)
     fit(wave, THETA, max_iter=5, covariance=None)
-    assert set(told) == {1000}
+    assert set(counts) == {1000}

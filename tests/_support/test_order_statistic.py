@@ -14,7 +14,7 @@ def by_cumulated_share(values, weight, h):
 
 @pytest.mark.parametrize("h", [1, 7.3, 101, 153, 200])
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_values_left_out_by_weight_zero_count_as_in_a_weighted_order(h, share):
+def test_zero_weights_equal_a_weighted_order_statistic(h, share):
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(2, 5, 200, 3, generator=generator, dtype=torch.float64)
     weight = (torch.rand(200, 1, generator=generator) < share).double()
@@ -22,7 +22,7 @@ def test_values_left_out_by_weight_zero_count_as_in_a_weighted_order(h, share):
     assert torch.equal(order_statistic(values, weight, h), expected)
 
 
-def test_weights_of_each_problem_are_its_own():
+def test_each_problem_has_its_own_weights():
     values = torch.arange(6.0).view(1, 6, 1).expand(2, 6, 1)
     weight = torch.tensor([[1.0, 0, 0, 1, 0, 0], [0, 0, 1, 1, 1, 0]]).unsqueeze(-1)
     assert order_statistic(values, weight, 3).tolist() == [[0.0], [3.0]]

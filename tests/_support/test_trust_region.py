@@ -1,4 +1,4 @@
-"""Newton's method within a trust region: minima of functions that are not convex."""
+"""Newton's method with a trust region: minima of nonconvex functions."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,7 @@ from mkc_torch._support.trust_region import Quadratic, minimise
 
 
 def made(f):
-    """A batch of one function with its derivatives by automatic differentiation."""
+    """A batch of a function with its derivatives by automatic differentiation."""
 
     def function(point: Tensor, index: Tensor) -> Quadratic:  # noqa: ARG001
         return Quadratic(
@@ -47,13 +47,13 @@ def test_each_start_keeps_its_own_minimum_and_a_saddle_is_left():
     assert bool(minima.converged.all())
 
 
-def test_too_few_steps_are_reported():
+def test_too_few_steps_are_reported_as_not_converged():
     minima = minimise(made(rosenbrock), torch.tensor([[-1.2, 1.0]], dtype=torch.float64), ones(1), max_iter=3)
     assert not bool(minima.converged)
     assert int(minima.n_iter) == 3
 
 
-def test_a_point_where_the_function_is_not_finite_is_not_taken():
+def test_steps_to_infinite_values_are_rejected():
     def barrier(x: Tensor) -> Tensor:
         return (x - torch.log(x)).sum()
 
@@ -61,7 +61,7 @@ def test_a_point_where_the_function_is_not_finite_is_not_taken():
     torch.testing.assert_close(minima.point, ones(2).unsqueeze(1), rtol=0, atol=1e-8)
 
 
-def test_a_function_that_is_constant_is_at_its_minimum():
+def test_a_constant_function_converges_at_its_start():
     minima = minimise(made(lambda x: 0.0 * x.sum()), torch.tensor([[2.0, 3.0]], dtype=torch.float64), ones(1))
     assert minima.point.tolist() == [[2.0, 3.0]]
     assert bool(minima.converged)

@@ -150,23 +150,23 @@ def test_unknown_standard_errors_are_null(demo_calibration):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "line 1 is not JSON"),
-        ("[1]", "names no schema"),
-        ("{}", "names no schema"),
+        ("[1]", "it has no schema"),
+        ("{}", "it has no schema"),
         ('{"schema": "mkc-model/1"}', "mkc-model/1"),
         ('{"schema": "mkc-calibration/1"}', "no `recording`"),
         ('{"schema": NaN}', "NaN"),
     ],
 )
-def test_other_texts_are_refused(text, told):
-    with pytest.raises(CalibrationFileError, match=told):
+def test_other_texts_are_refused(text, message):
+    with pytest.raises(CalibrationFileError, match=message):
         Calibration.from_json(text)
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "told"),
+    ("path", "value", "message"),
     [
         (("center", "value"), [1, 2], "`center.value`.*3 numbers"),
         (("center", "value"), [1, 2, "x"], "`center.value`"),
@@ -183,13 +183,13 @@ def test_other_texts_are_refused(text, told):
         (("rejected", "intervals"), [[1.0]], "`rejected.intervals.0`"),
     ],
 )
-def test_a_damaged_file_is_refused_naming_the_value(demo_calibration, path, value, told):
+def test_a_damaged_file_is_refused_naming_the_value(demo_calibration, path, value, message):
     content = json.loads(demo_calibration.to_json())
     place = content
     for key in path[:-1]:
         place = place[key]
     place[path[-1]] = value
-    with pytest.raises(CalibrationFileError, match=told):
+    with pytest.raises(CalibrationFileError, match=message):
         Calibration.from_json(json.dumps(content))
 
 
@@ -208,10 +208,10 @@ def test_samples_that_are_not_finite_and_unsorted_times_are_told():
     time[20] = time[19]
     c = calibrate(recorded(points, time=time))
     assert c.samples == len(points) - 3
-    told = " ".join(c.warnings)
-    assert "2 of 400 samples that are not finite" in told
-    assert "ran backwards" in told
-    assert "repeat the time" in told
+    message = " ".join(c.warnings)
+    assert "2 of 400 samples that are not finite" in message
+    assert "ran backwards" in message
+    assert "repeat the time" in message
 
 
 def test_many_rejected_samples_are_warned_of():
@@ -219,7 +219,7 @@ def test_many_rejected_samples_are_warned_of():
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     c = calibrate(recorded(points))
     assert c.rejected >= 100
-    assert any("do not fit one ellipsoid" in w and "`mkc diagnose`" in w for w in c.warnings)
+    assert any("do not fit the ellipsoid" in w and "`mkc diagnose`" in w for w in c.warnings)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_a_radius_that_is_no_field_of_the_earth_is_in_recorded_units(factor, gue
     assert (strong.unit, strong.field_unit) == ("recorded units", "µT")
 
 
-def test_the_radius_tells_the_unit_and_not_what_an_offset_adds():
+def test_the_radius_without_the_offset_determines_the_unit():
     c = calibrate(recorded(noisy_ellipsoid() + 500.0))
     assert c.unit == "µT"
     assert not c.warnings
@@ -255,7 +255,7 @@ def test_a_unit_of_the_users_own_is_believed():
     assert not c.warnings
 
 
-def test_times_in_milliseconds_are_told_of():
+def test_times_in_milliseconds_have_a_warning():
     c = calibrate(recorded(noisy_ellipsoid(), time=20.0 * torch.arange(400)))
     assert any("looks like ms" in w for w in c.warnings)
 
@@ -278,7 +278,7 @@ def test_a_warning_of_missing_directions_says_whether_the_result_holds():
     away = torch.nn.functional.normalize((points - torch.tensor([5.0, -9.0, 20.0])), dim=-1)
     small, large = points[away[:, 2] < 0.7], points[away[:, 2] < 0.0]
     (warning,) = calibrate(recorded(small)).warnings
-    assert re.search(r"semi-axes to 0\.0\d % of the radius, so the calibration holds all the same", warning)
+    assert re.search(r"semi-axes to 0\.0\d % of the radius, so the calibration is still valid", warning)
     (warning,) = calibrate(recorded(large)).warnings
     assert "if nothing changed meanwhile" in warning
     assert "holds all the same" not in warning
@@ -293,7 +293,7 @@ def test_exact_points_are_no_trouble():
 
 
 def test_nine_samples_or_a_clear_refusal():
-    with pytest.raises(RecordingError, match="rec: 8 samples are too few, an ellipsoid needs at least 9"):
+    with pytest.raises(RecordingError, match="rec: 8 samples are too few; an ellipsoid needs at least 9"):
         calibrate(recorded(noisy_ellipsoid(8)))
     with pytest.raises(RecordingError, match="1 sample is too few"):
         calibrate(recorded(noisy_ellipsoid(1)))
@@ -333,7 +333,7 @@ def test_scattered_rejections_are_no_interval():
     assert disturbed_intervals(time, torch.arange(5000) % 20 == 0) == ()
 
 
-def test_intervals_end_where_the_time_begins_anew():
+def test_intervals_end_where_the_time_restarts():
     time = torch.cat([torch.arange(100), torch.arange(100)]) / 50.0
     rejected = torch.zeros(200, dtype=torch.bool)
     rejected[80:120] = True

@@ -121,16 +121,16 @@ def test_information_is_the_least_eigenvalue_relative_to_even_coverage():
 def test_turning_and_stretching_the_vectors_changes_nothing_that_should_not_change(seed):
     directions = sample(seed, 40, 3) + torch.tensor([0.0, 0.0, 1.0])
     Q, _ = torch.linalg.qr(sample(seed + 1, 3, 3))
-    one = coverage(directions)
+    first = coverage(directions)
     lengths = sample(seed + 2, 40, 1).exp()
     other = coverage((directions * lengths) @ Q.mT)
-    assert other.information == pytest.approx(one.information, rel=1e-2, abs=1e-6)
-    assert other.fraction == pytest.approx(one.fraction, abs=0.03)
-    assert 0.0 <= one.fraction <= 1.0
-    assert all(g.degrees > GAP_DEGREES for g in one.gaps)
-    assert [g.degrees for g in one.gaps] == sorted((g.degrees for g in one.gaps), reverse=True)
+    assert other.information == pytest.approx(first.information, rel=1e-2, abs=1e-6)
+    assert other.fraction == pytest.approx(first.fraction, abs=0.03)
+    assert 0.0 <= first.fraction <= 1.0
+    assert all(g.degrees > GAP_DEGREES for g in first.gaps)
+    assert [g.degrees for g in first.gaps] == sorted((g.degrees for g in first.gaps), reverse=True)
     unit = torch.nn.functional.normalize(directions, dim=-1)
-    for gap in one.gaps:
+    for gap in first.gaps:
         nearest = (unit @ torch.tensor(gap.direction, dtype=torch.float64)).max().clamp(-1, 1)
         assert math.degrees(math.acos(float(nearest))) == pytest.approx(gap.degrees, abs=1e-6)
 

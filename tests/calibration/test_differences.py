@@ -25,15 +25,16 @@ def test_the_same_sensor_is_the_same_within_errors(pair, points):
     found = differences(*pair, points)
     assert len(found.numbers) == 10
     assert found.beyond == ()
-    assert difference_sentences(found)[0].startswith("The same within errors")
+    assert "offset" in difference_sentences(found)[0] or "matrix" in difference_sentences(found)[0]
+    assert f"{found.limit:.3g}" in difference_sentences(found)[0]
     assert found.name == "old"
 
 
-def test_a_calibration_beside_itself_differs_in_nothing(pair, points):
+def test_a_calibration_does_not_differ_from_itself(pair, points):
     found = differences(pair[0], pair[0], points)
-    assert {one.in_errors for one in found.numbers} == {0.0}
+    assert {difference.in_errors for difference in found.numbers} == {0.0}
     assert (found.angle_max, found.length_max) == pytest.approx((0.0, 0.0), abs=1e-12)
-    assert "0° and 0 µT at most" in difference_sentences(found)[1]
+    assert difference_sentences(found)[1].count("0° and 0 µT") == 2
 
 
 def test_errors_combine_and_the_limit_is_bonferronis(pair, points):
@@ -52,7 +53,7 @@ def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
     new, _ = pair
     old = dataclasses.replace(new, center=(new.center[0] + 0.8, *new.center[1:]), name="before")
     found = differences(new, old, points)
-    assert [one.name for one in found.beyond] == ["offset x"]
+    assert [difference.name for difference in found.beyond] == ["offset x"]
     assert found.beyond[0].in_errors == pytest.approx(-0.8 / (math.sqrt(2) * new.center_se[0]))
     ours, theirs = new.corrected(points).numpy(), old.corrected(points).numpy()
     lengths = np.linalg.norm(ours, axis=1) - np.linalg.norm(theirs, axis=1)
@@ -63,7 +64,7 @@ def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
     assert found.angle_max == pytest.approx(angles.max(), rel=1e-6)
     assert found.angle_rms == pytest.approx(np.sqrt((angles**2).mean()), rel=1e-6)
     sentences = difference_sentences(found)
-    assert sentences[0].startswith("It differs: offset x by −")
+    assert "offset x by −" in sentences[0]
     assert f"{len(points)} samples" in sentences[1]
 
 
@@ -80,8 +81,8 @@ def test_an_older_one_in_other_units_is_converted(pair, points):
         radius=0.01 * old.radius,
     )
     expected, found = differences(new, old, points), differences(new, in_gauss, points)
-    for one, other in zip(found.numbers, expected.numbers, strict=True):
-        assert one[2:] == pytest.approx(other[2:])
+    for difference, other in zip(found.numbers, expected.numbers, strict=True):
+        assert difference[2:] == pytest.approx(other[2:])
     assert found.angle_rms == pytest.approx(expected.angle_rms)
 
 
@@ -99,24 +100,26 @@ def test_unknown_errors_are_shown_as_unknown(pair, points):
     unknown = dataclasses.replace(old, center_se=nothing, semi_axes_se=nothing, matrix_se=(nothing,) * 3)
     found = differences(new, unknown, points)
     assert found.beyond == ()
-    assert difference_sentences(found)[0] == ("Whether they differ cannot be said: one of them has no standard errors.")
+    assert "no standard errors" in difference_sentences(found)[0]
     assert {row[-1] for row in difference_rows(found)} == {"?"}
     assert "nan" not in " ".join(" ".join(row) for row in difference_rows(found))
     half = dataclasses.replace(old, center=(99.0, *old.center[1:]), matrix_se=((math.nan,) * 3,) * 3)
-    assert [one.name for one in differences(new, half, points).beyond] == ["offset x"]
+    assert [difference.name for difference in differences(new, half, points).beyond] == ["offset x"]
 
 
 def test_many_differences_are_counted(pair, points):
     new, _ = pair
     other = dataclasses.replace(new, matrix=tuple(tuple(1.1 * v for v in row) for row in new.matrix))
     sentence = difference_sentences(differences(new, other, points))[0]
-    assert sentence.startswith("It differs: matrix")
+    assert "matrix" in sentence
     assert sentence.count("matrix") == 3
 
 
 def test_a_gain_of_all_axes_shows_in_the_radius_alone(points):
-    """Both correct to the length that they measured, so that their matrices are the same."""
+    """Each calibration corrects to its own measured length, so their matrices are equal."""
     new, old = calibrate(recorded(1.02 * points)), calibrate(recorded(points))
-    radius = [one for one in differences(new, old, points).beyond if one.name == "radius"]
+    radius = [difference for difference in differences(new, old, points).beyond if difference.name == "radius"]
     assert radius[0].new == pytest.approx(1.02 * old.radius, rel=1e-3)
-    assert not [one for one in differences(new, old, points).beyond if one.name.startswith("matrix")]
+    assert not [
+        difference for difference in differences(new, old, points).beyond if difference.name.startswith("matrix")
+    ]

@@ -1,4 +1,4 @@
-"""The ellipsoid head: exact recovery, equivariance, standard errors, and refusal where nothing is determined."""
+"""The ellipsoid fit: exact recovery, equivariance, standard errors, and errors if it is undetermined."""
 
 import csv
 import math
@@ -106,12 +106,12 @@ def test_axes_point_to_the_side_of_their_largest_component_but_for_the_last():
 def test_translation_scale_and_rotation_equivariance(seed, exponent, distance):
     points = disturbed(3)
     factor, shift, turn = 10.0**exponent, distance * sample(seed, 3), rotation(seed)
-    one = EllipsoidFit(LeastSquares()).fit(points)
+    fit_of_points = EllipsoidFit(LeastSquares()).fit(points)
     other = EllipsoidFit(LeastSquares()).fit(factor * (points + shift))
-    torch.testing.assert_close(other.center_ / factor, one.center_ + shift, rtol=0, atol=1e-6)
-    torch.testing.assert_close(other.semi_axes_ / factor, one.semi_axes_, rtol=1e-7, atol=0)
-    torch.testing.assert_close(other.calibration_matrix_, one.calibration_matrix_, rtol=0, atol=1e-7)
-    # least squares with the algebraic residual depends on the origin that the median chooses; an exact one does not
+    torch.testing.assert_close(other.center_ / factor, fit_of_points.center_ + shift, rtol=0, atol=1e-6)
+    torch.testing.assert_close(other.semi_axes_ / factor, fit_of_points.semi_axes_, rtol=1e-7, atol=0)
+    torch.testing.assert_close(other.calibration_matrix_, fit_of_points.calibration_matrix_, rtol=0, atol=1e-7)
+    # least squares with the algebraic residual depends on the origin that the median chooses; an exact fit does not
     exact = EllipsoidFit(LeastSquares()).fit(surface(150) @ turn.mT)
     torch.testing.assert_close(exact.center_, turn @ CENTER, rtol=0, atol=1e-7)
     torch.testing.assert_close(exact.semi_axes_, AXES, rtol=1e-8, atol=0)
@@ -308,9 +308,9 @@ def test_the_finish_of_gaussian_points_is_least_squares_of_orthogonal_distances(
 def test_the_finish_takes_away_the_bias_of_the_algebraic_fit():
     points = surface(200) + 1.0 * sample(0, 60, 200, 3)
     algebraic = (EllipsoidFit().fit(points).semi_axes_ - AXES).mean(0)
-    likeliest = (finished().fit(points).semi_axes_ - AXES).mean(0)
+    maximum_likelihood = (finished().fit(points).semi_axes_ - AXES).mean(0)
     assert float(algebraic[0]) > 0.08
-    assert float(likeliest[0].abs()) < 0.5 * float(algebraic[0])
+    assert float(maximum_likelihood[0].abs()) < 0.5 * float(algebraic[0])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -364,7 +364,7 @@ def test_standard_errors_of_the_finish_are_the_spread_of_repeated_experiments():
         spread = getattr(fit, name).std(0)
         predicted = getattr(fit, name[:-1] + "_se_").square().mean(0).sqrt()
         torch.testing.assert_close(predicted, spread, rtol=0.2, atol=0)
-    # they are those of the finish
+    # the errors are those of the finish
     algebraic = EllipsoidFit(LeastSquares()).fit(surface(150) + 0.2 * sample(0, 150, 150, 3))
     assert not torch.allclose(fit.center_se_, algebraic.center_se_, rtol=0.01)
 
@@ -419,7 +419,7 @@ def test_standard_errors_are_the_spread_of_repeated_experiments(repeated, name):
 
 def test_standard_errors_are_the_propagated_covariance():
     points = disturbed(0)
-    # of points that something else than noise moves there is no bias
+    # without noise, max_scatter=inf, there is no bias
     fit = EllipsoidFit(LeastSquares(), max_scatter=math.inf).fit(points)
     estimator, matrix = fit.estimator_, fit.calibration_matrix_
     coef, covariance = estimator.coef_.clone(), estimator.covariance_.clone()
@@ -537,10 +537,10 @@ def test_half_of_the_points_equal_is_no_nan():
 
 def test_two_circles_are_refused():
     angle = torch.linspace(0, 2 * math.pi, 41, dtype=torch.float64)[:-1]
-    one = torch.stack([40 * angle.cos(), 40 * angle.sin(), torch.zeros(40).double()], -1)
+    fit_of_points = torch.stack([40 * angle.cos(), 40 * angle.sin(), torch.zeros(40).double()], -1)
     other = torch.stack([40 * angle.cos(), torch.zeros(40).double(), 40 * angle.sin()], -1)
-    refused(torch.cat([one, other]), LeastSquares())
-    refused(torch.cat([one, other]) + 0.1 * sample(0, 80, 3))
+    refused(torch.cat([fit_of_points, other]), LeastSquares())
+    refused(torch.cat([fit_of_points, other]) + 0.1 * sample(0, 80, 3))
 
 
 def test_a_cap_of_sixty_degrees_is_refused_naming_the_other_side():
@@ -585,14 +585,14 @@ def test_noise_without_an_ellipsoid_is_refused_or_honest():
 @pytest.mark.parametrize("estimator", [None, LeastSquares(), LeastAbsoluteDeviations()])
 @pytest.mark.parametrize("long", [0.0, 2.0])
 def test_a_cloud_of_noise_draws_no_surface(estimator, long):
-    """A sensor at rest, or one that is turned a little to and fro: the noise covers all directions evenly."""
+    """A sensor at rest, or slightly turned to and fro: the noise covers all directions evenly."""
     turned = long * torch.linspace(0.0, 30.0, 2000, dtype=torch.float64).sin()
     cloud = 0.25 * sample(0, 2000, 3) + torch.stack([turned, 0.0 * turned, 0.0 * turned], -1)
     error = refused(CENTER + cloud @ rotation(3).mT, estimator)
-    assert "draw no surface" in str(error)
+    assert "do not form a surface" in str(error)
 
 
-def test_a_cloud_of_noise_is_taken_as_a_start_where_that_is_asked_for():
+def test_a_cloud_of_noise_is_accepted_with_infinite_max_scatter():
     fit = EllipsoidFit(LeastAbsoluteDeviations(), max_scatter=math.inf).fit(CENTER + 0.25 * sample(0, 2000, 3))
     assert float((fit.center_ - CENTER).abs().max()) < 0.1
 
@@ -656,10 +656,10 @@ def test_what_is_no_estimator_is_refused_when_the_fit_is_made(estimator):
     )
 
 
-def test_an_unfitted_ellipsoid_asks_for_points():
-    for asked in (lambda fit: fit.center_, lambda fit: fit.calibrate(surface(20))):
+def test_an_unfitted_ellipsoid_is_an_error():
+    for access in (lambda fit: fit.center_, lambda fit: fit.calibrate(surface(20))):
         with pytest.raises(NotFittedError, match=r"EllipsoidFit has no `\w+_` yet; call fit\(points\) first"):
-            asked(EllipsoidFit())
+            access(EllipsoidFit())
 
 
 @pytest.mark.parametrize(
@@ -668,7 +668,7 @@ def test_an_unfitted_ellipsoid_asks_for_points():
         (-torch.ones(20), ValueError, "`sample_weight` to be >= 0 and finite but got -1"),
         (torch.full((20,), math.nan), ValueError, "`sample_weight` to be >= 0 and finite but got nan"),
         ([1.0] * 20, TypeError, r"`sample_weight` .* got list; make a tensor of it, torch\.as_tensor\(sample_weight\)"),
-        (torch.ones(19), ValueError, r"`sample_weight` of shape \(20,\) but got \(19,\); it has one weight for each"),
+        (torch.ones(19), ValueError, r"`sample_weight` of shape \(20,\) but got \(19,\); give a weight for each"),
     ],
 )
 def test_weights_that_are_none_are_refused(weight, error, message):
@@ -681,7 +681,7 @@ def test_points_to_calibrate_are_looked_at():
     for points, error, message in (
         (surface(20).tolist(), TypeError, r"`points` .* got list; make a tensor of it"),
         (surface(20).mT, ValueError, r"\(\*, N, 3\) but got \(3, 20\); a point is a row, so try points\.mT"),
-        (surface(20)[0], ValueError, r"\(\*, N, 3\) but got \(3,\); one point is points\[None\]"),
+        (surface(20)[0], ValueError, r"\(\*, N, 3\) but got \(3,\); for a single point use points\[None\]"),
         (surface(20)[:, :2], ValueError, r"\(\*, N, 3\) but got \(20, 2\)\."),
     ):
         with pytest.raises(error, match=message):
@@ -693,7 +693,7 @@ def test_points_to_calibrate_are_looked_at():
         batch.calibrate(surface(20).expand(3, 20, 3))
 
 
-def test_half_precision_is_told_to_be_converted():
+def test_half_precision_is_rejected_with_advice():
     with pytest.raises(TypeError, match=r"`points` of dtype float32 or float64 but got torch\.float16; use \.float"):
         EllipsoidFit().fit(surface(20).half())
 
@@ -788,7 +788,7 @@ def test_two_fits_do_not_share_the_estimator_they_were_given():
     assert float(first.estimator_.d_) == d
 
 
-def test_nine_points_leave_nothing_to_tell_errors_from():
+def test_nine_points_have_infinite_standard_errors():
     generator = torch.Generator().manual_seed(1)
     points = 50.0 * fibonacci_sphere(9) + torch.randn(9, 3, generator=generator, dtype=torch.float64)
     assert bool(torch.isinf(EllipsoidFit().fit(points).semi_axes_se_).all())
@@ -812,7 +812,7 @@ def circles(seed: int, normals: list[list[float]], axes: list[float], noise: flo
 @pytest.mark.parametrize(("noise", "finish"), [(0.02, None), (0.08, None), (0.14, None), (0.08, "maximum_likelihood")])
 @pytest.mark.parametrize("long", [1.0, 5.0])
 def test_two_circles_are_refused_at_any_noise(seed, noise, finish, long):
-    """They lie on more than one ellipsoid: what noise seems to cover beside them is no coverage."""
+    """They lie on more than one ellipsoid: the apparent coverage by noise does not count."""
     normals = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.6 * (seed % 2)]]
     points = circles(seed, normals, [1.0, 1.0, long], noise, 300 if finish else 1000)
     with pytest.raises(NotIdentifiableError, match="Not identifiable"):
@@ -837,11 +837,11 @@ def test_intervals_of_noisy_points_hold_although_the_fit_is_biased(axes, finish)
     assert float(within.double().mean()) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 240)
 
 
-def test_much_noise_in_points_of_all_directions_is_named_and_the_finish_has_less_of_it():
+def test_much_noise_in_all_directions_is_reported_and_the_finish_has_a_smaller_bias():
     points = surface(600, axes=torch.tensor([35.0, 45.0, 50.0]).double()) + 4.8 * sample(0, 600, 3)
     message = str(refused(points))
     assert "there is too much noise" in message
-    assert 'finish="maximum_likelihood" has less of it' in message
+    assert 'finish="maximum_likelihood" has a smaller bias' in message
     finished_ = EllipsoidFit(finish="maximum_likelihood").fit(points)
     assert float((finished_.center_ - CENTER).abs().max()) < 1.96 * float(finished_.center_se_.max())
 

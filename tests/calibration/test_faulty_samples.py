@@ -36,8 +36,8 @@ def recorded(points, rate=50.0, **columns):
 def test_a_sensor_that_freezes_to_the_end_is_named_where_its_noise_would_not_let_it():
     points = turned()
     points[1500:] = points[1500]
-    (told,) = faults(recorded(points))
-    assert "from 30 to 39.98 s (500)" in told
+    (warning,) = faults(recorded(points))
+    assert "from 30 to 39.98 s (500)" in warning
     points = digits(turned(noise=0.05), 0.5)
     points[1500:] = points[1500]
     assert faults(recorded(points)) == []
@@ -53,9 +53,9 @@ def digits(points, step):
 
 def test_a_frozen_sensor_of_the_kept_case_is_named_and_left_out():
     c = calibrate(Recording.read(shared_case("messy/frozen_sensor.csv")))
-    (told,) = c.warnings
-    assert "800 of 2730" in told
-    assert "from 38.8633 to 70.0038 s (800)" in told
+    (warning,) = c.warnings
+    assert "800 of 2730" in warning
+    assert "from 38.8633 to 70.0038 s (800)" in warning
     assert c.samples == 1930
     whole = (-0.63, -10.54, 2.04)  # of the recording before it was frozen
     assert max(abs(a - b) / s for a, b, s in zip(c.center, whole, c.center_se, strict=True)) < 2.0
@@ -64,8 +64,8 @@ def test_a_frozen_sensor_of_the_kept_case_is_named_and_left_out():
 def test_clipping_of_the_kept_case_is_named_in_the_refusal():
     with pytest.raises(NotIdentifiableError) as caught:
         calibrate(Recording.read(shared_case("messy/clipped.csv")))
-    for told in ("`mag_x` is cut off at 40", "`mag_y` is cut off at -40 (924", "wider range"):
-        assert told in str(caught.value)
+    for warning in ("`mag_x` is cut off at 40", "`mag_y` is cut off at -40 (924", "wider range"):
+        assert warning in str(caught.value)
 
 
 def test_without_time_standard_errors_and_block_are_those_with_it():
@@ -118,11 +118,11 @@ def test_a_freeze_of_all_axes_or_of_one_is_named_with_its_place(axis, length, be
     assume(bool(((points[begin] > low + 3.0) & (points[begin] < high - 3.0))[columns].all()))
     for k in columns:
         points[begin : begin + length, k] = points[begin, k]
-    (told,) = faults(recorded(points))
+    (warning,) = faults(recorded(points))
     names = "all of `mag_x`, `mag_y`, `mag_z`" if axis is None else f"`{AXES[axis]}`"
-    assert f"{FROZEN}: {names} from " in told
+    assert f"{FROZEN}: {names} from " in warning
     # by chance the values before and after may be equal to it
-    start, end = map(float, told.split(" from ")[1].split(" s ")[0].split(" to "))
+    start, end = map(float, warning.split(" from ")[1].split(" s ")[0].split(" to "))
     assert (start, end) == pytest.approx((begin / 50.0, (begin + length - 1) / 50.0), abs=0.1)
     left = len(prepared(recorded(points)))
     assert len(points) - length - 5 <= left <= len(points) - length
@@ -136,9 +136,9 @@ def test_one_axis_that_is_cut_off_is_named_and_the_rest_is_calibrated(axis, side
     limit = round(float(center[axis]) + side * share * 45.0, 1)
     points[:, axis] = points[:, axis].clamp(max=limit) if side > 0 else points[:, axis].clamp(min=limit)
     recording = recorded(points)
-    (told,) = faults(recording)
-    assert f"`{AXES[axis]}` is cut off at {limit:.6g} (" in told
-    assert told.count("cut off") == 1
+    (warning,) = faults(recording)
+    assert f"`{AXES[axis]}` is cut off at {limit:.6g} (" in warning
+    assert warning.count("cut off") == 1
 
 
 def test_what_is_left_of_a_clipped_recording_is_calibrated():
@@ -152,7 +152,7 @@ def test_what_is_left_of_a_clipped_recording_is_calibrated():
 
 @pytest.mark.e2e
 def test_standard_errors_do_not_reach_from_one_run_to_the_next():
-    # two runs that begin with what is left over from the one before: joined, the lags between them would count
+    # two runs with correlated ends: if they were joined, the lags between them would count
     points = turned(1200, noise=0.2)
     drift = torch.cat([torch.linspace(1.0, 0.0, 600), torch.linspace(0.0, 1.0, 600)]).double()
     points = points * (1.0 + 0.03 * drift[:, None])

@@ -1,4 +1,4 @@
-"""An accelerometer by gravity's length, and a gyroscope's bias from rest."""
+"""Calibration of an accelerometer by gravity, and a gyroscope's bias from rest."""
 
 import json
 
@@ -17,7 +17,7 @@ GAINS = torch.tensor([1.02, 0.97, 1.01])
 
 
 def laid_down(places=16, rest=60, move=20, jolt=3.0):
-    """An accelerometer that is laid down in places; the hand jolts it in between."""
+    """An accelerometer that is laid down on its sides and accelerated by hand in between."""
     draw = torch.Generator().manual_seed(0)
     up = fibonacci_sphere(places)
     parts = []
@@ -57,9 +57,9 @@ def test_without_rests_all_samples_count_and_gravity_can_be_given():
     assert c.samples == 400
 
 
-def test_an_acceleration_in_g_is_told():
+def test_an_acceleration_in_g_has_a_warning():
     c = calibrate(recorded(fibonacci_sphere(400) * GAINS), sensor="accel")
-    assert "not gravity; these may be g" in c.warnings[0]
+    assert "not gravity; the columns may be in g" in c.warnings[0]
 
 
 def test_what_is_no_sensor_or_not_there_is_refused():

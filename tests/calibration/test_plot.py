@@ -1,4 +1,4 @@
-"""``calibration.plot``: the report's pictures as axes, and a calibration in a notebook."""
+"""``calibration.plot``: the report's plots on axes, and a calibration in a notebook."""
 
 import re
 
@@ -76,7 +76,7 @@ def test_weights_are_those_of_the_fit(calibration, recording):
 def test_one_from_a_file_needs_a_recording(calibration, recording):
     read = Calibration.from_json(calibration.to_json())
     assert read == calibration
-    with pytest.raises(ValueError, match="holds no samples to draw; give its recording"):
+    with pytest.raises(ValueError, match="has no samples to draw; pass its recording"):
         read.plot.residual()
     assert read.plot.residual(recording=recording).has_data()
 

@@ -1,4 +1,4 @@
-"""A sensor that rests for a while: a place where it stays is one direction, however long it stays there."""
+"""A sensor that rests for a while: a rest counts as a single direction, whatever its duration."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def outliers(share, seed=0):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_rest_is_told_from_turning_whatever_the_outliers(share):
+def test_rest_is_distinguished_from_turning_despite_outliers(share):
     found = turning(tumbling(N, noise=0.3, moments=resting(N, 600, 1400), sensor=outliers(share)).magnetometer())
     assert float(found[:570].double().mean()) > 0.9
     assert not bool(found[630:1370].any())
@@ -52,21 +52,21 @@ def test_a_sensor_that_mostly_rests_is_calibrated(first, share):
     recording = tumbling(N, noise=0.3, moments=resting(N, first, first + 1400), sensor=outliers(share))
     found = calibrate(recording)
     assert torch.tensor(found.center).tolist() == pytest.approx(OFFSET.tolist(), abs=0.15)
-    assert found.after.robust == pytest.approx(0.3, rel=0.25)  # of all samples, those at rest too
+    assert found.after.robust == pytest.approx(0.3, rel=0.25)  # of all samples, including a rest
     assert found.rejected / N == pytest.approx(0.9 * share, abs=0.06)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_step_while_the_sensor_rests_could_be_of_any_size_and_is_none(seed):
-    """It shows in one direction alone, and tangents where it is large say nothing about none."""
+    """It shows only in a single direction, and tangents at a large step do not describe zero."""
     result = diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, seed=seed, moments=resting(N, 0, 900)))
     assert result.verdict == "adequate"
     assert not result.warnings
 
 
 @pytest.mark.e2e
-def test_a_sensor_that_rests_for_most_of_the_time_is_diagnosed_and_told_of():
+def test_a_sensor_that_mostly_rests_is_diagnosed_with_a_warning():
     sensor = np.where(np.arange(N)[:, None] >= 1700, [3.0, -2.0, 1.0], 0.0)
     recording = tumbling(N, noise=0.3, moments=resting(N, 100, 1300), sensor=sensor)
     result = diagnose(Magnetometer("norm"), recording, surrogates=19)
@@ -81,11 +81,11 @@ def test_a_sensor_that_never_turns_is_refused():
             Magnetometer("norm").prepare(recording)
 
 
-def test_calibration_says_that_a_sensor_rests_whatever_a_few_samples_do():
+def test_calibration_reports_a_sensor_at_rest_despite_a_few_moving_samples():
     rest = tumbling(N, noise=0.3, moments=np.zeros(N))
     moved = tumbling(N, noise=0.3, moments=np.clip(np.arange(N), 0, 40) / 50.0)
     for recording in (rest, moved):
-        with pytest.raises(NotIdentifiableError, match=r"at rest, half of its measurements stay within 0\.\d+ µT"):
+        with pytest.raises(NotIdentifiableError, match=r"at rest; half of its measurements are within 0\.\d+ µT"):
             calibrate(recording)
 
 
@@ -116,7 +116,7 @@ def test_a_sensor_that_is_turned_a_little_to_and_fro_is_refused(size):
 
 
 def tilting(seed, share, tilt=0.14, size=34.0):
-    """A multicopter: little tilts while it turns; a share of samples is off along one axis, to one side."""
+    """A multicopter with small tilts; some samples are shifted along an axis in the same direction."""
     random = np.random.default_rng(seed)
     time = np.arange(4500) / 50.0
     angle = [tilt * np.sin(f * time + p) for f, p in ((1.3, 0.1), (1.7, 1.9))]
@@ -148,7 +148,7 @@ def test_the_way_passes_by_samples_that_stand_apart_and_keeps_the_turns():
     assert float((torch.linalg.vector_norm(measured - clean, dim=-1) > 3.0).double().mean()) > 0.15
 
 
-def test_samples_too_rare_for_a_way_have_none_and_are_calibrated_all_the_same():
+def test_samples_too_sparse_for_a_path_are_still_calibrated():
     rare = tumbling(300, noise=0.3, rate=3.0)
     assert way(rare.magnetometer()) is None
     assert calibrate(rare).center == pytest.approx(OFFSET.tolist(), abs=0.3)

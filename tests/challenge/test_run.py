@@ -53,7 +53,7 @@ def test_the_hash_matches_the_key(run):
     assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
 
 
-def test_recordings_do_not_tell_what_is_hidden(run):
+def test_recordings_do_not_reveal_the_hidden_physics(run):
     _, output, _ = run
     names = sorted(path.name for path in (output / "recordings").iterdir())
     assert names == [f"case_{k:05d}.csv" for k in range(6)]
@@ -104,8 +104,8 @@ def test_the_page_is_whole_and_loads_nothing(run):
 
 def test_summary_and_score_are_written(run):
     _, output, _ = run
-    assert "| asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
-    assert "| said of empty recordings: unexplained | 0 | 0 |" in (output / "summary.md").read_text(encoding="utf-8")
+    assert "| threshold | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
+    assert "| empty recordings: unexplained | 0 | 0 |" in (output / "summary.md").read_text(encoding="utf-8")
     record = json.loads((output / "score.json").read_text())
     assert record["settings"]["seed"] == 3
     assert sum(record["score"]["verdicts"].values()) == 3

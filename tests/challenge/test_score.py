@@ -54,7 +54,7 @@ def test_false_alarms_are_claims_that_physics_is_missing():
 
 @pytest.mark.parametrize(("grade", "claimed"), [("left_out", 1), ("small", 1), (None, 1), ("unconfirmed", 0),
                                                 ("nearest", 0)])  # fmt: skip
-def test_a_grade_says_whether_a_finding_is_a_claim(grade, claimed):
+def test_the_grade_decides_whether_a_finding_is_a_claim(grade, claimed):
     told = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
     result = score([key("a"), key("b", "empty")], {"a": told, "b": told})
     assert result.named.count == result.false_alarms.count == claimed
@@ -184,7 +184,7 @@ def at(places, effect="coulomb_friction", **more):
     return dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], at=tuple(places)),))
 
 
-def test_places_are_asked_of_effects_that_have_several():
+def test_located_right_counts_effects_with_several_ports():
     told = finding("coulomb_friction") | {"channels": ["rate of speed"]}
     right, wrong = at(["rate of speed", "rate of turn"]), at(["rate of turn"])
     assert score([right], {"a": says(told)}).located.count == 1
@@ -202,7 +202,7 @@ def test_an_inseparable_rival_is_right_at_its_own_place():
         assert (result.named.count, result.located.count) == (right, right)
 
 
-def test_other_thresholds_can_be_asked():
+def test_other_thresholds_can_be_given():
     asked = (Threshold("located_right", 0.5, 1.0, "somewhere"),)
     told = finding("coulomb_friction") | {"channels": ["rate of turn"]}
     (found,) = score([at(["rate of turn"])], {"a": says(told)}, thresholds=asked).measured

@@ -32,7 +32,7 @@ def asked(**given):
     return CalibrationRequest(**({"columns": {}, "units": {}, "sensor": None, "field_strength": None} | given))
 
 
-def test_each_sensor_of_a_file_is_told_and_the_file_is_read_once(tmp_path, reads):
+def test_each_sensor_of_a_file_is_reported_and_the_file_is_read_once(tmp_path, reads):
     points, stages = noisy_ellipsoid(300), []
     columns = {f"mag{n}_{axis}": points[:, k] + n for n in range(2) for k, axis in enumerate("xyz")}
     write_table(tmp_path / "two.csv", {"time": torch.arange(300) / 50.0} | columns)

@@ -22,7 +22,7 @@ def adequate(paths, folder):
         (folder / path.stem / "diagnosis.json").write_text(json.dumps(told))
 
 
-def test_scenarios_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch):
+def test_scenarios_are_scored_and_printed_with_their_aims(tmp_path, monkeypatch):
     monkeypatch.setattr(challenge_jobs, "diagnose_in_scenario", adequate)
     folder = tmp_path / "scenarios"
     command = (
@@ -41,8 +41,8 @@ def test_scenarios_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypat
     assert result.exit_code == 0, result.output
     flat = " ".join(result.stdout.split())
     assert "Blind proof in scenarios: 7 recordings" in flat
-    assert "gusts: pushes of the rate of one state in some stretches" in flat
-    assert "said of 3 unfit 0, adequate 3, explained 0, unexplained 0, failed 0" in flat
+    assert "gusts: gusts in the rate of one state" in flat
+    assert "verdicts of 3 unfit 0, adequate 3, explained 0, unexplained 0, failed 0" in flat
     assert "false alarms 0.0 % (0 of 3; 0.0-70.8 %)" in flat
     assert "at most 7 % false alarms 0.0 % held" in flat
     assert "unexplained, at the right state, in at least 80 % 0.0 % not held" in flat

@@ -179,7 +179,7 @@ def test_constant_column_and_coplanar_points(tmp_path):
 
 
 @pytest.mark.e2e
-def test_unsorted_and_repeated_times_are_told(tmp_path):
+def test_unsorted_and_repeated_times_are_reported(tmp_path):
     time = torch.arange(300) / 50.0
     time[[4, 5]] = time[[5, 4]]
     time[50] = time[49]
@@ -194,7 +194,7 @@ def test_unsorted_and_repeated_times_are_told(tmp_path):
 @pytest.mark.parametrize("factor", [1e306, 1e-306])
 def test_values_beyond_all_measure_are_refused(tmp_path, factor):
     path = table(tmp_path / "odd.csv", noisy_ellipsoid() * factor)
-    refused(mkc("calibrate", path, "--output", tmp_path / "out"), str(path), "no magnetic field")
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), str(path), "not a magnetic field")
 
 
 @pytest.mark.e2e
@@ -347,7 +347,7 @@ def test_apply_never_overwrites_what_it_reads(calibrated, tmp_path):
     (tmp_path / "folder").mkdir()
     before = recording.read_bytes(), model.read_bytes()
     for name in ("mine.csv", "soft.csv", "hard.csv", "folder/../mine.csv", "model.csv"):
-        refused(mkc("apply", model, recording, "--output", tmp_path / name, "--force"), "never overwritten")
+        refused(mkc("apply", model, recording, "--output", tmp_path / name, "--force"), "--output is the input file")
     assert (recording.read_bytes(), model.read_bytes()) == before
     assert (tmp_path / "soft.csv").is_symlink()
 
@@ -358,8 +358,8 @@ def test_apply_warns_of_a_recording_in_another_unit(calibrated, tmp_path):
     other = table(tmp_path / "other.csv", 1e3 * mine.magnetometer())
     result = mkc("apply", folder / "calibration.json", other, "--output", tmp_path / "o.csv")
     assert result.exit_code == 0
-    assert "times the 48.2 µT of the recording that this was made from" in result.stdout
-    assert "another unit" in result.stdout
+    assert "times the 48.2 µT of the calibrated recording" in result.stdout
+    assert "check the unit" in result.stdout
     result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", tmp_path / "p.csv")
     assert "warning" not in result.stdout
     assert "median length 48.2" in result.stdout
@@ -392,14 +392,14 @@ def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
     refused(mkc("apply", c, rec, "--output", tmp_path / "none" / "o.csv"), "there is no folder")
     binary = tmp_path / "binary.json"
     binary.write_bytes(b"\xff\xfe\x80")
-    refused(mkc("apply", binary, rec, *out), "not text")
+    refused(mkc("apply", binary, rec, *out), "not a text file")
     assert not (tmp_path / "o.csv").exists()
 
 
 DEMO = ["calibration.json", "concealed", "concealed.csv", "corrected.csv", "recording.csv", "report.html", "second.csv"]
 
 
-def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
+def test_demo_is_marked_as_simulated_and_shows_the_truth(calibrated):
     folder, result = calibrated
     assert sorted(p.name for p in folder.iterdir()) == DEMO
     assert "SIMULATED" in result.stdout
@@ -496,13 +496,13 @@ def test_a_recording_without_a_name_is_refused(good, tmp_path):
     for command in (("calibrate",), ("diagnose", "--simulation", "magnetometer")):
         result = mkc(*command, nameless, "--output", tmp_path / "out")
         assert result.exit_code == 2
-        assert "has no name that a folder of results could have" in " ".join(result.stderr.split())
+        assert "is not a valid name for a results folder" in " ".join(result.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.process
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_a_full_disk_behind_the_terminal_is_told_in_a_line(good, tmp_path):
+def test_a_full_disk_behind_stdout_is_reported_in_a_line(good, tmp_path):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "mkc_torch.cli", "calibrate", good, "--output", tmp_path / "out"],

@@ -142,7 +142,7 @@ def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path)
     new = sensor(7, step=1.0, start=100.0)
     other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
     result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
-    assert " µT of the recording that this was made from: is this one in another unit" in result.stdout
+    assert " µT of the calibrated recording; check the unit" in result.stdout
     content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     del content["state"]["unit"], content["state"]["strength"]  # of an earlier version
     (tmp_path / "old.json").write_text(json.dumps(content), encoding="utf-8")
@@ -151,10 +151,10 @@ def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path)
     assert "warning" not in result.stdout
 
 
-def test_apply_tells_models_from_other_files(stepped, tmp_path):
+def test_apply_distinguishes_models_from_other_files(stepped, tmp_path):
     path, folder, _ = stepped
     out = ("--output", tmp_path / "o.csv")
-    refused(mkc("apply", folder / "diagnosis.json", path, *out), "diagnosis.json", "model.json beside it")
+    refused(mkc("apply", folder / "diagnosis.json", path, *out), "diagnosis.json", "model.json in the same folder")
     refused(mkc("apply", folder, path, *out), "this is a folder", "model.json")
     content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     for change, words in (
@@ -226,7 +226,7 @@ def test_columns_that_can_drive_nothing(tmp_path):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("factor", "unit", "option"), [(0.01, "gauss", "gauss"), (1000.0, "nanotesla", "nT")])
-def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option):
+def test_other_units_are_refused_or_converted(tmp_path, factor, unit, option):
     scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
     path = quiet(tmp_path / "a.csv", **scaled)
     refused(diagnosed(path, "--output", tmp_path / "out"), unit, f"`--convert mag={option}`")
@@ -235,7 +235,7 @@ def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option)
 
 
 @pytest.mark.e2e
-def test_raw_counts_are_told_of_and_keep_their_name(tmp_path):
+def test_raw_counts_are_reported_and_keep_their_name(tmp_path):
     path = quiet(tmp_path / "a.csv", **{name: 100.0 * sensor(QUIET)[name] for name in AXES})
     assert "may be raw counts" in warnings_of(path, tmp_path / "out")
     assert warnings_of(path, tmp_path / "own", "--unit-label", "counts") == ""
@@ -313,7 +313,7 @@ def test_recordings_that_differ_are_not_diagnosed_together(tmp_path):
     a, b = quiet(tmp_path / "a.csv"), quiet(tmp_path / "b.csv", current=torch.ones(500))
     refused(
         diagnosed(a, b, "--together", "--output", tmp_path / "out"),
-        "b and a cannot be diagnosed together, for their columns differ: b has `current`, which a has not.",
+        "b and a cannot be diagnosed together; their columns differ: b has `current`, which a has not.",
     )
     assert not list((tmp_path / "out").iterdir())
 
@@ -342,7 +342,7 @@ def test_usage_errors_exit_with_two(tmp_path):
     for arguments, words in (
         ((path, *known), "--output"),
         ((*known, *out), "REC"),
-        ((path, *out, "--simulation", "pendulum"), '"pendulum" is not known; known: magnetometer'),
+        ((path, *out, "--simulation", "pendulum"), '"pendulum" is unknown; give magnetometer'),
         ((path, *out, *known, "--level", "1"), "--level must be"),
         ((path, *out, *known, "--level", "nan"), "--level must be"),
         ((path, *out, *known, "--surrogates", "18"), "at least 19 at level 0.05"),
@@ -385,7 +385,7 @@ def test_a_write_that_fails_leaves_no_half_file(stepped, tmp_path, monkeypatch):
     assert not (tmp_path / "out" / "stepped").exists()
 
 
-def test_without_a_model_none_is_written_and_an_old_one_goes(tmp_path):
+def test_without_a_model_an_old_model_file_is_removed(tmp_path):
     (tmp_path / "model.json").write_text("of an earlier diagnosis")
     written = diagnosis_files.write_diagnosis(make_diagnosis(0, model=None), tmp_path, force=True)
     assert [path.name for path in written] == ["diagnosis.json", "report.html"]
@@ -419,13 +419,13 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
     assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
 
 
-def test_a_process_that_dies_is_told(tmp_path):
+def test_a_process_that_dies_is_reported(tmp_path):
     def died():
         raise BrokenProcessPool
 
     (outcome,) = _waited_for(died, tmp_path / "a.csv")
     assert outcome.failed
-    assert "its process ended" in outcome.text
+    assert "the process ended" in outcome.text
 
 
 @pytest.mark.e2e

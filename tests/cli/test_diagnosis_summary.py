@@ -41,12 +41,12 @@ def test_a_finding_in_a_dozen_lines():
         "size offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT onset 41.32 ± 0.14 s",
         "where from 41.3 s on; acts on mag_x, mag_y, mag_z",
         "driven by no recorded column",
-        "how sure p = 0.005, the smallest that 199 surrogates can show",
-        "held out residual 0.912 → 0.521 µT (43 % less); surely better on unseen blocks; +0.312 nats a sample (95 %: "
-        "0.281 to 0.350); 0 is no better",
+        "how sure p = 0.005 (the minimum with 199 surrogates)",
+        "held out residual 0.912 → 0.521 µT (43 % less); surely better on held-out blocks; +0.312 nats per sample (95 %: "
+        "0.281 to 0.350); 0 is no improvement",
         "named hard-iron step: left out of the simulation",
         "unexplained nothing",
-        "or current field (current): this recording cannot tell",
+        "or current field (current): this recording cannot distinguish",
         "compare a smooth correction by all recorded columns and by time reaches",
         "noise autoregressive: noise with a memory",
         "If it is hard-iron step: look for what changed at that time; use the calibration from after the step.",
@@ -64,15 +64,15 @@ def test_where_in_the_states_a_finding_lies():
     region = Region("speed", "rad/s", "near zero", 0.31, 0.82, 0.2)
     finding = dataclasses.replace(made.findings[0], region=region, experiments=(0.9, 0.1))
     text = flat(shown(dataclasses.replace(made, findings=(finding,))))
-    assert "mostly 82 % of the gain where speed is within ±0.310 rad/s, 20 % of the time" in text
+    assert "mostly 82 % of the gain, in 20 % of the time: speed within ±0.310 rad/s" in text
     assert "in run 1: 90 %, run 2: 10 %" in text
 
 
 def test_nothing_found():
     text = flat(shown(make_diagnosis(0)))
-    assert "Nothing is missing that this recording could show." in text
-    assert "how sure p = 0.37; 64 candidates tried, level 0.05" in text
-    assert "to do Use the simulation as it is" in text
+    assert "The recording shows no missing physics." in text
+    assert "how sure p = 0.37; 64 candidates, level 0.05" in text
+    assert "to do Use the simulation without findings" in text
 
 
 def test_several_findings_are_numbered():
@@ -80,18 +80,18 @@ def test_several_findings_are_numbered():
     for line in (
         "1  hard-iron step: left out of the simulation",
         "2  current field (current): left out of the simulation",
-        "3  an effect outside the catalogue (temperature): not confirmed on unseen blocks",
+        "3  an effect outside the catalogue (temperature): not confirmed on held-out blocks",
     ):
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
     assert "together residual" in flat(text)
     assert "−0.0004 to 0.0046) Blocks of 4 s with gaps of 1 s." in flat(text)
-    assert text.count("0 is no better") == 1
+    assert text.count("0 is no improvement") == 1
 
 
 def test_structure_that_remains():
     text = flat(shown(make_diagnosis(0, verdict="unexplained", p_value=0.005)))
-    assert "Structure remains that no effect in the catalogue accounts for." in text
+    assert "The residual has structure that no effect in the catalogue explains." in text
 
 
 def test_texts_from_files_neither_style_nor_steer_the_terminal():
@@ -117,7 +117,7 @@ def test_every_width(width):
     assert "hard-iron step" in text
 
 
-def test_what_any_test_of_evidence_says_has_a_line():
+def test_each_test_of_evidence_has_a_line():
     said = EvidenceResult("my_test", rows=(Row("left over", "white"), Row("in print", "more", in_terminal=False)))
     made = make_diagnosis(1)
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
@@ -131,14 +131,14 @@ def test_without_a_smooth_correction_there_is_no_line_of_it():
     assert "smooth correction" not in shown(make_diagnosis(1, ceiling=None))
 
 
-def test_a_rare_p_value_does_not_stand_beside_nothing_is_missing():
+def test_a_rare_p_value_contradicts_an_adequate_verdict():
     text = flat(shown(make_diagnosis(0, p_value=0.04)))
     assert "Nothing is missing" not in text
     assert "Something is there that noise alone rarely makes" in text
     assert "how sure p = 0.04" in text
 
 
-def test_a_list_of_many_numbers_is_told_by_its_largest():
+def test_a_long_list_of_numbers_shows_its_largest():
     made = make_diagnosis(1)
     slopes = EffectParameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
     text = flat(
@@ -156,30 +156,28 @@ def answers(diagnosis):
 def test_the_four_answers_stand_first():
     quiet = make_diagnosis(0, simulation="Pendulum", environment=make_environment(process_noise=(), disturbance=()))
     assert answers(quiet).startswith(
-        "flight_07 against Pendulum Nothing is missing that this recording could show. "
-        "follows angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation "
-        "noise What is left is the sensor's noise. Between samples `torque` is held. named nothing unexplained nothing"
+        "flight_07 against Pendulum The recording shows no missing physics. "
+        "follows angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
+        "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named nothing unexplained nothing"
     )
 
 
-def test_what_pushes_is_located_before_any_finding():
+def test_process_noise_is_located_before_any_finding():
     pushed = make_diagnosis(
         0, simulation="Pendulum", verdict="unexplained", p_value=0.4, environment=make_environment()
     )
     told = answers(pushed)
-    assert "Pendulum Something unrecorded pushes the rate of `rate`, and no physics in the catalogue" in told
-    assert "noise Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², for about 0.7 s" in told
+    assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in told
+    assert "noise Process noise acts on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in told
     assert "named nothing unexplained the rate of `rate`" in told
 
 
 def test_a_simulation_that_does_not_follow_names_nothing():
     text = flat(shown(make_unfit(), width=200))
-    assert text.startswith(
-        "flight_07 against Pendulum The simulation does not follow the recording. follows angle: the"
-    )
+    assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. follows angle: the")
     assert "explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by 0.360 rad" in text
     assert "why Another start reaches 0.006 rad" in text
-    assert "named nothing: physics is named only beside a simulation that follows" in text
+    assert "named nothing: a simulation must fit before physics is named" in text
     for words in ("Use the simulation", "how sure", "compare", "unexplained"):
         assert words not in text
 
@@ -188,13 +186,13 @@ def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
     made = make_diagnosis(1, verdict="unexplained")
     for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "unconfirmed"), "not conf")):
         text = flat(shown(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
-        assert f"named nothing surely; hard-iron step: {grade}" in text
-        assert "unexplained structure without a name" in text
+        assert f"named nothing confirmed; hard-iron step: {grade}" in text
+        assert "unexplained unnamed structure" in text
     shape = flat(shown(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
-    assert "likelier by 163 nats (p = 0.002 if the name were right); 0.0071 |x|^1.52 sign(x)" in shape
+    assert "likelier by 163 nats (p = 0.002 if the name is right); 0.0071 |x|^1.52 sign(x)" in shape
 
 
-def test_outputs_are_told_each_in_its_own_unit():
+def test_each_output_has_its_own_unit():
     followed = (make_follows(), make_follows("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"))
     text = flat(shown(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
-    assert "rate follows to 0.0300 rad/s; noise floor 0.0200 rad/s (the steps of its numbers)" in text
+    assert "rate: residual 0.0300 rad/s; noise floor 0.0200 rad/s (resolution of the recording)" in text

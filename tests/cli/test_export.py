@@ -126,7 +126,7 @@ def test_a_file_of_the_users_own_is_not_replaced(good, tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_exports_of_an_earlier_calibration_are_told_and_kept(good, tmp_path):
+def test_exports_of_an_earlier_calibration_are_reported_and_kept(good, tmp_path):
     assert mkc("calibrate", good, "--output", tmp_path, "--export", "px4", "--export", "json").exit_code == 0
     before = (tmp_path / "good" / "px4.params").read_bytes()
     again = mkc("calibrate", good, "--output", tmp_path, "--export", "json", "--force", "--field-strength", 48)
@@ -137,7 +137,7 @@ def test_exports_of_an_earlier_calibration_are_told_and_kept(good, tmp_path):
 
 
 @pytest.mark.e2e
-def test_the_new_one_stands_beside_the_old_one(done, tmp_path):
+def test_the_new_calibration_is_compared_with_the_old(done, tmp_path):
     old = done[0] / "calibration.json"
     before = old.read_bytes()
     other = table(tmp_path / "other.csv", noisy_ellipsoid(300, seed=5) + torch.tensor([0.0, 2.0, 0.0]))
@@ -154,16 +154,16 @@ def test_the_new_one_stands_beside_the_old_one(done, tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_what_it_is_set_beside_is_never_replaced(good, tmp_path):
+def test_the_compared_calibration_is_never_replaced(good, tmp_path):
     assert mkc("calibrate", good, "--output", tmp_path).exit_code == 0
     old = tmp_path / "good" / "calibration.json"
     before = old.read_bytes()
     result = mkc("calibrate", good, "--output", tmp_path, "--compare-with", old, "--field-strength", 48, "--force")
-    refused(result, "is not replaced", "choose another --output")
+    refused(result, "--output would replace", "choose another --output")
     assert old.read_bytes() == before
 
 
-def test_an_old_one_that_is_none_ends_before_any_work(good, model, tmp_path):
+def test_an_invalid_old_calibration_is_refused_before_any_work(good, model, tmp_path):
     out = ("--output", tmp_path / "out")
     refused(mkc("calibrate", good, *out, "--compare-with", tmp_path / "none.json"), "none.json", "no such file")
     refused(mkc("calibrate", good, *out, "--compare-with", model), "model.json", "calibration.json of `mkc calibrate`")
@@ -171,7 +171,7 @@ def test_an_old_one_that_is_none_ends_before_any_work(good, model, tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_an_old_one_in_units_without_a_size_is_told_and_the_new_one_written(done, good, tmp_path):
+def test_incomparable_units_are_reported_and_the_calibration_is_written(done, good, tmp_path):
     old = done[0] / "calibration.json"
     result = mkc("calibrate", good, "--output", tmp_path, "--unit-label", "counts", "--compare-with", old)
     refused(result, "counts", "same unit options")
@@ -195,7 +195,7 @@ def test_a_calibration_that_exists_is_exported(done, tmp_path, kind):
     assert "another" in output.read_text(encoding="utf-8")
 
 
-def test_a_model_is_exported_with_its_current_and_what_is_left_out_is_told(model, tmp_path):
+def test_a_model_is_exported_with_its_current_and_omissions_are_reported(model, tmp_path):
     output = tmp_path / "flight.param"
     result = mkc("export", model, "--to", "ardupilot", "--output", output, "--instance", 2)
     assert result.exit_code == 0, result.output
@@ -210,7 +210,7 @@ def test_a_model_is_exported_with_its_current_and_what_is_left_out_is_told(model
 def test_export_never_overwrites_what_it_reads(done, tmp_path):
     copy = tmp_path / "calibration.json"
     copy.write_bytes((done[0] / "calibration.json").read_bytes())
-    refused(mkc("export", copy, "--to", "json", "--output", copy, "--force"), "never overwritten")
+    refused(mkc("export", copy, "--to", "json", "--output", copy, "--force"), "--output is the input file")
     assert copy.read_bytes() == (done[0] / "calibration.json").read_bytes()
 
 
@@ -227,7 +227,7 @@ def test_what_is_no_calibration_is_refused(tmp_path, done):
     assert not (tmp_path / "a.params").exists()
 
 
-def test_mistakes_in_options_are_told_before_any_work(done, good, tmp_path):
+def test_wrong_options_are_refused_before_any_work(done, good, tmp_path):
     out = ("--output", tmp_path / "out")
     model = done[0] / "calibration.json"
     refused(mkc("calibrate", good, *out, "--export", "qgc"), "--export", "px4, ardupilot, c-header", code=2)
@@ -274,7 +274,7 @@ def test_a_full_disk_names_the_file(good, tmp_path, monkeypatch):
     ],
     ids=lambda command: command[0],
 )
-def test_a_full_disk_behind_the_terminal_is_told_in_a_line(done, good, tmp_path, command):
+def test_a_full_disk_behind_stdout_is_reported_in_a_line(done, good, tmp_path, command):
     places = {"model": done[0] / "calibration.json", "good": good, "out": tmp_path / "out"}
     words = [word.format(**places) for word in command]
     with Path("/dev/full").open("w") as full:

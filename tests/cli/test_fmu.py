@@ -51,7 +51,7 @@ def test_an_fmu_is_diagnosed_applied_and_corrected(tmp_path, monkeypatch):
     assert "or the FMU that was diagnosed" in flat(refused.stderr)
 
 
-def test_what_cannot_be_used_is_said_before_anything_is_written(tmp_path):
+def test_unusable_input_is_refused_before_anything_is_written(tmp_path):
     (tmp_path / "tank.fmu").write_bytes(b"no archive")
     table = tank_table(tmp_path / "runs.csv")
     result = mkc("diagnose", table, "--simulation", tmp_path / "tank.fmu", "--output", tmp_path / "out")

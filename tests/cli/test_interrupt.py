@@ -79,7 +79,7 @@ def told(result, sentence):
 
 
 @pytest.mark.e2e
-def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monkeypatch):
+def test_an_interrupted_calibrate_names_the_recordings_without_results(tmp_path, monkeypatch):
     paths = [table(tmp_path / f"{name}.csv", noisy_ellipsoid(200)) for name in "abc"]
     interrupting(monkeypatch, "calibration_files", "fit", after=1)
     result = mkc("calibrate", *paths, "--output", tmp_path / "out")
@@ -88,7 +88,7 @@ def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monke
     assert "a\noffset" in result.stdout
 
 
-def test_diagnose_says_so_too(tmp_path, monkeypatch):
+def test_an_interrupted_diagnose_names_the_recordings_without_results(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
     interrupting(monkeypatch, "diagnosis_files", "diagnose_file")
     told(
@@ -98,7 +98,7 @@ def test_diagnose_says_so_too(tmp_path, monkeypatch):
 
 
 @pytest.mark.e2e
-def test_apply_and_demo_say_so_too(tmp_path, monkeypatch):
+def test_an_interrupted_apply_or_demo_reports_its_files(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
     assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
     interrupting(monkeypatch, "correction", "correct")
@@ -117,4 +117,4 @@ def test_what_may_be_incomplete_is_named(tmp_path):
     assert console.not_written([a, b], tmp_path / "out") == (
         f"nothing was written for {a}; {tmp_path / 'out' / 'b'} may be incomplete."
     )
-    assert console.not_written([], tmp_path) == "all was written."
+    assert console.not_written([], tmp_path) == "all results were written."

@@ -45,7 +45,7 @@ def test_two_files_are_written_and_nothing_is_replaced(tmp_path, monkeypatch, co
         ("_", "cannot be the name of a module"),
         ("torch", "a module torch is installed"),
         ("json", "a module json is installed"),
-        ("Kite", "in small letters, kite"),
+        ("Kite", "in lower case, kite"),
     ],
 )
 def test_names_that_would_not_work(tmp_path, monkeypatch, name, words):

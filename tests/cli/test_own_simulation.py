@@ -313,7 +313,7 @@ def test_what_a_simulator_wrote(tmp_path):
         (STATIC.replace("u.temperature", "u.temperature[:3]"), "Thermistor", ["should be a tensor of shape (250,)"]),
     ],
 )
-def test_code_that_fails_is_told_and_nothing_is_written(tmp_path, text, name, words):
+def test_failing_code_is_reported_and_nothing_is_written(tmp_path, text, name, words):
     path = tmp_path / "own.py"
     path.write_text(text)
     table = thermistor_table(tmp_path / "bench.csv")
@@ -330,7 +330,7 @@ def test_usage_errors(thermistor):
     source, table, output = thermistor
     for more, words in (
         (("--simulation", source, "--simulator-output", table), "give one of --simulation and --simulator-output"),
-        (("--simulation", "bench.py"), "or one of your own as FILE.py:CLASS or MODEL.fmu"),
+        (("--simulation", "bench.py"), "your own simulation as FILE.py:CLASS or MODEL.fmu"),
     ):
         result = mkc("diagnose", table, "--output", output, *more)
         assert result.exit_code == 2

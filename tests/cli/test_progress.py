@@ -99,7 +99,7 @@ def test_nothing_is_forked_while_something_is_drawn():
 
 
 def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(console, "_NOTED_EVERY", 0.02)
+    monkeypatch.setattr(console, "_FILE_LINE_S", 0.02)
     folder = tmp_path / "not yet there"
     with progress(3, folder) as step:
         step("diagnosing a.csv: trying 84 effects")
@@ -117,7 +117,7 @@ def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
 
 
 def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypatch):
-    monkeypatch.setattr(console, "_LINE_EVERY", 0.02)
+    monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2, lines=True) as step:
         step("calibrating log.bin, sensor MAG (1 of 3)")
         seen = ""
@@ -131,7 +131,7 @@ def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypat
 
 
 def test_in_a_pipe_nothing_is_written_without_lines(capfd, monkeypatch):
-    monkeypatch.setattr(console, "_LINE_EVERY", 0.02)
+    monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2) as step:
         step("diagnosing log.bin")
         threading.Event().wait(0.2)
@@ -152,7 +152,7 @@ def test_short_work_and_a_folder_that_cannot_be_written_leave_no_file(tmp_path, 
     with progress(1, tmp_path / "short") as step:
         step("calibrating a.csv")
     assert not (tmp_path / "short").exists()
-    monkeypatch.setattr(console, "_NOTED_EVERY", 0.02)
+    monkeypatch.setattr(console, "_FILE_LINE_S", 0.02)
     (tmp_path / "file").write_text("mine")
     with progress(1, tmp_path / "file") as step:
         step("calibrating a.csv")
@@ -161,7 +161,7 @@ def test_short_work_and_a_folder_that_cannot_be_written_leave_no_file(tmp_path, 
 
 
 @pytest.mark.process
-def test_a_diagnosis_tells_its_stages():
+def test_a_diagnosis_reports_its_stages():
     from mkc_torch import diagnose
     from mkc_torch.recording.demonstration import concealed_recording
     from mkc_torch.simulation import Magnetometer

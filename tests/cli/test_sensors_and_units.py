@@ -82,7 +82,7 @@ def test_one_of_several_can_be_chosen(folder, tmp_path):
     refused(mkc("calibrate", folder / "two.csv", "--output", tmp_path / "o", "--sensor", "mag5"), "`mag0`, `mag1`")
 
 
-def test_apply_takes_the_sensor_and_asks_for_one(folder, tmp_path):
+def test_apply_takes_the_sensor_and_needs_its_name(folder, tmp_path):
     model = folder / "out" / "two" / "mag1" / "calibration.json"
     command = ("apply", model, folder / "two.csv", "--output", tmp_path / "o.csv")
     refused(mkc(*command), "2 magnetometers, `mag0`, `mag1`", "--sensor mag0")
@@ -109,10 +109,10 @@ def test_apply_converts_as_calibrate_did(folder, tmp_path):
     torch.testing.assert_close(first, second, rtol=0.0, atol=1e-9)
 
 
-def test_apply_says_that_units_differ(folder, tmp_path):
+def test_apply_reports_different_units(folder, tmp_path):
     model = folder / "out" / "one" / "calibration.json"
     command = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv", "--unit-label", "counts")
-    refused(mkc(*command), "is in counts, but this was made of measurements in µT")
+    refused(mkc(*command), "is in counts, but the calibrated recording was in µT")
     result = mkc("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv")
     assert "is this one in another unit" in flat(result.stdout)
 
@@ -123,7 +123,7 @@ def test_units_are_written_in_one_option_or_in_several(texts):
 
 
 @pytest.mark.e2e
-def test_units_are_asked_for_and_then_converted(folder, tmp_path):
+def test_guessed_units_are_refused_and_given_units_converted(folder, tmp_path):
     path = folder / "gauss.csv"
     refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--convert mag=gauss`")
     assert not (tmp_path / "no" / "gauss").exists()
@@ -150,7 +150,7 @@ def test_units_that_cannot_be_understood(folder, tmp_path, arguments, words):
     refused(mkc("calibrate", folder / "one.csv", "--output", tmp_path / "o", *arguments), words, code=2)
 
 
-def test_a_simulation_of_ones_own_has_its_own_units():
+def test_the_users_simulation_declares_its_own_units():
     from typer import BadParameter
 
     assert _units(["time=us"], None, "pendulum.py:Pendulum") == {"time": "us"}
@@ -179,7 +179,7 @@ def test_inspect_shows_columns_rates_units_and_the_command(folder):
 
 
 @pytest.mark.slow
-def test_the_command_that_inspect_gives_does_what_it_says(folder, tmp_path, monkeypatch):
+def test_the_command_of_inspect_works(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("two", "gauss"):
         (data,) = json.loads(mkc("inspect", folder / f"{name}.csv", "--json").stdout)
@@ -190,7 +190,7 @@ def test_the_command_that_inspect_gives_does_what_it_says(folder, tmp_path, monk
         assert [sensor["name"] for sensor in data["sensors"]] == (["mag0", "mag1"] if name == "two" else [""])
 
 
-def test_inspect_asks_what_it_does_not_know(tmp_path):
+def test_inspect_reports_open_questions(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,ux,uy,uz,what\n0,1,2,3,a\n1,2,,4,b\n2,3,4,5,c\n40,1,1,1,d\n")
     (data,) = json.loads(mkc("inspect", path, "--json").stdout)

@@ -77,4 +77,4 @@ def test_a_calibration_loads_no_compiler(tmp_path):
 def test_what_the_command_line_knows_of_a_diagnosis_is_true():
     module = sys.modules["mkc_torch.diagnosis.diagnose"]
     assert (diagnosis_request.LEVEL, diagnosis_request.SURROGATES) == (module.LEVEL, module.SURROGATES)
-    assert diagnosis_request.BETWEEN == arguments.BETWEEN
+    assert diagnosis_request.INPUT_HOLDS == arguments.BETWEEN

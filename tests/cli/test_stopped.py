@@ -88,7 +88,7 @@ def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, m
 
 
 @pytest.mark.e2e
-def test_an_interrupt_writes_what_is_known_says_so_and_begins_nothing_else(tmp_path, monkeypatch):
+def test_an_interrupt_writes_and_reports_the_results_so_far_and_stops(tmp_path, monkeypatch):
     path = tmp_path / "runs.csv"
     quiet(path)
     lines = path.read_text().splitlines()

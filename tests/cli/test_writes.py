@@ -135,7 +135,7 @@ def test_killed_at_any_write_leaves_whole_files_alone_and_the_next_run_works(com
 @pytest.mark.parametrize(
     "name", ["calibrate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("apply", "diagnose"))]
 )
-def test_a_disk_that_is_full_at_any_size_is_told_and_loses_nothing(commands, name):
+def test_a_full_disk_is_reported_and_loses_nothing(commands, name):
     """A limit on the size of files is the nearest to a full disk that needs no disk."""
     command, files = commands[name]
     place = command[-1]

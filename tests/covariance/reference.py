@@ -1,4 +1,4 @@
-"""Published data sets, and what R finds in them: robustbase 0.95-0 under R 4.2.2.
+"""Published data sets, and the estimates of robustbase 0.95-0 under R 4.2.2.
 
 ``x`` being a set's columns, the values are those of::
 
@@ -95,7 +95,7 @@ _WOOD = """
 
 
 class Reference(NamedTuple):
-    """What R finds in one set."""
+    """Estimates of R for a data set."""
 
     name: str
     alpha: float
@@ -105,7 +105,7 @@ class Reference(NamedTuple):
     location: tuple[float, ...]
     upper: tuple[float, ...]  # of the covariance, column by column down to the diagonal
     raw_variance: tuple[float, ...]  # the diagonal of the raw covariance
-    far: tuple[int, ...]  # rows beyond the 0.975 quantile, counted from 1; none are printed of a single column
+    far: tuple[int, ...]  # rows beyond the 0.975 quantile, counted from 1; not printed for a single column
 
     def covariance(self) -> Tensor:
         """The upper triangle as a matrix."""

@@ -1,4 +1,4 @@
-"""Input of the minimum covariance determinant that is refused, and arrays and frames that are taken."""
+"""Refused and accepted arguments of the minimum covariance determinant."""
 
 import re
 
@@ -21,7 +21,7 @@ def with_value(value):
 
 
 @pytest.mark.parametrize(
-    ("X", "error", "told"),
+    ("X", "error", "message"),
     [
         (GOOD.long(), TypeError, "`X` to be a real floating-point tensor but got torch.int64; convert it, X.float()"),
         (GOOD.to(torch.complex64), TypeError, "`X` to be a real floating-point tensor but got torch.complex64"),
@@ -30,7 +30,7 @@ def with_value(value):
         (None, TypeError, "`X` to be a tensor or an array but got NoneType"),
         (GOOD.numpy().astype(str), TypeError, "`X` to hold real numbers but got text"),
         (GOOD.numpy().astype(complex), TypeError, "`X` to hold real numbers but got complex128"),
-        (GOOD[:, 0], ValueError, "`X` of shape (*, N, p) but got (30,); one column is X.unsqueeze(-1)"),
+        (GOOD[:, 0], ValueError, "`X` of shape (*, N, p) but got (30,); for a single column pass X.unsqueeze(-1)"),
         (GOOD[:0], ValueError, "`X` of shape (*, N, p) but got (0, 3)"),
         (GOOD[:, :0], ValueError, "`X` of shape (*, N, p) but got (30, 0)"),
         (GOOD[:4], ValueError, "at least 5 samples for a scatter of 3 columns but got 4"),
@@ -38,17 +38,17 @@ def with_value(value):
         (with_value(np.nan), ValueError, "`X` to be finite but got 1 values that are not, the first at index (4, 1)"),
         (with_value(np.inf), ValueError, "`X` to be finite but got 1 values that are not, the first at index (4, 1)"),
         (with_value(1e90), ValueError, "`X` of a magnitude of at most 1e+77 but got 1e+90; choose another unit"),
-        (GOOD * 1e-170, ValueError, "`X` with variances that torch.float64 holds"),
-        (GOOD.float() * 1e-30, ValueError, "`X` with variances that torch.float32 holds"),
+        (GOOD * 1e-170, ValueError, "`X` with variances in the range of torch.float64"),
+        (GOOD.float() * 1e-30, ValueError, "`X` with variances in the range of torch.float32"),
     ],
 )
-def test_bad_samples_are_refused(X, error, told):
-    with pytest.raises(error, match=re.escape(told)):
+def test_bad_samples_are_refused(X, error, message):
+    with pytest.raises(error, match=re.escape(message)):
         MCD().fit(X)
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "told"),
+    ("options", "error", "message"),
     [
         ({"support_fraction": 0.4}, ValueError, "`support_fraction` to be in [0.5, 1] but got 0.4"),
         ({"support_fraction": "half"}, TypeError, "`support_fraction` to be a number in [0.5, 1] but got 'half'"),
@@ -61,36 +61,36 @@ def test_bad_samples_are_refused(X, error, told):
         ({"seed": None}, ValueError, "`seed` to be a whole number but got None"),
     ],
 )
-def test_bad_parameters_are_refused(options, error, told):
-    with pytest.raises(error, match=re.escape(told)):
+def test_bad_parameters_are_refused(options, error, message):
+    with pytest.raises(error, match=re.escape(message)):
         MCD(**options)
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"h": 16}, "`h` between 17, (N + p + 1) // 2, and the 30 samples but got 16"),
         ({"h": 31}, "`h` between 17, (N + p + 1) // 2, and the 30 samples but got 31"),
         ({"cutoff": 1e-9}, "`cutoff` to leave more than 3 samples but only 0 are within it; raise it"),
     ],
 )
-def test_parameters_that_do_not_fit_the_samples_are_refused(options, told):
-    with pytest.raises(ValueError, match=re.escape(told)):
+def test_parameters_that_do_not_fit_the_samples_are_refused(options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         MCD(**options).fit(GOOD)
 
 
-def test_other_samples_have_to_have_the_columns_of_the_fit():
+def test_other_samples_must_have_the_columns_of_the_fit():
     fit = MCD().fit(torch.stack([GOOD, 2.0 * GOOD]))
-    for bad, told in (
-        (GOOD[:, :2], "shape (*, M, 3) but got (30, 2); give it the columns of the fit"),
+    for bad, message in (
+        (GOOD[:, :2], "shape (*, M, 3) but got (30, 2); pass the columns of the fit"),
         (GOOD[0], "shape (*, M, 3) but got (3,)"),
         (GOOD.expand(3, 30, 3), "batch dimensions of `X` and `location_` that broadcast but got (3,) and (2,)"),
     ):
-        with pytest.raises(ValueError, match=re.escape(told)):
+        with pytest.raises(ValueError, match=re.escape(message)):
             fit.mahalanobis(bad)
 
 
-def test_nothing_is_there_before_the_fit():
+def test_attributes_before_fit_raise_not_fitted():
     with pytest.raises(NotFittedError, match=r"no `covariance_` yet; call fit\(X\) first"):
         _ = MCD().covariance_
     with pytest.raises(NotFittedError, match=r"call fit\(X\) first"):
@@ -116,7 +116,7 @@ def frozen(array):
     ],
     ids=["array", "read-only", "columns first", "a view", "other bytes", "polars", "pandas"],
 )
-def test_arrays_and_data_frames_are_taken(make):
+def test_arrays_and_data_frames_are_accepted(make):
     fit = MCD().fit(make(GOOD.numpy()))
     assert torch.equal(fit.covariance_, MCD().fit(GOOD).covariance_)
     assert torch.equal(fit.mahalanobis(make(GOOD.numpy())), fit.mahalanobis(GOOD))
@@ -128,7 +128,7 @@ def test_arrays_of_other_numbers_become_floats():
     assert MCD().fit(GOOD.numpy().astype(np.float32)).covariance_.dtype == torch.float32
 
 
-def test_the_samples_given_stay_as_they_are():
+def test_the_given_samples_are_not_modified():
     X = SETS["hbk"]()
     before = X.clone()
     MCD().fit(X)

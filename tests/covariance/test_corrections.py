@@ -1,4 +1,4 @@
-"""Quantiles of chi-square and the factors made of them, against SciPy and R."""
+"""Chi-square quantiles and correction factors, against SciPy and R."""
 
 import pytest
 from scipy.stats import chi2
@@ -8,7 +8,7 @@ from mkc_torch.covariance._corrections import consistency_factor, small_sample_f
 
 
 @pytest.mark.parametrize("p", [1, 2, 3, 10, 100, 1000])
-def test_chi_square_is_that_of_scipy(p):
+def test_chi_square_equals_scipy(p):
     for q in (1e-6, 0.025, 0.5, 0.9, 0.975, 1.0 - 1e-6):
         x = chi2.ppf(q, p)
         assert chi_square_quantile(q, p) == pytest.approx(x, rel=1e-8)
@@ -36,7 +36,7 @@ def test_the_consistency_factor_is_the_share_of_variance_of_the_most_central():
         (200, 8, 0.9, 1.02366160828289, 1.01987411281356),
     ],
 )
-def test_factors_for_few_samples_are_those_of_robustbase(N, p, fraction, raw, reweighted):
+def test_small_sample_factors_equal_robustbase(N, p, fraction, raw, reweighted):
     assert small_sample_factor(N, p, fraction, reweighted=False) == pytest.approx(raw, rel=1e-12)
     assert small_sample_factor(N, p, fraction, reweighted=True) == pytest.approx(reweighted, rel=1e-12)
 

@@ -1,4 +1,4 @@
-"""The minimum covariance determinant: others' estimates, all subsets, breakdown, equivariance, limits."""
+"""The minimum covariance determinant: published estimates, all subsets, breakdown, equivariance, limits."""
 
 import itertools
 
@@ -33,16 +33,16 @@ def covariance(X: Tensor) -> Tensor:
 
 
 def subsets(X: Tensor, h: int) -> Tensor:
-    """The least log determinant of all subsets."""
+    """The smallest log determinant of all subsets."""
     index = torch.tensor(list(itertools.combinations(range(X.shape[0]), h)))
     return torch.logdet(covariance(X[index])).min()
 
 
-# others' results
+# published results
 
 
 @pytest.mark.parametrize("reference", REFERENCES, ids=lambda r: f"{r.name} {r.alpha:g}")
-def test_estimates_are_those_of_robustbase(reference):
+def test_estimates_equal_robustbase(reference):
     fit = MCD(reference.alpha).fit(SETS[reference.name]())
     assert fit.h_ == int(fit.support_.sum()) == reference.h
     assert float(fit.objective_) == pytest.approx(reference.objective, rel=1e-6)
@@ -76,7 +76,7 @@ def test_published_outliers_are_far(name, rows):
 
 
 @pytest.mark.parametrize("name", ["stackloss", "hbk", "hbk_y", "salinity", "delivery_y", "versicolor", "iris"])
-def test_no_objective_of_scikit_learn_is_lower(name):
+def test_the_objective_is_not_above_that_of_scikit_learn(name):
     X = SETS[name]()
     peer = MinCovDet(random_state=0).fit(X.numpy())
     mine = MCD(h=int(peer.raw_support_.sum())).fit(X)
@@ -85,17 +85,17 @@ def test_no_objective_of_scikit_learn_is_lower(name):
 
 
 @pytest.mark.parametrize("name", ["stackloss", "salinity", "wood", "hbk", "stars_cyg_y"])
-def test_estimates_are_those_of_scikit_learn_but_for_the_correction_for_few_samples(name):
-    """Of the first three sets it finds the same support, of the last three it keeps the same samples."""
+def test_estimates_equal_scikit_learn_without_the_small_sample_correction(name):
+    """The first three sets have the same support, the last three the same reweighted samples."""
     X = SETS[name]()
     N, p = X.shape
     peer = MinCovDet(random_state=0).fit(X.numpy())
     h, k = int(peer.raw_support_.sum()), int(peer.support_.sum())
     fit = MCD(h=h, consistency="cutoff").fit(X)
     half = (N + p + 1) // 2
-    fraction = 0.5 + 0.5 * (h - half) / (N - half)  # it rounds up
+    fraction = 0.5 + 0.5 * (h - half) / (N - half)  # scikit-learn rounds up
     small = {which: small_sample_factor(N, p, fraction, reweighted=which) for which in (False, True)}
-    # it divides by the number of samples
+    # scikit-learn divides by the number of samples
     if name in ("stackloss", "salinity", "wood"):
         assert fit.support_.tolist() == peer.raw_support_.tolist()
         torch.testing.assert_close(fit.raw_location_, torch.as_tensor(peer.raw_location_))
@@ -112,13 +112,13 @@ def test_estimates_are_those_of_scikit_learn_but_for_the_correction_for_few_samp
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("N", "p", "h"), [(10, 2, 7), (12, 3, 8), (11, 1, 6), (12, 1, 9), (9, 2, 9)])
-def test_the_optimum_is_that_of_all_subsets(seed, N, p, h):
+def test_the_optimum_equals_the_search_over_all_subsets(seed, N, p, h):
     X = sample(seed, N, p) * torch.exp(sample(seed + 100, N, 1))
     assert float(MCD(h=h).fit(X).objective_) == pytest.approx(float(subsets(X, h)), abs=1e-9)
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e70])
-def test_far_values_cost_one_column_no_digits(far):
+def test_a_single_column_with_far_values_keeps_its_digits(far):
     values = sample(0, 41, 1)
     values[:10] = -far * (1.0 + values[:10].abs())
     ordered = values.flatten().sort().values
@@ -127,7 +127,7 @@ def test_far_values_cost_one_column_no_digits(far):
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_every_seed_finds_one_optimum(name):
+def test_every_seed_finds_the_same_optimum(name):
     X = SETS[name]()
     found = [float(MCD(seed=seed, reweight=False).fit(X).objective_) for seed in range(1, 4)]
     assert max(found) == pytest.approx(min(found), abs=1e-9)
@@ -143,7 +143,7 @@ def test_no_exchange_of_two_samples_lowers_the_determinant():
         assert float(torch.logdet(covariance(X[others]))) >= float(fit.objective_) - 1e-9
 
 
-def test_more_samples_than_are_screened_reach_a_fixed_point():
+def test_large_samples_reach_a_fixed_point():
     X = sample(0, 2500, 3)
     X[:900] += 8.0
     fit = MCD(starts=50).fit(X)
@@ -160,18 +160,18 @@ def test_more_samples_than_are_screened_reach_a_fixed_point():
 
 @pytest.mark.parametrize("p", [1, 2, 4])
 @pytest.mark.parametrize("far", ["cluster", "point", "cloud", "farther"])
-def test_forty_percent_of_far_outliers_leave_it(p, far):
+def test_forty_percent_of_far_outliers_have_no_influence(p, far):
     X = sample(p, 100, p)
     clean = X[40:].clone()
     X[:40] = {
-        # nearer by, the least determinant of four columns is that of a line through a point like these
+        # nearer clusters would have the smallest determinant in four columns
         "cluster": 1e3 + 0.1 * sample(9, 40, p),
         "point": torch.full((40, p), 1e4, dtype=torch.float64),
         "cloud": 1e3 * sample(9, 40, p),
         "farther": 1e70 * torch.sign(sample(9, 40, p)),
     }[far]
     fit = MCD(consistency="cutoff").fit(X)
-    if far != "cloud":  # a few of which may lie near
+    if far != "cloud":  # a few points of a cloud may lie near
         assert not fit.weights_[:40].any()
         assert (fit.distances_[:40] > fit.distance_cutoff_).all()
     torch.testing.assert_close(fit.location_, clean.mean(0), atol=0.25, rtol=0)
@@ -179,7 +179,7 @@ def test_forty_percent_of_far_outliers_leave_it(p, far):
     assert 0.4 < float(size.min()) <= float(size.max()) < 1.6
 
 
-def test_a_tight_cluster_that_owns_the_smallest_determinant_is_found_as_such():
+def test_a_tight_cluster_of_smallest_determinant_is_the_support():
     X = sample(0, 200, 4)
     X[:80] = 30.0 + 0.1 * sample(1, 80, 4)
     fit = MCD().fit(X)
@@ -188,7 +188,7 @@ def test_a_tight_cluster_that_owns_the_smallest_determinant_is_found_as_such():
     assert float(fit.objective_) < float(clean.objective_)
 
 
-def test_the_share_that_is_left_is_a_larger_correction_than_the_cutoff():
+def test_the_share_correction_is_larger_than_the_cutoff_correction():
     X = sample(0, 200, 2)
     X[:80] += 50.0
     share, cutoff = (MCD(consistency=which).fit(X) for which in ("share", "cutoff"))
@@ -199,7 +199,7 @@ def test_the_share_that_is_left_is_a_larger_correction_than_the_cutoff():
 
 
 @pytest.mark.parametrize("options", [{}, {"consistency": "cutoff"}, {"support_fraction": 0.75}], ids=str)
-def test_gaussian_samples_have_their_covariance(options):
+def test_the_covariance_of_gaussian_samples_is_consistent(options):
     mixed = torch.tensor([[2.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.5, -0.3, 0.1]], dtype=torch.float64)
     X = sample(0, 20000, 3) @ mixed.mT + 5.0
     fit = MCD(starts=50, **options).fit(X)
@@ -245,7 +245,7 @@ def test_without_reweighting_the_raw_estimates_are_the_result():
     logs=st.lists(st.floats(-8, 8), min_size=4, max_size=4),
     shift=st.floats(-1e3, 1e3),
 )
-def test_it_turns_and_stretches_with_the_data(seed, p, N, logs, shift):
+def test_the_estimate_is_affine_equivariant(seed, p, N, logs, shift):
     X = contaminated(seed, N, p)
     orthogonal = torch.linalg.qr(sample(seed + 5, p, p)).Q
     change = orthogonal * torch.exp(torch.tensor(logs[:p], dtype=torch.float64) / 4.0) * 10.0 ** (logs[0] / 2.0)
@@ -290,7 +290,7 @@ def test_single_precision_gives_the_same_in_single_precision():
 
 @pytest.mark.parametrize("p", [1, 3])
 @pytest.mark.parametrize("reweight", [True, False])
-def test_derivatives_are_those_of_moments_of_the_samples_that_count(p, reweight):
+def test_derivatives_equal_those_of_the_moments_of_the_used_samples(p, reweight):
     X = contaminated(3, N=16, p=p).requires_grad_()
 
     def results(X):
@@ -303,7 +303,7 @@ def test_derivatives_are_those_of_moments_of_the_samples_that_count(p, reweight)
     torch.testing.assert_close(slope[:, 0], fit.weights_ / fit.weights_.sum())
 
 
-def test_a_huge_outlier_puts_no_nan_into_a_derivative():
+def test_a_huge_outlier_gives_no_nan_derivative():
     X = contaminated(3)
     X[0] = 1e75
     X.requires_grad_()
@@ -312,7 +312,7 @@ def test_a_huge_outlier_puts_no_nan_into_a_derivative():
         assert torch.isfinite(torch.autograd.grad(result, X, retain_graph=True)[0]).all()
 
 
-def test_distances_are_those_of_mahalanobis():
+def test_distances_equal_the_mahalanobis_formula():
     fit = MCD().fit(contaminated(0))
     new = 5.0 * sample(3, 2, 7, 3)
     error = new - fit.location_
@@ -323,9 +323,9 @@ def test_distances_are_those_of_mahalanobis():
     assert fit.distance_cutoff_ == pytest.approx(3.0575, abs=1e-4)  # sqrt of 9.3484, of any table
 
 
-def test_the_fraction_and_h_say_the_same():
+def test_support_fraction_and_h_are_equivalent():
     X = contaminated(0)  # N = 60, p = 3
     for fraction, h in ((0.5, 32), (0.75, 46), (1.0, 60)):
-        one, other = MCD(fraction).fit(X), MCD(h=h).fit(X)
-        assert one.h_ == h
-        torch.testing.assert_close(one.covariance_, other.covariance_)
+        first, other = MCD(fraction).fit(X), MCD(h=h).fit(X)
+        assert first.h_ == h
+        torch.testing.assert_close(first.covariance_, other.covariance_)

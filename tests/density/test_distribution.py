@@ -68,7 +68,7 @@ def cumulative(u, sigma, length):
 
 
 @over_shapes
-def test_log_prob_is_minus_the_nll(sigma, length):
+def test_log_prob_is_the_negative_nll(sigma, length):
     p = distribution(sigma, length, d=0.7, loc=1.5)
     value = 1.5 + 0.7 * length * torch.linspace(-0.99, 0.99, 41, dtype=torch.float64)
     torch.testing.assert_close(p.log_prob(value), -mkc_nll(value - 1.5, p.sigma, p.d, p.bound), rtol=1e-13, atol=1e-13)
@@ -153,7 +153,7 @@ def test_icdf_in_float32_keeps_the_outermost_draws_of_a_gaussian_on_the_head(len
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_uniform_draw_of_exactly_zero_does_not_make_an_impossible_sample(dtype, monkeypatch):
+def test_a_uniform_draw_of_zero_gives_a_plausible_sample(dtype, monkeypatch):
     p = MKCDistribution(*(torch.tensor(v, dtype=dtype) for v in (INF, 1.0, 1e5)))
     monkeypatch.setattr(torch, "rand", lambda size, **options: torch.zeros(size, **options))
     assert p.rsample((3,)).abs().max() < 40  # float32 draws 0 once in 2^24, and the density at -1e5 is exp(-5e9)
@@ -177,13 +177,13 @@ def test_icdf_of_many_probabilities_equals_icdf_of_few():
 
 
 @pytest.mark.parametrize("probability", [-1e-3, 1.001, math.nan])
-def test_icdf_refuses_what_is_no_probability(probability):
+def test_icdf_refuses_values_that_are_not_probabilities(probability):
     with pytest.raises(ValueError, match=r"`value` to be probabilities in \[0, 1\] but got .* at index \(1,\); divide"):
         MKCDistribution(2.0, 1.0, 10.0, validate_args=True).icdf(torch.tensor([0.5, probability]))
 
 
 @pytest.mark.parametrize("name", ["log_prob", "cdf", "icdf"])
-def test_a_number_is_no_tensor_of_values(name):
+def test_values_that_are_not_tensors_are_refused(name):
     with pytest.raises(
         TypeError, match=r"`value` to be a tensor.* but got float; make a tensor of it, torch\.as_tensor"
     ):
@@ -191,7 +191,7 @@ def test_a_number_is_no_tensor_of_values(name):
 
 
 @pytest.mark.parametrize("shape", [3, "a", None, (2.5,)])
-def test_what_is_no_shape_of_samples_is_refused(shape):
+def test_bad_shapes_of_samples_are_refused(shape):
     for draw in (MKCDistribution(2.0, 1.0, 10.0).rsample, MKCDistribution(2.0, 1.0, 10.0).sample):
         with pytest.raises(TypeError, match=r"`sample_shape` to be a shape but got .*; write \(1000,\)"):
             draw(shape)
@@ -201,7 +201,7 @@ def test_what_is_no_shape_of_samples_is_refused(shape):
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "loc"])
 @pytest.mark.parametrize("value", ["2", None, torch.ones(1) + 0j])
-def test_parameters_that_are_no_numbers_are_refused_by_name(name, value):
+def test_parameters_that_are_not_numbers_are_refused_by_name(name, value):
     with pytest.raises(TypeError, match=rf"Expected argument `{name}` to be (a number, or a tensor of them|real)"):
         MKCDistribution(**{"sigma": 2.0, "d": 1.0, "bound": 10.0, name: value})
 
@@ -233,7 +233,7 @@ def test_samples_in_float32_follow_the_cdf_too():
     assert stats.kstest(x.numpy(), lambda v: p.cdf(torch.from_numpy(v)).numpy()).pvalue > 0.01
 
 
-def test_samples_have_the_extended_shape_follow_the_seed_and_carry_no_gradient_unless_asked():
+def test_samples_have_the_extended_shape_follow_the_seed_and_have_no_gradient_by_default():
     sigma = torch.tensor([1.0, 2.0], requires_grad=True)
     p = MKCDistribution(sigma, torch.ones(3, 1), 10.0)
     assert p.sample().shape == (3, 2)
@@ -249,7 +249,7 @@ def test_samples_have_the_extended_shape_follow_the_seed_and_carry_no_gradient_u
 
 @pytest.mark.parametrize("sigma", SIGMAS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_quantiles_are_the_same_whether_or_not_a_gradient_is_asked_for(sigma, dtype):
+def test_quantiles_do_not_depend_on_requires_grad(sigma, dtype):
     probability = torch.cat([torch.linspace(0, 1, 101), torch.tensor([1e-6, 1e-5, 1e-4, 1 - 1e-6])]).to(dtype)
     arguments = [torch.tensor(v, dtype=dtype) for v in (sigma, 1.0, 100.0)]
     expected = MKCDistribution(*arguments).icdf(probability)
@@ -313,7 +313,7 @@ def test_gradient_of_the_sampled_second_moment_is_that_of_the_variance():
 
 
 @pytest.mark.parametrize("sigma", [0.3, INF])
-def test_gradients_of_icdf_at_the_ends_are_those_of_the_support(sigma):
+def test_gradients_of_icdf_at_the_ends_equal_those_of_the_support(sigma):
     leaves = double(sigma, 0.7, 3.0, -2.0, requires_grad=True)
     for probability, sign in ((0.0, -1.0), (1.0, 1.0)):
         found = torch.autograd.grad(MKCDistribution(*leaves).icdf(double(probability)), leaves)
@@ -397,7 +397,7 @@ def test_float32_agrees_with_float64(sigma):
         torch.testing.assert_close(found.double(), expected, rtol=2e-5, atol=2e-5)
 
 
-# --- a good citizen of torch.distributions
+# --- conventions of torch.distributions
 
 
 def test_shapes_broadcast_and_expand():
@@ -449,10 +449,10 @@ def test_arguments_outside_their_constraints_are_refused(name, value):
     arguments = {"sigma": 1.0, "d": 1.0, "bound": 5.0, "loc": 0.0, name: torch.tensor([1.0, value])}
     assert set(MKCDistribution.arg_constraints) == {"sigma", "d", "bound", "loc"}
     with pytest.raises(ValueError, match=f"Expected parameter {name}"):
-        MKCDistribution(**arguments, validate_args=True)  # torch.compile turns the default off for good
+        MKCDistribution(**arguments, validate_args=True)  # torch.compile turns the default off permanently
 
 
-def test_the_least_and_the_greatest_sigma_are_accepted():
+def test_the_smallest_and_the_largest_sigma_are_accepted():
     assert MKCDistribution(torch.tensor([0.05, INF]), 1.0, 5.0, validate_args=True).entropy().isfinite().all()
     assert MKCDistribution(torch.tensor([0.05, INF]).double(), 1.0, 5.0, validate_args=True).entropy().isfinite().all()
 
@@ -502,7 +502,7 @@ def test_works_inside_independent_and_transformed_distributions():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))], ids=["deepcopy", "pickle"])
-def test_copies_are_equal_and_apart(copied):
+def test_copies_are_equal_and_independent(copied):
     p = distribution([0.5, INF], 10.0, loc=1.0)
     q = copied(p)
     x = double([2.0, -3.0])
@@ -519,7 +519,7 @@ def test_repr_names_the_parameters():
 
 @pytest.mark.parametrize("default", [True, False])
 @pytest.mark.parametrize("bound", [math.inf, 0.0, -1.0, math.nan])
-def test_a_domain_without_an_end_is_refused_whatever_torch_has_for_a_default(bound, default, monkeypatch):
+def test_an_infinite_domain_is_refused_for_any_validation_default_of_torch(bound, default, monkeypatch):
     monkeypatch.setattr(torch.distributions.Distribution, "_validate_args", default)
     with pytest.raises(ValueError, match="parameter bound"):
         MKCDistribution(2.0, 1.0, bound)

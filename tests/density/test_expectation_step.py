@@ -11,14 +11,14 @@ DOMAIN = {"bound": torch.tensor([20.0, 30.0]).double(), "d_min": torch.tensor([1
 
 
 def residuals(count=3000, seed=0):
-    """A heavy-tailed channel and a Gaussian one."""
+    """A heavy-tailed channel and a Gaussian channel."""
     torch.manual_seed(seed)
     heavy = MKCDistribution(torch.tensor(2.0).double(), torch.tensor(0.5).double(), 20.0).sample((count,))
     gaussian = torch.erfinv(2 * (torch.arange(count).double() + 0.5) / count - 1) * 2**0.5  # quantiles
     return torch.stack([heavy, 0.7 * gaussian], -1)
 
 
-def test_it_is_the_likeliest_density_of_weighted_residuals():
+def test_the_step_has_the_maximum_likelihood_for_weighted_residuals():
     error = residuals()
     weight = torch.rand_like(error)
     found = expectation_step(error, weight, **DOMAIN)
@@ -46,7 +46,7 @@ def test_annealed_step_takes_a_share_of_kappa_and_fits_d_for_it():
     assert part.d[0] > full.d[0]
 
 
-def test_a_domain_without_room_gets_least_squares_and_leaves_the_other_channels_alone():
+def test_a_narrow_domain_gets_least_squares_and_does_not_affect_other_channels():
     error = residuals()
     wide = error * torch.tensor([1000.0, 1.0])
     found = expectation_step(wide, torch.ones_like(error), **DOMAIN)
@@ -57,7 +57,7 @@ def test_a_domain_without_room_gets_least_squares_and_leaves_the_other_channels_
     torch.testing.assert_close((found.kappa[1], found.d[1]), (alone.kappa[1], alone.d[1]))
 
 
-def test_one_residual_is_two_of_its_size():
+def test_a_single_residual_equals_two_of_its_size():
     error, weight = torch.tensor([[0.5, -2.0]]).double(), torch.tensor([[3.0, 1.0]]).double()
     found = expectation_step(error, weight, **DOMAIN)
     twice = expectation_step(error.repeat(2, 1), weight.repeat(2, 1), **DOMAIN)
@@ -70,14 +70,14 @@ def test_residuals_of_zero_end_at_the_floor():
     torch.testing.assert_close(found.d, DOMAIN["d_min"])
 
 
-def test_damping_moves_part_of_the_way_in_log_d():
+def test_damping_interpolates_in_log_d():
     before, after = torch.tensor([1.0, 4.0]).double(), torch.tensor([100.0, 4.0]).double()
     torch.testing.assert_close(damped(before, after, 0.5), torch.tensor([10.0, 4.0]).double())
     torch.testing.assert_close(damped(before, after, 0.0), after)
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
-def test_damping_of_kappa_is_between_the_two_and_exact_at_infinite_sigma(keep):
+def test_damped_kappa_lies_between_and_is_exact_at_infinite_sigma(keep):
     before, after = torch.tensor([4.0, 0.0, 0.0, 1.0]).double(), torch.tensor([0.25, 0.0, 1.0, 0.0]).double()
     found = damped_kappa(before, after, keep)
     assert found[1] == 0
@@ -90,7 +90,7 @@ def test_damping_of_kappa_is_between_the_two_and_exact_at_infinite_sigma(keep):
         torch.testing.assert_close(found, after, rtol=1e-14, atol=0)
 
 
-def test_damped_steps_arrive_at_infinite_sigma():
+def test_damped_steps_converge_to_infinite_sigma():
     kappa = torch.tensor([1.0]).double()
     for _ in range(200):
         kappa = damped_kappa(kappa, torch.zeros(1).double(), 0.7)

@@ -15,8 +15,8 @@ def uniform(low, high, *shape, seed=0):
 
 
 @pytest.mark.parametrize(("shortest", "longest", "rounding"), [(1.0, 15.0, 5e-6), (15.0, 1e7, 5e-7)])
-def test_many_normalisers_in_single_precision_are_those_of_double_precision(shortest, longest, rounding):
-    """Mostly by quadrature, where the tail cancels from the slope, and by the table alone."""
+def test_many_normalisers_in_single_precision_equal_double_precision(shortest, longest, rounding):
+    """Mostly by quadrature, where the tail cancels in the derivative, and by the table alone."""
     n = 5000
     kappa = torch.cat(
         [uniform(0.0, 1.0, n), uniform(0.0, 400.0, n), torch.exp(uniform(-14.0, 5.99, n)), torch.zeros(9)]
@@ -36,7 +36,7 @@ def test_many_normalisers_in_single_precision_are_those_of_double_precision(shor
     torch.testing.assert_close(found[2], expected[2], rtol=1e-6, atol=1e-6)
 
 
-def test_the_table_itself_has_more_digits_than_single_precision_rounds_away():
+def test_the_table_is_more_accurate_than_single_precision():
     kappa = torch.cat([uniform(0.0, 0.5, 500), uniform(0.0, 400.0, 500)]).requires_grad_()
     length = torch.full_like(kappa, 24.0)
     assert reaches_beyond_head(kappa, length).all()

@@ -1,4 +1,4 @@
-"""Several kernels on one channel: what they hold, held-out likelihood, the normaliser, and what is refused."""
+"""Several kernels per channel: held-out likelihood, normaliser, equivariance, and bad arguments."""
 
 import math
 
@@ -27,7 +27,7 @@ def of_one_kernel(learned, other, bound):
 
 @pytest.mark.parametrize("freedom", [1.0, 1.5, 3.0])
 @pytest.mark.parametrize("seed", [10, 11])
-def test_a_tail_that_thins_out_is_held_out_as_by_its_own_density_and_far_better_than_a_flat_one(freedom, seed):
+def test_held_out_likelihood_of_a_decreasing_tail_is_near_the_truth_and_above_a_flat_tail(freedom, seed):
     learned, other = drawn(seed, freedom), drawn(seed + 100, freedom)
     bound = 1.001 * float(torch.cat([learned, other]).abs().max())
     several = float(fit_kernels(learned, bound=bound).log_prob(other).mean())
@@ -37,13 +37,13 @@ def test_a_tail_that_thins_out_is_held_out_as_by_its_own_density_and_far_better_
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_wrong_values_anywhere_and_none_at_all_are_described_as_by_one_kernel(seed):
+def test_uniform_outliers_and_gaussian_errors_are_described_as_by_a_single_kernel(seed):
     normal = torch.randn(4000, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     for error, bound in ((mixed(seed), 20.0), (normal, 10.0)):
         order = torch.randperm(4000, generator=torch.Generator().manual_seed(seed))
         learned, other = error[order[:2000]], error[order[2000:]]
-        one = of_one_kernel(learned, other, bound)
-        assert float(fit_kernels(learned, bound=bound).log_prob(other).mean()) == pytest.approx(one, abs=0.01)
+        first = of_one_kernel(learned, other, bound)
+        assert float(fit_kernels(learned, bound=bound).log_prob(other).mean()) == pytest.approx(first, abs=0.01)
 
 
 def test_the_density_integrates_to_one_over_its_domain():
@@ -56,10 +56,10 @@ def test_the_density_integrates_to_one_over_its_domain():
         assert 2.0 * float(mass) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_no_other_depths_are_likelier():
+def test_the_depths_maximise_the_likelihood():
     error = drawn(3, 2.0, 500)
     fit = fit_kernels(error, bound=60.0)
-    # the fit counts one error more at the bound
+    # the fit adds an error at the bound
     counted = torch.cat([error, fit.bound.unsqueeze(0)])
 
     def likelihood(depth):
@@ -75,14 +75,14 @@ def test_no_other_depths_are_likelier():
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
-def test_another_unit_changes_the_density_by_that_unit_alone(unit):
+def test_the_density_is_equivariant_to_the_unit(unit):
     error = drawn(2, 2.0, 1000)
-    one, other = fit_kernels(error), fit_kernels(unit * error)
-    torch.testing.assert_close(one.log_prob(error), other.log_prob(unit * error) + math.log(unit))
-    assert float(one.log_likelihood) == pytest.approx(float(one.log_prob(error).mean()), abs=1e-3)
+    first, other = fit_kernels(error), fit_kernels(unit * error)
+    torch.testing.assert_close(first.log_prob(error), other.log_prob(unit * error) + math.log(unit))
+    assert float(first.log_likelihood) == pytest.approx(float(first.log_prob(error).mean()), abs=1e-3)
 
 
-def test_channels_are_fitted_apart():
+def test_channels_are_fitted_independently():
     both = torch.cat([drawn(0, 1.0), 7.0 * drawn(1, 5.0)], -1)
     fit = fit_kernels(both)
     for k in range(2):
@@ -90,7 +90,7 @@ def test_channels_are_fitted_apart():
         torch.testing.assert_close(fit.log_prob(both)[:, k], alone.log_prob(both[:, k : k + 1])[:, 0])
 
 
-def test_residuals_that_are_hit_exactly_do_not_make_a_spike():
+def test_residuals_of_exactly_zero_do_not_make_a_spike():
     error = drawn(0, 3.0)
     error[:1200] = 0.0
     assert float(fit_kernels(error).log_prob(torch.zeros(1, 1)).exp()) < 100.0
@@ -101,25 +101,25 @@ def test_residuals_that_are_hit_exactly_do_not_make_a_spike():
     [
         (torch.zeros(5), None, r"shape \(N >= 2, m\)"),
         (torch.zeros(1, 1), None, r"shape \(N >= 2, m\)"),
-        (torch.tensor([[1.0], [math.nan]]), None, "not finite must be left out"),
+        (torch.tensor([[1.0], [math.nan]]), None, "leave out residuals that are not finite"),
         (torch.tensor([[0.0], [0.0], [0.0], [1.0]]), None, "a robust scale above 0"),
         (torch.tensor([[-1.0], [1.0], [2.0]]), 3.0, "at least four robust scales"),
         (torch.tensor([[-1.0], [1.0], [2.0]]), torch.tensor([90.0, 90.0]), r"a number or of shape \(1,\)"),
         (torch.tensor([[-1.0], [1.0], [2.0]]), 1e200, "beyond which squares overflow"),
     ],
 )
-def test_what_has_no_density_is_refused(error, bound, match):
+def test_residuals_without_a_density_are_refused(error, bound, match):
     with pytest.raises(ValueError, match=match):
         fit_kernels(error, bound=bound)
 
 
-def test_a_bound_of_one_channel_is_that_of_all():
+def test_a_bound_of_a_single_channel_applies_to_all():
     both = torch.cat([drawn(0, 1.0), drawn(1, 1.0)], -1)
     of_one, of_each = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
     assert of_one.bound.tolist() == of_each.bound.tolist() == [90.0, 90.0]
 
 
-def test_there_is_a_kernel_of_every_octave_up_to_the_bound():
+def test_there_is_a_kernel_for_every_octave_up_to_the_bound():
     bandwidth = fit_kernels(drawn(0, 2.0), bound=300.0).bandwidth[0]
     torch.testing.assert_close(bandwidth[1:-1], 2.0 * bandwidth[:-2])
     assert 150.0 < float(bandwidth[-2]) <= 300.0

@@ -1,4 +1,4 @@
-"""Theorem 3 and what follows from it: the bound holds, its minimum is where Corollary 2 says, its limits are right."""
+"""Theorem 3 and its consequences: the bound holds, its minimum agrees with Corollary 2, its limits are right."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def test_no_outliers_move_the_minimiser_beyond_the_bound(sizes, d, epsilon, zeta
     sigma = above * float(least_bandwidth(double(epsilon), N, M))
     x = zeta * (1.0 + 0.5 * torch.rand(N, generator=g).double()) * (torch.randint(2, (N,), generator=g) * 2 - 1)
     noise = epsilon * d * (2.0 * torch.rand(N, generator=g).double() - 1.0)
-    if seed % 2:  # all inliers pull to one side, where the outliers are
+    if seed % 2:  # all inliers have errors of one sign, that of the outliers
         noise = epsilon * d * torch.sign(x)
     xi = float(error_bound(double(sigma), d, epsilon, zeta, N, M))
-    # the outliers agree with one another on a coefficient near the bound
+    # all outliers agree on a coefficient near the bound
     noise[M:] = x[M:] * xi * float(torch.rand((), generator=g)) * (1.2 if seed % 3 else -1.2)
     found = global_minimiser(x, noise, sigma * d, reach=1.5 * xi + 3.0 * epsilon * d / zeta)
     assert abs(found) <= xi * (1 + 1e-9)
@@ -77,7 +77,7 @@ def test_no_outliers_move_the_minimiser_beyond_the_bound(sizes, d, epsilon, zeta
 
 @sampled
 @given(st.integers(0, 10**6))
-def test_the_fixed_point_keeps_to_the_bound_under_gross_outliers(seed):
+def test_the_fixed_point_stays_within_the_bound_under_gross_outliers(seed):
     g = torch.Generator().manual_seed(seed)
     x = 1.0 + torch.rand(50, generator=g).double()
     y = 3.0 * x + 0.5 * (2.0 * torch.rand(50, generator=g).double() - 1.0)
@@ -88,8 +88,8 @@ def test_the_fixed_point_keeps_to_the_bound_under_gross_outliers(seed):
 
 
 @pytest.mark.parametrize(("sigma", "close"), [(0.7, 0.2), (1.0, 0.4), (5.0, 0.85), (40.0, 0.98)])
-def test_outliers_of_great_leverage_come_near_the_bound(sigma, close):
-    # inliers all at ε on the side of the outliers, whose narrow kernels agree on one coefficient
+def test_outliers_of_large_leverage_nearly_reach_the_bound(sigma, close):
+    # all inliers are at ε on the side of the outliers, whose narrow kernels agree on a coefficient
     N, M, epsilon = 100, 80, 1.0
     xi = float(error_bound(double(sigma), 1.0, epsilon, 1.0, N, M))
     place = torch.linspace(epsilon, xi, 2000).double()
@@ -100,7 +100,7 @@ def test_outliers_of_great_leverage_come_near_the_bound(sigma, close):
         y = torch.cat([inliers.expand(len(place), M), place.unsqueeze(1) * x[M:]], 1)
         return torch.exp(-0.5 * ((y - theta.unsqueeze(1) * x) / sigma).square()).sum(1)
 
-    # there or at the inliers: outliers have no say elsewhere
+    # there or at the inliers: outliers have no influence elsewhere
     won = kernel_sum(place, place) > kernel_sum(torch.full_like(place, epsilon), place)
     assert close * xi < float(place[won].max()) <= xi
 
@@ -120,7 +120,7 @@ def test_the_bound_falls_then_rises_about_the_optimal_bandwidth(sizes, d, epsilo
     assert abs(float(slope[1])) < 1e-6 * float(slope[3])
 
 
-def test_the_optimal_bandwidth_is_that_of_a_numerical_search():
+def test_the_optimal_bandwidth_equals_a_numerical_search():
     for N, M in ((10, 6), (100, 51), (100, 80), (1000, 999)):
 
         def bound(log_sigma: float, N: int = N, M: int = M) -> float:
@@ -138,7 +138,7 @@ def test_corollary_2(sizes, epsilon):
     N, M = sizes
     sigma = optimal_bandwidth(double(epsilon), N, M)
     p = torch.exp(-0.5 * (epsilon / sigma).square())
-    # close to one half of outliers p - q loses digits
+    # close to 50 % outliers p - q loses digits
     assert float(phi(p, double((N - M) / M))) == pytest.approx(1.0, abs=1e-13 * N + 1e-9)
     torch.testing.assert_close(optimal_bandwidth(double(2 * epsilon), N, M), 2 * sigma, rtol=1e-12, atol=0.0)
     assert float(sigma) > epsilon / math.sqrt(2)
@@ -146,7 +146,7 @@ def test_corollary_2(sizes, epsilon):
 
 @sampled
 @given(st.floats(1e-6, 0.999), st.floats(1e-3, 0.998), st.floats(1e-4, 1e-3))
-def test_phi_falls(q, share, step):
+def test_phi_is_decreasing(q, share, step):
     low = q + (1 - q) * share
     assert float(phi(double(low), q)) > float(phi(double(low + (1 - q) * step), q))
     assert float(phi(double(1.0), q)) == 0.0
@@ -220,14 +220,14 @@ def test_shapes_broadcast():
 
 @sampled
 @given(st.floats(0.3, 20.0))
-def test_efficiency_is_that_of_welsch_and_has_an_inverse(h):
+def test_efficiency_equals_welschs_and_has_an_inverse(h):
     c = h * math.sqrt(2)
     assert float(gaussian_efficiency(double(h))) == pytest.approx(psi_efficiency("welsch", (c,)), rel=1e-9)
     assert float(gaussian_efficiency(double(h), 3.0, 3.0)) == pytest.approx(float(gaussian_efficiency(double(h))))
     assert float(bandwidth_for_efficiency(gaussian_efficiency(double(h)))) == pytest.approx(h, rel=1e-8)
 
 
-def test_efficiency_is_measured():
+def test_efficiency_equals_a_simulation():
     g = torch.Generator().manual_seed(0)
     X = torch.randn(300, 200, 2, generator=g, dtype=torch.float64)
     y = 0.5 * torch.randn(300, 200, generator=g, dtype=torch.float64)
@@ -241,7 +241,7 @@ def test_efficiency_is_measured():
 @pytest.mark.e2e
 @sampled
 @given(st.integers(5, 40), st.floats(0.3, 5.0), st.integers(0, 10**6))
-def test_breakdown_point_of_one_coefficient(N, h, seed):
+def test_breakdown_point_of_a_single_coefficient(N, h, seed):
     g = torch.Generator().manual_seed(seed)
     x, y = 1.0 + torch.rand(N, generator=g).double(), torch.randn(N, generator=g).double()
     at = global_minimiser(x, y, h, reach=10.0)

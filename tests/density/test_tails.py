@@ -26,7 +26,7 @@ def uniform(seed: int, *shape: int) -> Tensor:
 
 
 def with_outliers(seed: int, share: float, *shape: int) -> Tensor:
-    """Standard normal errors, each replaced with probability ``share`` by a uniform one within ±20."""
+    """Standard normal errors, each replaced with probability ``share`` by a uniform error within ±20."""
     wrong = uniform(seed + 1, *shape) < share
     return torch.where(wrong, 40.0 * uniform(seed + 2, *shape) - 20.0, normal(seed, *shape))
 
@@ -36,7 +36,7 @@ def drawn(sigma: float, bound: float, seed: int, *shape: int) -> tuple[Tensor, f
     density = MKCDistribution(*(torch.tensor(v, dtype=torch.float64) for v in (sigma, 1.0, bound)))
     exact = 2.0 * float(density.cdf(torch.tensor(-3.0, dtype=torch.float64)))
     grid = torch.linspace(-bound, bound, 20_001, dtype=torch.float64)
-    # in a fraction of the time of icdf
+    # faster than icdf
     return torch.from_numpy(np.interp(uniform(seed, *shape), density.cdf(grid), grid)), exact
 
 
@@ -64,13 +64,13 @@ def test_outliers_are_found(share):
 
 
 @pytest.mark.parametrize("error", [2.0 * uniform(0, 500, 1) - 1.0, torch.ones(50, 1), torch.sign(normal(0, 300, 1))])
-def test_tails_lighter_than_those_of_a_gaussian_pass_as_gaussian(error):
+def test_tails_lighter_than_a_gaussians_are_not_rejected(error):
     tails = assess_tails(error)
     assert bool(tails.is_gaussian)
     assert float(tails.likelihood_ratio) == 0.0
 
 
-def test_the_ratio_is_twice_the_difference_of_the_log_likelihoods_of_two_fits_on_one_domain():
+def test_the_ratio_is_twice_the_difference_of_log_likelihoods_on_the_same_domain():
     error = torch.stack([with_outliers(0, 0.05, 300), normal(3, 300)], -1)
     for bound in (20.0, 60.0):
         mkc, gaussian = fit_density(error, bound=bound), fit_density(error, bound=bound, sigma=math.inf)
@@ -81,10 +81,10 @@ def test_the_ratio_is_twice_the_difference_of_the_log_likelihoods_of_two_fits_on
         torch.testing.assert_close(tails.bound, mkc.bound)
 
 
-def test_the_verdict_says_nothing_else_than_the_ratio():
+def test_the_verdict_depends_on_the_ratio_alone():
     tails = assess_tails(normal(1, 300, 100, 1), bound=12.0)
     assert bool((tails.is_gaussian == (tails.likelihood_ratio < GAUSSIAN_BELOW)).all())
-    # a finite sigma alone is no sign of a heavy tail
+    # a finite sigma alone is not evidence of a heavy tail
     assert float(torch.isfinite(tails.sigma[tails.is_gaussian]).double().mean()) > 0.2
 
 
@@ -98,11 +98,11 @@ def test_the_share_is_within_two_errors_of_the_exact_one_in_95_per_cent_of_draws
     tails = assess_tails(error, bound=bound)
     covered = (tails.share_beyond - exact).abs() <= 1.96 * tails.share_error
     assert 0.90 <= float(covered.double().mean()) <= 0.99
-    # the errors claimed are those seen
+    # the reported errors equal the observed errors
     assert float(tails.share_error.mean() / tails.share_beyond.std()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_tail_that_is_not_detected_is_mostly_within_two_errors():
+def test_an_undetected_tail_is_mostly_within_two_errors():
     error, exact = drawn(3.5, 10.0, 0, 300, 500, 1)
     tails = assess_tails(error, bound=10.0)
     assert 0.3 < float(tails.is_gaussian.double().mean()) < 0.8
@@ -110,7 +110,7 @@ def test_a_tail_that_is_not_detected_is_mostly_within_two_errors():
     assert float(covered.double().mean()) > 0.8
 
 
-def test_the_share_is_that_of_the_fitted_density():
+def test_the_share_is_computed_from_the_fitted_density():
     error = with_outliers(4, 0.1, 400, 1)
     tails = assess_tails(error, bound=25.0)
     density = MKCDistribution(tails.sigma, tails.d, tails.bound)
@@ -118,24 +118,24 @@ def test_the_share_is_that_of_the_fitted_density():
     assert float(tails.share_observed) == float((error.abs() > 3.0 * tails.d).double().mean())
 
 
-def test_the_share_of_a_gaussian_verdict_is_that_of_the_gaussian():
+def test_the_share_of_a_gaussian_verdict_is_the_gaussian_share():
     tails = assess_tails(normal(1, 20, 400, 1), bound=10.0)
     share = tails.share_beyond[tails.is_gaussian]
     torch.testing.assert_close(share, torch.full_like(share, 2.0 * norm.sf(3.0)), rtol=1e-6, atol=0)
     assert bool((tails.share_error > 0).all())
-    # of a Gaussian truncated at 2.5 standard deviations there is nothing beyond 3
+    # a Gaussian truncated at 2.5 standard deviations has no mass beyond 3
     narrow = assess_tails(normal(1, 400, 1).clamp(-2.0, 2.0), bound=2.3)
     assert numbers(narrow)[1:4] == [1.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(("sigma", "length"), [(1.2, 12.0), (2.5, 8.0), (6.0, 15.0)])
-def test_the_error_is_that_of_the_delta_method_with_the_expected_information(sigma, length):
+def test_the_error_equals_the_delta_method_with_the_expected_information(sigma, length):
     kappa, log_d, log_bound = (torch.tensor([v], dtype=torch.float64) for v in (sigma**-2, 0.0, math.log(length)))
     at = torch.cat([kappa, log_d]).requires_grad_()
     d = torch.exp(at[1])
     share = 2.0 * MKCDistribution(at[0].rsqrt(), d, length).cdf(-3.0 * d)
     (slope,) = torch.autograd.grad(share, at)
-    # the mean Hessian of the negative log-likelihood over quantiles, which stand for the density
+    # the mean Hessian of the negative log-likelihood over quantiles, which represent the density
     quantiles = MKCDistribution(sigma, 1.0, length).icdf((torch.arange(50_000).double() + 0.5) / 50_000)
     energy = energy_derivatives(quantiles.unsqueeze(-1), None, kappa, log_d)
     total = [float(a + b) for a, b in zip(energy, normaliser_derivatives(kappa, log_d, log_bound), strict=True)]
@@ -150,7 +150,7 @@ def test_the_error_is_that_of_the_delta_method_with_the_expected_information(sig
 # channels, batches, weights, dtypes, units
 
 
-def test_channels_and_batches_are_assessed_each_on_its_own():
+def test_channels_and_batches_are_assessed_independently():
     error = torch.stack([with_outliers(5 * k, 0.03 * k, 150) for k in range(6)]).reshape(2, 3, 150).mT
     tails = assess_tails(error, bound=torch.tensor([20.0, 30.0, 40.0], dtype=torch.float64))
     for name in FIELDS:
@@ -162,22 +162,22 @@ def test_channels_and_batches_are_assessed_each_on_its_own():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
-def test_float32_gives_the_numbers_of_float64_in_its_own_dtype(share):
+def test_float32_residuals_give_the_float64_numbers_as_float32(share):
     error = with_outliers(0, share, 400, 2).float()
     single, double = assess_tails(error, bound=20.0), assess_tails(error.double(), bound=20.0)
     for name in FIELDS:
-        one, other = getattr(single, name), getattr(double, name)
-        assert one.dtype == (torch.bool if name == "is_gaussian" else torch.float32)
-        torch.testing.assert_close(one.double(), other.double(), rtol=1e-4, atol=1e-6)
+        first, other = getattr(single, name), getattr(double, name)
+        assert first.dtype == (torch.bool if name == "is_gaussian" else torch.float32)
+        torch.testing.assert_close(first.double(), other.double(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("factor", [1e-12, 1e9])
-def test_the_unit_of_the_residuals_does_not_matter(factor):
+def test_the_test_does_not_depend_on_the_unit_of_the_residuals(factor):
     error = with_outliers(0, 0.05, 300, 1)
-    one, other = assess_tails(error, bound=20.0), assess_tails(factor * error, bound=factor * 20.0)
-    assert float(other.d) == pytest.approx(factor * float(one.d), rel=1e-6)
+    first, other = assess_tails(error, bound=20.0), assess_tails(factor * error, bound=factor * 20.0)
+    assert float(other.d) == pytest.approx(factor * float(first.d), rel=1e-6)
     for name in ("likelihood_ratio", "share_beyond", "share_error", "share_observed", "sigma", "count"):
-        assert float(getattr(other, name)) == pytest.approx(float(getattr(one, name)), rel=1e-5), name
+        assert float(getattr(other, name)) == pytest.approx(float(getattr(first, name)), rel=1e-5), name
 
 
 def test_a_weight_of_zero_leaves_a_residual_out():
@@ -187,7 +187,7 @@ def test_a_weight_of_zero_leaves_a_residual_out():
     assert numbers(assess_tails(junk, weight)) == pytest.approx(numbers(assess_tails(error)), rel=1e-6)
 
 
-def test_the_unit_of_the_weights_does_not_matter_and_uneven_weights_count_for_fewer_residuals():
+def test_the_scale_of_weights_is_irrelevant_and_uneven_weights_reduce_the_count():
     error, weight = with_outliers(0, 0.05, 400, 1), uniform(7, 400, 1)
     tails = assess_tails(error, weight, bound=20.0)
     assert float(tails.count) == pytest.approx(float(weight.sum() ** 2 / weight.square().sum()))
@@ -200,7 +200,7 @@ def test_weighted_gaussian_residuals_are_rejected_in_no_more_than_five_per_cent_
     assert float((~tails.is_gaussian).double().mean()) <= 0.06
 
 
-def test_fewer_independent_residuals_prove_less():
+def test_fewer_independent_residuals_give_a_smaller_ratio():
     error = with_outliers(0, 0.05, 400, 1)
     whole, quarter = assess_tails(error, bound=20.0), assess_tails(error, bound=20.0, count=100.0)
     assert float(quarter.likelihood_ratio) == pytest.approx(0.25 * float(whole.likelihood_ratio))
@@ -208,7 +208,7 @@ def test_fewer_independent_residuals_prove_less():
     assert float(quarter.count) == 100.0
 
 
-def test_arrays_are_taken():
+def test_arrays_are_accepted():
     error = with_outliers(0, 0.05, 300, 1)
     assert numbers(assess_tails(np.asarray(error), np.ones((300, 1)))) == pytest.approx(numbers(assess_tails(error)))
 
@@ -216,7 +216,7 @@ def test_arrays_are_taken():
 # the result of fit_density
 
 
-def test_a_density_fit_knows_its_tails():
+def test_a_density_fit_has_its_tails():
     error = torch.stack([with_outliers(0, 0.05, 300), normal(3, 300)], -1)
     weight = uniform(7, 300, 1)
     fit = fit_density(error, weight=weight, bound=25.0, d_min=0.01)
@@ -231,11 +231,11 @@ def test_a_density_fit_knows_its_tails():
     torch.testing.assert_close(fixed.tails.likelihood_ratio, expected.likelihood_ratio)
 
 
-def test_the_tails_are_those_of_the_residuals_that_were_fitted():
+def test_the_tails_use_a_copy_of_the_fitted_residuals():
     error = with_outliers(0, 0.05, 300, 1).requires_grad_()
     fit, expected = fit_density(error), assess_tails(error)
     with torch.no_grad():
-        error.zero_()  # as a caller's buffer is written over
+        error.zero_()  # as if the caller overwrote its buffer
     assert numbers(fit.tails) == numbers(expected)
     assert not fit.tails.share_beyond.requires_grad
 
@@ -258,8 +258,8 @@ def autoregressive(seed: int, phi: float, draws: int, count: int) -> Tensor:
 
 def test_autocorrelated_gaussian_series_are_rejected_in_no_more_than_five_per_cent_of_draws():
     series = autoregressive(0, 0.9, 80, 1000)
-    naive = assess_tails(series.unsqueeze(-1), bound=10.0).is_gaussian
-    assert float((~naive).double().mean()) > 0.07
+    unadjusted = assess_tails(series.unsqueeze(-1), bound=10.0).is_gaussian
+    assert float((~unadjusted).double().mean()) > 0.07
     rejected = sum(not channel.is_gaussian for channel in time_series_tails(series.mT))
     assert rejected <= 4
 
@@ -278,7 +278,7 @@ def test_an_exact_fit_has_no_tails():
 # texts
 
 
-def test_the_text_says_gaussian_or_how_many_errors_are_beyond_three_scales():
+def test_the_text_is_gaussian_or_the_share_of_errors_beyond_three_scales():
     error = torch.stack([normal(4, 500), with_outliers(0, 0.1, 500)], -1)
     tails = assess_tails(error, bound=20.0)
     gaussian, heavy = str(tails).splitlines()
@@ -289,7 +289,7 @@ def test_the_text_says_gaussian_or_how_many_errors_are_beyond_three_scales():
     assert tails.channels[1].share_beyond == float(tails.share_beyond[1])
 
 
-def test_the_verdict_of_plain_numbers_is_that_of_the_tensors():
+def test_the_verdict_of_plain_numbers_equals_that_of_the_tensors():
     assert ChannelTails(2.7, 0.0027, 0.001).is_gaussian
     assert not ChannelTails(2.72, 0.01, 0.001).is_gaussian
     assert str(ChannelTails(9.0, 0.0, 0.0)) == "heavy-tailed, on a domain that ends within 3 d"
@@ -308,10 +308,10 @@ def test_a_share_is_written_to_the_first_digit_of_its_error(share, error, text):
     assert percent_with_error(share, error) == text
 
 
-# data that are no sample of noise
+# degenerate data
 
 
-def test_a_channel_of_zeros_alone_is_refused_by_its_number():
+def test_a_channel_of_zeros_is_refused_by_its_number():
     error = torch.stack([normal(0, 50), torch.zeros(50).double()], -1)
     message = r"`error` with a residual .* not 0 in every channel .* in channel 1; an exact fit has no tails, leave"
     with pytest.raises(ValueError, match=message):
@@ -319,7 +319,7 @@ def test_a_channel_of_zeros_alone_is_refused_by_its_number():
     fit = fit_density(error)
     with pytest.raises(ValueError, match=message):
         _ = fit.tails
-    # of two residuals only the zero counts
+    # only the zero residual has weight
     with pytest.raises(ValueError, match="channel 0"):
         assess_tails(torch.tensor([[0.0], [1.0]]), torch.tensor([[1.0], [0.0]]))
 
@@ -344,7 +344,7 @@ def test_degenerate_residuals_give_finite_numbers(error):
     assert 0.0 <= float(tails.share_beyond) <= 1.0
 
 
-def test_residuals_that_a_fit_has_interpolated_are_heavy_tailed_with_the_share_of_the_others():
+def test_interpolated_residuals_are_heavy_tailed_with_the_share_of_the_others():
     tails = assess_tails(torch.cat([1e-9 * normal(1, 400, 1), normal(0, 40, 1)]), bound=10.0)
     assert not bool(tails.is_gaussian)
     assert float(tails.share_beyond) == pytest.approx(40 / 440, abs=2 * float(tails.share_error))
@@ -359,11 +359,11 @@ def test_residuals_that_a_fit_has_interpolated_are_heavy_tailed_with_the_share_o
         ({"bound": 0.1}, "`bound` to be at least two robust scales"),
         ({"d_min": 1e9}, "`d_min` below the half-width"),
         ({"weight": torch.zeros(100, 1)}, "`weight` .* positive somewhere in every channel"),
-        ({"error": normal(0, 100)}, r"one channel is error\[:, None\]"),
+        ({"error": normal(0, 100)}, r"`error` .* error\[:, None\]"),
         ({"error": normal(0, 100, 1) * math.nan}, "`error` to be finite"),
     ],
 )
-def test_arguments_out_of_range_are_refused_with_what_to_do(arguments, message):
+def test_arguments_out_of_range_are_refused_with_a_remedy(arguments, message):
     with pytest.raises(ValueError, match=message):
         assess_tails(**{"error": normal(0, 100, 2), **arguments})
 

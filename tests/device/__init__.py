@@ -1,1 +1,1 @@
-"""What a GPU, or any other device of torch, makes of the library: ``python -m tests.device``."""
+"""Checks of the library on a GPU or any other device of torch: ``python -m tests.device``."""

@@ -1,4 +1,4 @@
-"""One command for whoever has a device: agreement, time, memory, capture, fits.
+"""Device checks in a single command: agreement, time, memory, capture, fits.
 
 python -m tests.device [--device cuda] [--only agreement steps ...]
 """
@@ -47,7 +47,7 @@ def main() -> None:
         print(f"\n{name}", flush=True)
         try:
             right = sections[name]() is not False and right
-        except Exception:  # a compiler fails by types of its own; the other sections go on
+        except Exception:  # compilers raise their own exception types; the other sections continue
             traceback.print_exc()
             right = False
         print(f"  ({time.perf_counter() - start:.0f} s)", flush=True)

@@ -21,7 +21,7 @@ SHAPES: tuple[tuple[tuple[int, ...], int], ...] = (
     ((200_001, 1), -1),
 )
 TOLERANCE = {torch.float32: 3e-5, torch.float64: 1e-7, torch.bfloat16: 2e-2, torch.float16: 4e-3}
-"""Greatest difference over the greatest number, by the dtype of the predictions."""
+"""Largest difference over the largest number, by the dtype of the predictions."""
 
 
 def found(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> list[Tensor]:
@@ -31,7 +31,7 @@ def found(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -
         for parameter in loss.parameters():
             parameter.grad = None
         value = loss(leaf, target, weight)
-        # as a gradient scaler has it: float16 has no digits for a mean over many elements
+        # scaled as by a gradient scaler: the mean over many elements underflows float16
         value.backward(torch.full_like(value, 1700.0 if input.dtype == torch.float16 else 1.7))
     assert leaf.grad is not None
     grads = [p.grad for p in loss.parameters() if p.grad is not None]
@@ -54,7 +54,7 @@ def cases() -> list[Case]:
 
 
 def compared(device: str, case: Case) -> list[tuple[str, float]]:
-    """What was compared, and how far it is from the reference, over the greatest number."""
+    """Name of each compared quantity, and its difference from the reference over the largest number."""
     name, shape, axis, reduction, weighted, dtype = case
     generator = torch.Generator().manual_seed(1)
     x, y = torch.randn(2, *shape, generator=generator)
@@ -68,7 +68,7 @@ def compared(device: str, case: Case) -> list[tuple[str, float]]:
     expected = found(reference, x.double(), y.double(), None if weight is None else weight.double())
     rows = []
     for what, value, other in zip(("value", "input", "sigma", "d"), on_device, expected, strict=False):
-        # a gradient scaler's factor stands in what float16 gives back
+        # gradients of float16 still have the gradient scaler's factor
         other = other if what == "value" or dtype != torch.float16 else 1000.0 * other
         size = other.abs().max().clamp(min=1e-3 if what in ("sigma", "d") else 1e-12)
         text = f"{name} {shape} {reduction}{' weighted' if weighted else ''} {what}"
@@ -89,7 +89,7 @@ def print_agreement(device: torch.device) -> bool:
     for dtype, tolerance in TOLERANCE.items():
         rows = [row for case, rows in zip(todo, answers, strict=True) if case[-1] == dtype for row in rows]
         text, off = max(rows, key=lambda row: row[1] if row[1] == row[1] else float("inf"))
-        print(f"  {dtype!s:16} greatest difference {off:.1e} of {tolerance:.0e} ({text})")
+        print(f"  {dtype!s:16} largest difference {off:.1e} of {tolerance:.0e} ({text})")
         for text, off in rows:
             if not off <= tolerance:
                 print(f"    differs: {text}: {off:.2e}")

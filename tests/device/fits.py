@@ -1,4 +1,4 @@
-"""Robust fits on a device: many rows, and many small problems side by side."""
+"""Robust fits on a device: many rows, and batches of small problems."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def problem(device: torch.device, *shape: int) -> tuple[Tensor, Tensor]:
 
 
 def print_fits(device: torch.device, *, large: int, many: int) -> None:
-    """Time of a fit of many rows, and of many small fits, or the error that it ends in."""
+    """Print the time of a fit of many rows and of many small fits, or the error."""
     for name, make in ESTIMATORS.items():
         for what, shape in (("rows", (large, 9)), ("problems of 100 x 2", (many, 100, 2))):
             X, y = problem(device, *shape)

@@ -1,4 +1,4 @@
-"""The modes of the loss that every section looks at, their peers, and the floor of memory traffic."""
+"""The modes of the loss for every section, comparable losses, and the floor of memory traffic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODES: dict[str, dict[str, Any]] = {"fixed": FIXED, "learned": {"d": 1.0}, "as i
 
 
 class LearnedGaussianNLL(nn.Module):
-    """GaussianNLLLoss with one learned variance for each channel."""
+    """GaussianNLLLoss with a learned variance per channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class LearnedStudentT(nn.Module):
 
 @dataclass
 class Step:
-    """Forward and backward of a loss on one batch, the fill of the upstream gradient included."""
+    """Forward and backward pass of a loss on a batch, the fill of the upstream gradient included."""
 
     loss: Callable[..., Tensor]
     parameters: list[nn.Parameter]
@@ -69,7 +69,7 @@ class Step:
 
 
 def batch(rows: int, channels: int, device: torch.device, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Predictions that want a gradient, and targets."""
+    """Predictions that require a gradient, and targets."""
     generator = torch.Generator(device).manual_seed(0)
     size = (rows, channels)
     input, target = (torch.randn(size, generator=generator, device=device, dtype=torch.float32).to(dtype) for _ in "ab")

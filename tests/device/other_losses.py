@@ -24,7 +24,7 @@ BATCHES: tuple[tuple[tuple[int, ...], int, Any], ...] = (
 """Shape, dimension of the channels and bound of the batches that are compared."""
 
 Case = tuple[Any, Any, list[Tensor], list[Tensor]]
-"""A loss, the same for the reference, tensors that want a gradient, and tensors that want none."""
+"""A loss, its reference, tensors that require a gradient, and tensors that do not."""
 
 
 def samples(shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = torch.float32) -> list[Tensor]:
@@ -39,7 +39,7 @@ def samples(shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = t
 
 
 def labels(rows: int, classes: int, device: torch.device, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Logits and labels, a quarter of which do not count."""
+    """Logits and labels, of which a quarter is ignored."""
     generator = torch.Generator(device).manual_seed(0)
     logits = 3.0 * torch.randn(rows, classes, generator=generator, device=device)
     target = torch.randint(0, classes, (rows,), generator=generator, device=device)
@@ -48,14 +48,14 @@ def labels(rows: int, classes: int, device: torch.device, dtype: torch.dtype = t
 
 
 def worst_difference(case: Case, device: torch.device) -> float:
-    """Greatest difference of value and gradients, each over its greatest number."""
+    """Largest difference of value and gradients, each over its largest number."""
     loss, reference, leaves, rest = case
     found = []
     for own, where, wide in ((loss.to(device), device, False), (reference.double(), torch.device("cpu"), True)):
         given = [entry.to(where, torch.float64 if wide else entry.dtype).requires_grad_() for entry in leaves]
         others = [entry.to(where) for entry in rest]
         value = own(*given, *others)
-        # float16 has no digits for a mean over many elements without a gradient scaler
+        # without a gradient scaler a mean over many elements underflows float16
         upstream = 1700.0 if own.reduction == "mean" else 1.7
         grads = torch.autograd.grad(value, given, torch.full_like(value, upstream))
         found.append([grad.detach().cpu().double() for grad in (value, *grads)])
@@ -63,7 +63,7 @@ def worst_difference(case: Case, device: torch.device) -> float:
 
 
 def agreement(device: torch.device) -> bool:
-    """Print the worst difference of each loss and dtype; whether all are within the tolerances."""
+    """Print the largest difference of each loss and dtype. Returns whether all are within the tolerances."""
     worst: dict[tuple[str, torch.dtype], float] = {}
     cpu = torch.device("cpu")
     for reduction, dtype, weighted in itertools.product(("mean", "sum", "none"), TOLERANCE, (False, True)):
@@ -92,7 +92,7 @@ def agreement(device: torch.device) -> bool:
 
 
 def step_of(loss: Callable[..., Tensor], leaves: list[Tensor], rest: list[Tensor]) -> Callable[[], None]:
-    """Forward and backward on one batch."""
+    """Forward and backward pass on a batch."""
     for value in leaves:
         value.requires_grad_()
 
@@ -152,7 +152,7 @@ def print_times(device: torch.device) -> None:
 
 
 def print_other_losses(device: torch.device) -> bool:
-    """Agreement and times of the losses beside MKCLoss; whether they agree."""
+    """Print agreement and times of the losses other than MKCLoss. Returns whether they agree."""
     right = agreement(device)
     print_times(device)
     return right

@@ -1,4 +1,4 @@
-"""Time, memory, kernels and host synchronisations of a step, beside peers and the floor of memory traffic."""
+"""Time, memory, kernels and host synchronisations of a step, compared with other losses and the memory floor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CHANNELS = 4
 
 
 def step_of(loss: Any, input: Tensor, target: Tensor, **rest: Any) -> Step:
-    """A step of a loss, or of a compiled one."""
+    """A step of a loss, eager or compiled."""
     return Step(loss, list(loss.parameters()), input, target, **rest)
 
 
@@ -53,7 +53,7 @@ def kernels_and_syncs(step: Callable[[], object], device: torch.device) -> tuple
 
 
 def captured_time(step: Step, device: torch.device) -> float | None:
-    """Time of a step replayed from a CUDA graph: the card's own, without that of Python; None where there are none."""
+    """Time of a step replayed from a CUDA graph: the card's time without Python's; None without CUDA graphs."""
     if device.type != "cuda":
         return None
     stream = torch.cuda.Stream()
@@ -107,7 +107,7 @@ def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool)
             step = step_of(loss, *batch(size // CHANNELS, CHANNELS, device))
             try:
                 row = measured(step, size, rate, device)
-            except Exception as error:  # a compiler fails by types of its own; the row says which
+            except Exception as error:  # compilers raise their own exception types; the row names the type
                 row = f"{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}"
             print(f"  {name:34}{row}", flush=True)
 

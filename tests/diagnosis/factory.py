@@ -1,4 +1,4 @@
-"""Diagnoses made by hand, with residuals that show what the findings say."""
+"""Diagnoses made by hand, with residuals that match their findings."""
 
 import dataclasses
 import math
@@ -78,26 +78,26 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
     }
     ceiling = changes.pop("ceiling", HeldOutScore(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels))
     smooth = SmoothCorrection(ceiling, changes.pop("remaining", ()))
-    content["evidence"] = () if ceiling is None else (remaining.said(smooth),)
+    content["evidence"] = () if ceiling is None else (remaining.as_result(smooth),)
     diagnosis = Diagnosis(**content | changes)
     return diagnosis if "advice" in changes else dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
 
 
 def graded(finding, grade=None):
-    """A finding with the grade that its evidence gives it, or with another."""
+    """Return a finding with the grade of its evidence, or another grade."""
     return dataclasses.replace(finding, grade=grade or grade_of(finding))
 
 
-def with_evidence(thing, *said):
-    """A finding, graded, or a diagnosis of which these tests say that, and the others what they did."""
-    new = {told.test for told in said}
-    kept = (told for told in thing.evidence if told.test not in new)
-    changed = dataclasses.replace(thing, evidence=(*kept, *said))
+def with_evidence(thing, *results):
+    """Return a finding, graded, or a diagnosis with these results of tests; the other results stay."""
+    new = {result.test for result in results}
+    kept = (result for result in thing.evidence if result.test not in new)
+    changed = dataclasses.replace(thing, evidence=(*kept, *results))
     return graded(changed) if isinstance(changed, Finding) else changed
 
 
 def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, floor=0.005, **changes):
-    """How a simulation follows an output."""
+    """Return the goodness of fit of an output."""
     made = GoodnessOfFit(
         output, unit, residual, variation, 1.0 - (residual / variation) ** 2, floor, "declared", variation, 0.021
     )
@@ -105,13 +105,21 @@ def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, fl
 
 
 LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
-"""Of two outputs, neither followed."""
+"""Two outputs with a poor fit."""
 
-PUSHED = ProcessNoise("rate", at_rate=True, correlation_time=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", log_likelihood_gain=311.0)
+PUSHED = ProcessNoise(
+    "rate",
+    at_rate=True,
+    correlation_time=0.7,
+    size=0.2284,
+    standard_error=0.021,
+    unit="rad/s²",
+    log_likelihood_gain=311.0,
+)
 
 
 def make_forcing(samples=1800, push=PUSHED):
-    """The course of a push along a pendulum's run."""
+    """Return the estimated disturbance of a pendulum's rate."""
     time = torch.arange(samples, dtype=torch.float64) / 20.0
     value = push.size * (torch.sin(1.1 * time) + 0.6 * torch.sin(3.7 * time + 1.0))
     x = torch.linspace(-1.0, 1.0, 40, dtype=torch.float64)
@@ -128,21 +136,27 @@ def make_forcing(samples=1800, push=PUSHED):
 
 
 def make_environment(**changes):
-    """A pendulum that is followed, whose rate something pushes, and whose torque is held."""
-    world = NoiseEnvironment(
-        goodness_of_fit=(make_follows(),), process_noise=(PUSHED,), input_hold={"torque": "held"}, disturbance=(make_forcing(),), starts=12
+    """Return the environment of a pendulum with a good fit, a disturbed rate, and a held torque."""
+    environment = NoiseEnvironment(
+        goodness_of_fit=(make_follows(),),
+        process_noise=(PUSHED,),
+        input_hold={"torque": "held"},
+        disturbance=(make_forcing(),),
+        starts=12,
     )
-    return dataclasses.replace(world, **changes)
+    return dataclasses.replace(environment, **changes)
 
 
 def make_unfit(**changes):
-    """A pendulum that does not follow its recording."""
+    """Return the diagnosis of a pendulum with a poor fit."""
     reasons = (
         "Another start reaches 0.006 rad: `gravity` = −9.81 with the other sign.",
         "`damping` ends at its bound, 0.",
     )
-    world = NoiseEnvironment(goodness_of_fit=LOST, reasons=reasons, starts=12)
-    return make_diagnosis(0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "environment": world} | changes)
+    environment = NoiseEnvironment(goodness_of_fit=LOST, reasons=reasons, starts=12)
+    return make_diagnosis(
+        0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "environment": environment} | changes
+    )
 
 
 def nearest(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
@@ -220,7 +234,7 @@ def _step(channels, has_time):
             EffectParameter("onset", 41.32, 0.14, "s"),
         ),
         p_value=0.005,
-        evidence=(held_out_gain.said(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
+        evidence=(held_out_gain.as_result(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
         alternatives=(
             Alternative("offset_drift", (), 41.2, True),
             Alternative("current_field", ("current",), 1.3, False),
@@ -247,7 +261,7 @@ def _current(channels, has_time):
             EffectParameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
         ),
         p_value=0.01,
-        evidence=(held_out_gain.said(None, "The event has no second occurrence to be held out."),),
+        evidence=(held_out_gain.as_result(None, "The event has no second occurrence to be held out."),),
         alternatives=(),
         plausible=True,
         plausibility="0.37 µT/A; up to 1 µT/A occurs.",
@@ -269,7 +283,7 @@ def _unknown(channels, _has_time):
         parameters=(EffectParameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
         p_value=0.045,
         evidence=(
-            held_out_gain.said(
+            held_out_gain.as_result(
                 HeldOut(0.0021, (-0.0004, 0.0046), 0.5214, 0.5198, "µT"), "Blocks of 4 s with gaps of 1 s."
             ),
         ),

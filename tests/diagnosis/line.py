@@ -1,4 +1,4 @@
-"""A simulation that is no magnetometer: two channels that rise in time, a port that mixes and one that sums."""
+"""A simulation that is not a magnetometer: two channels linear in time, a pointwise port and a summing port."""
 
 import torch
 

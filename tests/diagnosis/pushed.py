@@ -1,4 +1,4 @@
-"""A driven pendulum that something unrecorded pushes, made by steps of its own, and the fits to it."""
+"""A driven pendulum with an unrecorded disturbance, integrated independently, and fits to it."""
 
 import functools
 import math
@@ -36,14 +36,14 @@ class Pendulum(Dynamics):
 
 
 class UpsideDown(Pendulum):
-    """The angle taken from the wrong end: gravity drives it away."""
+    """The angle is measured from the wrong end: gravity drives it away."""
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"angle": x.rate, "rate": u.torque + p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
 
 
 def walk(random, n, samples):
-    """A random course of variance one that forgets itself in so many steps."""
+    """Return a random course of variance 1 with a correlation time of that many samples."""
     kept = math.exp(-1.0 / samples) if samples > 0 else 0.0
     course = np.zeros(n)
     for k in range(n):
@@ -53,29 +53,30 @@ def walk(random, n, samples):
 
 @functools.cache
 def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
-    """A recording; ``push`` is "none", "white", "slow" or "torque", one that goes along with the torque.
+    """Return a recording and the disturbance of its rate; the disturbance is "none", "white", "slow" or "torque".
 
     Args:
-        push: white ones are new at each sample, of 0.4 rad/s²; slow ones last for 1 s, of 0.3 rad/s².
-        seed, N: of the draws, and their number.
-        drag: of the hidden quadratic drag, in 1/rad.
-        effect: of the torque, -1 for one of the other sign.
-        late: samples by which it acts later than it is recorded.
+        push: "white" is new at each sample, of 0.4 rad/s²; "slow" has a correlation time of 1 s, of 0.3 rad/s²;
+            "torque" follows the torque.
+        seed, N: of the draws, and number of samples.
+        drag: hidden quadratic drag, in 1/rad.
+        effect: factor of the torque, -1 for the wrong sign.
+        late: delay of the torque in samples.
     """
     random = np.random.default_rng(seed)
     torque = 1.5 * walk(random, N, 12)
     acting = effect * np.concatenate([np.zeros(late), torque])[:N]
     if push == "white":
-        pushed = 0.4 * random.standard_normal(N)
+        added = 0.4 * random.standard_normal(N)
     elif push == "slow":
-        pushed = 0.3 * walk(random, N, 1.0 / STEP)
+        added = 0.3 * walk(random, N, 1.0 / STEP)
     else:
-        pushed = np.zeros(N) if push == "none" else 0.4 * np.concatenate([np.zeros(6), torque[:-6]])
+        added = np.zeros(N) if push == "none" else 0.4 * np.concatenate([np.zeros(6), torque[:-6]])
     x, h, angle = np.array([0.3, 0.0]), STEP / FINE, np.zeros(N)
 
     def rate(x, k):
         own = -9.0 * math.sin(x[0]) - 0.15 * x[1] - drag * x[1] * abs(x[1])
-        return np.array([x[1], acting[k] + pushed[k] + own])
+        return np.array([x[1], acting[k] + added[k] + own])
 
     for k in range(N):
         angle[k] = x[0]
@@ -85,34 +86,34 @@ def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
             c = rate(x + h / 2 * b, k)
             x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, k))
     columns = {"time": STEP * np.arange(N), "torque": torque, "angle": angle + NOISE * random.standard_normal(N)}
-    recording = Recording({name: torch.from_numpy(one) for name, one in columns.items()}, name="swing")
-    return recording, torch.from_numpy(pushed)
+    recording = Recording({name: torch.from_numpy(column) for name, column in columns.items()}, name="swing")
+    return recording, torch.from_numpy(added)
 
 
 def in_the_world(recording, system=Pendulum):
-    """A simulation alone, fitted under the likeliest noise of the world."""
+    """Fit a simulation without effects, under its most likely noise."""
     prepared = system().prepare(recording).with_input_hold({"torque": "held"})
-    world = fit_baseline(prepared, {}, NoiseSettings())
-    return choose_input_hold(world, {}, {"torque": "held"}, NoiseSettings())
+    baseline = fit_baseline(prepared, {}, NoiseSettings())
+    return choose_input_hold(baseline, {}, {"torque": "held"}, NoiseSettings())
 
 
 @functools.cache
 def swung_in_the_world(push="none", seed=0, N=500, drag=0.0):
-    """The same of a recording of :func:`swung`."""
+    """Fit a recording of :func:`swung`."""
     return in_the_world(swung(push, seed, N, drag)[0])
 
 
 @functools.cache
 def at_the_truth(push="white", seed=0):
-    """A pendulum of :func:`swung` with its true parameters, under the pushes that were drawn."""
+    """Return a pendulum of :func:`swung` at its true parameters, under the drawn disturbance."""
     prepared = Pendulum().prepare(swung(push, seed)[0])
     theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
     prepared = prepared.observed(strong_observer(prepared, theta, 10.0))
     flow = flow_of(prepared, theta, {}, None)
-    size, lasting = (0.4, 0.0) if push == "white" else (0.3, 1.0)
+    size, correlation_time = (0.4, 0.0) if push == "white" else (0.3, 1.0)
     sensor = torch.tensor([NOISE], dtype=torch.float64)
-    pushes = (Disturbance("rate", True, lasting, size),)
-    observer = observer_of(flow, pushes, sensor, prepared.disturbable, prepared.channels)
+    disturbances = (Disturbance("rate", True, correlation_time, size),)
+    observer = observer_of(flow, disturbances, sensor, prepared.disturbable, prepared.channels)
     model = JointModel(prepared.observed(observer))
     residual = model.residual(theta).detach()
     d = residual.std(0)
@@ -120,5 +121,5 @@ def at_the_truth(push="white", seed=0):
 
 
 def candidates(fit, effects):
-    """Terms for a search beside a fit."""
+    """Return the candidates for a search at a fit."""
     return candidate_terms(open_loop(fit.model.prepared), (), effects)

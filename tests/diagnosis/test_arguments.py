@@ -1,4 +1,4 @@
-"""What is declared of a sensor's noise and of an input's course, checked."""
+"""Checks of the declared sensor noise and input holds."""
 
 import math
 
@@ -21,7 +21,7 @@ from mkc_torch.simulation import Static
         (0.1, TypeError, "to be a dict such as"),
     ],
 )
-def test_noise_that_makes_no_sense_is_refused(noise, error, words):
+def test_invalid_noise_raises(noise, error, words):
     with pytest.raises(error, match=words):
         checked_noise(noise, ("angle", "rate"))
 
@@ -29,34 +29,34 @@ def test_noise_that_makes_no_sense_is_refused(noise, error, words):
 @pytest.mark.parametrize(
     ("between", "error", "words"),
     [
-        ({"torque": "stepped"}, ValueError, "one of held, linear, smooth of `torque` but got 'stepped'"),
+        ({"torque": "stepped"}, ValueError, "`torque` to be one of held, linear, smooth but got 'stepped'"),
         ({"torque": 1}, ValueError, "one of held, linear, smooth"),
         ({"force": "held"}, ValueError, "they are `torque`"),
         ("held", TypeError, "to be a dict such as"),
     ],
 )
-def test_what_an_input_cannot_do_is_refused(between, error, words):
+def test_invalid_input_holds_raise(between, error, words):
     with pytest.raises(error, match=words):
         checked_between(between, ("torque",))
 
 
-def test_a_simulation_without_inputs_says_so():
+def test_input_holds_of_a_simulation_without_inputs_raise():
     with pytest.raises(ValueError, match="got `torque`; it has none"):
         checked_between({"torque": "held"}, ())
 
 
-def test_what_is_declared_is_kept_and_nothing_is_needed():
+def test_declarations_are_returned_and_optional():
     assert checked_noise({"angle": 1}, ("angle",)) == {"angle": 1.0}
     assert checked_noise(None, ("angle",)) == checked_between(None, ()) == {}
 
 
-def test_a_diagnosis_checks_what_is_declared():
+def test_diagnose_checks_the_declarations():
     time = torch.arange(60) / 10.0
     heat = torch.sin(time)
     recording = Recording({"time": time, "temperature": heat, "voltage": 0.5 + heat})
     line = Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))
     with pytest.raises(ValueError, match="they are `voltage`"):
         diagnose(line, recording, noise={"temperature": 0.1})
-    # no equations, nothing between samples
+    # a static simulation has no input holds
     with pytest.raises(ValueError, match="inputs in the equations of this simulation but got `temperature`; it has no"):
         diagnose(line, recording, between={"temperature": "held"})

@@ -1,4 +1,4 @@
-"""The verdict follows from what is known of the whole recording, not from whether something was named."""
+"""Warnings and plausibility of a whole diagnosis."""
 
 import numpy as np
 import pytest
@@ -15,21 +15,21 @@ def in_units(recording, **units):
     return Recording(recording.columns, name=recording.name, units={**recording.units, **units})
 
 
-def test_more_than_was_asked_for_is_told_of():
+def test_structure_beyond_max_findings_is_warned_of():
     N = 2000
     time = np.arange(N) / 50.0
     current = np.sin(2.0 * np.pi * time / 3.3)
     temperature = 20.0 + 4.0 * np.sin(2.0 * np.pi * time / 17.0)
     sensor = np.outer(current, [3.0, -2.0, 2.0]) + np.outer(temperature, [0.8, 0.5, -0.6])
     recording = tumbling(N, noise=0.3, sensor=sensor, current=current, temperature=temperature)
-    one = diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
-    assert (len(one.findings), one.verdict) == (1, "unexplained")
-    assert any("more structure beside the 1 findings" in warning for warning in one.warnings)
+    limited = diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
+    assert (len(limited.findings), limited.verdict) == (1, "unexplained")
+    assert any("`max_findings`" in warning for warning in limited.warnings)
     two = diagnose(Magnetometer(), recording, surrogates=19, max_findings=2)
     assert ({f.effect for f in two.findings}, two.verdict) == ({"current_field", "temperature_offset"}, "explained")
 
 
-def test_a_size_is_compared_in_the_unit_that_is_known():
+def test_sizes_are_compared_in_the_unit_of_the_driver():
     current = np.sin(2.0 * np.arange(1500) / 50.0)
     sensor = np.outer(current, [3.0, -2.0, 2.0])
     effects = [effect for effect in CATALOGUE if effect.id == "current_field"]
@@ -40,7 +40,7 @@ def test_a_size_is_compared_in_the_unit_that_is_known():
         assert f"within the {known} that is plausible" in finding.plausibility
 
 
-def test_a_size_in_a_unit_that_is_not_known_is_not_judged():
+def test_sizes_in_unknown_units_are_not_judged():
     current = np.sin(2.0 * np.arange(1500) / 50.0)
     recording = tumbling(1500, noise=0.3, sensor=np.outer(current, [3.0, -2.0, 2.0]), current=current)
     recording = in_units(recording, mag_x="counts", mag_y="counts", mag_z="counts")

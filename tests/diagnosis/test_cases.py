@@ -1,6 +1,6 @@
-"""Recordings whose right answer is known, real ones and simulated: what a diagnosis says of each.
+"""Diagnoses of recordings with known answers, real and simulated.
 
-Those that take long are marked slow and left out unless they are asked for, ``pytest -m slow tests/diagnosis``.
+Slow cases are left out by default; run them with ``pytest -m slow tests/diagnosis``.
 """
 
 import functools
@@ -20,7 +20,7 @@ slow = pytest.mark.slow
 
 @functools.cache
 def diagnosed(recording, simulation, between=None):
-    """Of files among the cases, once."""
+    """Diagnose a case, cached."""
     path, (file, name) = shared_case(recording), simulation.split(":")
     system = load_simulation(f"{shared_case(file)}:{name}")
     if between is not None:
@@ -33,19 +33,19 @@ def pendulum(name, between=None):
 
 
 def first(diagnosis, effect, channel):
-    """The first finding, which has to be this."""
+    """Return the first finding, which has to be this effect."""
     found = diagnosis.findings[0]
     assert (found.effect, found.channels) == (effect, (channel,))
     return found
 
 
 def value(finding, name):
-    (one,) = [parameter for parameter in finding.parameters if parameter.name == name]
-    return one.value
+    (match,) = [parameter for parameter in finding.parameters if parameter.name == name]
+    return match.value
 
 
 def confirmed(diagnosis):
-    return [one.effect for one in diagnosis.findings if one.grade in CONFIRMED]
+    return [finding.effect for finding in diagnosis.findings if finding.grade in CONFIRMED]
 
 
 @pytest.mark.e2e
@@ -58,7 +58,7 @@ def confirmed(diagnosis):
         pytest.param("linear_input", "held", marks=slow),
     ],
 )
-def test_what_an_input_does_between_samples_is_found_whatever_the_simulation_says_and_is_no_physics(name, between):
+def test_the_input_hold_is_found_and_is_no_finding(name, between):
     diagnosis = pendulum(name, between)
     assert (diagnosis.verdict, diagnosis.findings, diagnosis.environment.process_noise) == ("adequate", (), ())
     assert diagnosis.environment.input_hold == {INPUT: name.removesuffix("_input")}
@@ -75,14 +75,14 @@ def test_what_an_input_does_between_samples_is_found_whatever_the_simulation_say
         pytest.param("gusts", 0.5, False, marks=slow),
     ],
 )
-def test_a_push_that_nobody_recorded_is_told_as_one_and_no_physics_is_left_out(name, size, white):
+def test_an_unrecorded_disturbance_is_process_noise_and_no_finding(name, size, white):
     diagnosis = pendulum(name)
     assert diagnosis.verdict == "unexplained"
     assert confirmed(diagnosis) == []
-    push = diagnosis.environment.process_noise[0]
-    assert (push.place, push.at_rate) == ("rate", True)
-    assert size / 2.0 < push.size < 2.0 * size
-    assert 0.0 < push.standard_error < push.size
+    disturbance = diagnosis.environment.process_noise[0]
+    assert (disturbance.place, disturbance.at_rate) == ("rate", True)
+    assert size / 2.0 < disturbance.size < 2.0 * size
+    assert 0.0 < disturbance.standard_error < disturbance.size
     course = diagnosis.environment.disturbance[0]
     assert course.value.shape == course.band.shape == course.time.shape == (750,)
     assert ("is white" in course.sentences[0]) is white
@@ -91,7 +91,7 @@ def test_a_push_that_nobody_recorded_is_told_as_one_and_no_physics_is_left_out(n
 
 @slow
 @pytest.mark.parametrize("name", ["held_input", "linear_input", "pushed_slowly", "pushed_white", "gusts"])
-def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named_where_nothing_pushes(name):
+def test_gravity_of_the_wrong_sign_is_unfit_and_named_without_process_noise(name):
     diagnosis = diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:UpsideDown")
     assert diagnosis.verdict == "unfit"
     assert diagnosis.findings == ()
@@ -101,7 +101,7 @@ def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named_where_nothing_pu
 
 
 @slow
-def test_an_output_that_has_nothing_to_do_with_the_input_is_not_followed():
+def test_an_output_unrelated_to_the_input_is_unfit():
     diagnosis = pendulum("unrelated")
     assert diagnosis.verdict == "unfit"
     assert diagnosis.findings == ()
@@ -112,35 +112,35 @@ def test_an_output_that_has_nothing_to_do_with_the_input_is_not_followed():
 
 
 @slow
-def test_drag_of_a_car_that_rolls_out_is_what_would_explain_it():
+def test_a_coasting_car_has_drag():
     diagnosis = diagnosed("coastdown/runs.csv", "coastdown/naive.py:Coast")
     assert diagnosis.verdict in ("explained", "unexplained")
     found = first(diagnosis, diagnosis.findings[0].effect, "rate of speed")
-    named = {found.effect, *(one.effect for one in found.alternatives if not one.separable)}
+    named = {found.effect, *(rival.effect for rival in found.alternatives if not rival.separable)}
     assert "quadratic_drag" in named
     assert found.effect in DRAG
     if found.effect == "quadratic_drag":
         assert 0.0003 < value(found, "drag") < 0.0007
     elif found.effect == "linear_drag":
-        # about the mean speed, 5 m/s, its slope is that of the quadratic one, and rolling resistance takes the rest
+        # at the mean speed, 5 m/s, it has the slope of the quadratic drag; rolling resistance explains the rest
         assert 0.0003 < value(found, "drag") / 10.0 < 0.0007
 
 
 @slow
-def test_natural_convection_is_a_power_of_the_difference_and_no_radiation():
+def test_natural_convection_is_a_power_law_and_not_radiation():
     diagnosis = diagnosed("heater/runs.csv", "heater/naive.py:Heater")
     assert diagnosis.verdict == "explained"
     found = first(diagnosis, "power_law", "rate of temp")
     assert 1.4 < value(found, "exponent") < 1.6
-    assert "thermal_loss" not in [one.effect for one in diagnosis.findings]
-    assert "thermal_loss" not in [one.effect for one in found.alternatives if not one.separable]
+    assert "thermal_loss" not in [finding.effect for finding in diagnosis.findings]
+    assert "thermal_loss" not in [rival.effect for rival in found.alternatives if not rival.separable]
     after = found.held_out.outputs["temp"]
     assert (after.unit, after.after) == ("°C", pytest.approx(0.2, abs=0.1))
     assert after.before > 2.0
 
 
 @slow
-def test_the_ground_effect_of_a_hovering_vehicle_is_a_curve_of_its_height():
+def test_ground_effect_is_a_curve_of_the_height():
     diagnosis = diagnosed("altitude/runs.csv", "altitude/naive.py:Altitude")
     found = first(diagnosis, "unknown", "rate of climb")
     assert found.curve is not None
@@ -154,22 +154,25 @@ def test_the_ground_effect_of_a_hovering_vehicle_is_a_curve_of_its_height():
 
 
 @slow
-def test_dry_friction_of_a_geared_motor_is_told_in_each_outputs_unit():
+def test_dry_friction_of_a_geared_motor_has_sizes_in_each_outputs_unit():
     diagnosis = diagnosed("gear_motor/runs.csv", "gear_motor/naive.py:GearMotor")
     found = first(diagnosis, "stribeck_friction", "rate of speed")
     assert found.grade == AS_WRITTEN
     sizes = found.held_out.outputs
-    assert {name: one.unit for name, one in sizes.items()} == {"angle": "rad", "speed": "rad/s"}
+    assert {name: size.unit for name, size in sizes.items()} == {"angle": "rad", "speed": "rad/s"}
     for one in sizes.values():
         assert 0.0 < one.after < one.before < math.inf
     assert sizes["angle"].before < 1.0
     assert sizes["speed"].before < 20.0
-    assert [(one.output, one.unit) for one in diagnosis.environment.goodness_of_fit] == [("angle", "rad"), ("speed", "rad/s")]
-    assert all(math.isfinite(one.value) for one in found.parameters)
+    assert [(fit.output, fit.unit) for fit in diagnosis.environment.goodness_of_fit] == [
+        ("angle", "rad"),
+        ("speed", "rad/s"),
+    ]
+    assert all(math.isfinite(parameter.value) for parameter in found.parameters)
 
 
 @slow
-def test_a_free_double_integrator_does_not_follow_a_ball_on_a_beam():
+def test_a_free_double_integrator_is_unfit_for_a_ball_on_a_beam():
     diagnosis = diagnosed("ball_beam/run.csv", "ball_beam/naive.py:Ball")
     assert diagnosis.verdict == "unfit"
     assert confirmed(diagnosis) == []
@@ -180,7 +183,7 @@ def test_a_free_double_integrator_does_not_follow_a_ball_on_a_beam():
 
 
 @slow
-def test_the_fit_of_two_tanks_is_found_and_the_rest_is_not_called_noise():
+def test_two_tanks_have_a_good_fit():
     diagnosis = diagnosed("tanks/fit.csv", "tanks/naive.py:Tanks")
     (level,) = diagnosis.environment.goodness_of_fit
     assert (level.unit, level.residual < 0.65) == ("V", True)
@@ -208,7 +211,7 @@ def real(recording, simulation):
 
 
 @pytest.mark.e2e
-def test_a_rocket_that_coasts_is_braked_by_the_square_of_its_speed():
+def test_a_coasting_rocket_has_quadratic_drag():
     diagnosis = real("rocket/juno.csv", "rocket/naive.py:Rocket")
     assert diagnosis.verdict == "explained"
     found = first(diagnosis, "quadratic_drag", "rate of speed")
@@ -218,20 +221,20 @@ def test_a_rocket_that_coasts_is_braked_by_the_square_of_its_speed():
 
 
 @pytest.mark.e2e
-def test_a_mug_loses_heat_by_a_high_power_of_its_temperature():
+def test_a_mug_loses_heat_by_a_high_power():
     diagnosis = real("mug/run.csv", "mug/naive.py:Cooling")
     assert diagnosis.verdict == "explained"
     assert first(diagnosis, "power_law", "rate of temp").grade == AS_WRITTEN
 
 
 @slow
-def test_a_house_has_a_second_mass_even_where_its_first_noise_was_not_the_likeliest():
+def test_a_house_has_a_second_thermal_mass():
     diagnosis = real("house/house_2.csv", "house/naive.py:House")
     assert first(diagnosis, "hidden_lag", "rate of indoor").grade == AS_WRITTEN
 
 
 @slow
-def test_a_pendulum_on_a_shaft_is_stopped_by_dry_friction():
+def test_a_pendulum_on_a_shaft_has_dry_friction():
     diagnosis = real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum")
     found = first(diagnosis, "coulomb_friction", "rate of speed")
     assert found.grade == AS_WRITTEN

@@ -1,4 +1,4 @@
-"""The whole way: an effect is put into a recording whose truth is known, and has to be named, sized and taken off."""
+"""Whole diagnoses: a hidden effect is named, sized and corrected."""
 
 import json
 
@@ -30,7 +30,7 @@ GAIN = np.array([0.4, -0.3, 0.5])
 
 
 def outliers(seed=3, share=0.1, size=15.0):
-    """Sparse, large, on every axis."""
+    """Sparse, large outliers on every axis."""
     random = np.random.default_rng(seed)
     return size * random.standard_normal((N, 3)) * (random.random((N, 1)) < share)
 
@@ -53,7 +53,7 @@ def named(request):
 
 
 @pytest.mark.e2e
-def test_it_is_named_with_its_driver(named):
+def test_a_hidden_effect_is_named_with_its_driver(named):
     effect, drivers, _, _, diagnosis = named
     assert diagnosis.verdict == "explained"
     assert (diagnosis.findings[0].effect, diagnosis.findings[0].drivers) == (effect, drivers)
@@ -70,14 +70,14 @@ def test_its_size_is_within_its_errors(named):
 
 
 @pytest.mark.e2e
-def test_the_fit_improves_on_blocks_that_it_has_not_seen(named):
+def test_the_fit_improves_on_held_out_blocks(named):
     held = named[-1].findings[0].held_out
     assert held.confidence_interval[0] > 0.0
     assert held.rmse_after < held.rmse_before
 
 
 @pytest.mark.e2e
-def test_the_file_is_valid_and_says_the_same(named):
+def test_the_file_is_valid_and_contains_the_finding(named):
     effect, *_, diagnosis = named
     content = json.loads(diagnosis_to_json(diagnosis))
     assert content["schema"] == "mkc-diagnosis/3"
@@ -85,7 +85,7 @@ def test_the_file_is_valid_and_says_the_same(named):
 
 
 @pytest.mark.e2e
-def test_the_model_takes_it_off_another_recording(named):
+def test_the_model_corrects_another_recording(named):
     effect, *_, diagnosis = named
     model = DiagnosedModel.from_json(diagnosis.model.to_json())
     lasting = {"hard_iron_step": 4.0 * GAIN * np.ones((N, 1))}.get(effect, HIDDEN[effect][0])
@@ -97,13 +97,13 @@ def test_the_model_takes_it_off_another_recording(named):
 
 
 @pytest.mark.e2e
-def test_a_step_is_found_to_the_sample_or_nearly():
+def test_the_onset_of_a_step_is_accurate():
     effect = 4.0 * GAIN * (TIME[:, None] >= 23.4)
     assert diagnose(Magnetometer(), recording_of(effect)).findings[0].onset == pytest.approx(23.4, abs=0.3)
 
 
 @pytest.mark.e2e
-def test_nothing_is_found_where_nothing_is():
+def test_noise_alone_has_no_findings():
     found = [diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(s), seed=s, **COLUMNS)) for s in range(4)]
     assert sum(d.verdict != "adequate" for d in found) <= 1
     assert all(d.model is not None for d in found)
@@ -126,7 +126,7 @@ def test_a_time_offset_and_a_name_change_nothing():
 
 
 @pytest.mark.e2e
-def test_the_driver_s_copy_is_a_rival_that_cannot_be_told_apart():
+def test_a_copy_of_the_driver_is_an_inseparable_rival():
     recording = recording_of(HIDDEN["current_field"][0], spare=3.0 * CURRENT + 1.0)
     (finding, *_) = diagnose(Magnetometer(), recording).findings
     assert finding.drivers == ("current",)
@@ -141,14 +141,14 @@ def test_the_level_holds_with_three_hundred_columns():
 
 
 @pytest.mark.e2e
-def test_without_its_driver_a_model_refuses():
+def test_a_model_without_its_driver_raises():
     model = diagnose(Magnetometer(), recording_of(HIDDEN["current_field"][0])).model
     with pytest.raises(MissingColumnError, match=r"current_field by the column `current`.*--columns current=NAME"):
         model.correct(changed(recording_of(np.zeros((N, 3))), current=None))
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("{", "not JSON"),
         ('{"schema": "mkc-calibration/1"}', 'its schema is "mkc-calibration/1"'),
@@ -165,13 +165,13 @@ def test_without_its_driver_a_model_refuses():
         ),
     ],
 )
-def test_a_text_that_is_no_model_is_refused(text, said):
-    with pytest.raises(ModelFileError, match=said):
+def test_invalid_model_text_raises(text, message):
+    with pytest.raises(ModelFileError, match=message):
         DiagnosedModel.from_json(text)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"level": 0.0}, "`level`"),
         ({"surrogates": 5}, "`surrogates` to be at least 19"),
@@ -181,8 +181,8 @@ def test_a_text_that_is_no_model_is_refused(text, said):
         ({"seed": "a"}, "`seed` to be a whole number but got 'a'"),
     ],
 )
-def test_arguments_out_of_range_are_refused(options, said):
-    with pytest.raises(ValueError, match=said):
+def test_arguments_out_of_range_raise(options, message):
+    with pytest.raises(ValueError, match=message):
         diagnose(Magnetometer(), recording_of(np.zeros((N, 3))), **options)
 
 
@@ -191,7 +191,7 @@ class Lacking:
 
 
 class Nameless(GainEffect):
-    """It has defaults for all but its id."""
+    """An effect without an id."""
 
 
 class Letters(HardIronStep):
@@ -199,43 +199,41 @@ class Letters(HardIronStep):
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
-        ({"simulation": "magnetometer"}, r"got 'magnetometer'; pass one, such as Magnetometer\(\), or name it on the"),
-        ({"simulation": Magnetometer}, r"got the class Magnetometer; make one, Magnetometer\(\)"),
-        ({"simulation": None}, r"`simulation` to be a Simulation but got None; pass one"),
+        ({"simulation": "magnetometer"}, r"got 'magnetometer'; pass a simulation, such as Magnetometer\(\), or use"),
+        ({"simulation": Magnetometer}, r"got the class Magnetometer; .*, Magnetometer\(\)"),
+        ({"simulation": None}, r"`simulation` to be a Simulation but got None; pass a"),
         ({"recording": "NEW.csv"}, r"`recording` to be a Recording but got 'NEW\.csv'; read it, Recording\.read\('NEW"),
         ({"recording": {"time": torch.ones(3)}}, r"`recording` to be a Recording but got .*; make one, Recording\("),
         (
             {"effects": ("hard_iron_step",)},
-            r"`effects` to hold Effects but got 'hard_iron_step'; .*CATALOGUE holds them",
+            r"`effects` to hold Effects but got 'hard_iron_step'; .*CATALOGUE",
         ),
         (
             {"effects": "hard_iron_step"},
-            r"`effects` to be a sequence of Effects but got 'hard_iron_step'; it is a tuple",
+            r"`effects` to be a sequence of Effects but got 'hard_iron_step'; pass a tuple",
         ),
-        ({"effects": HardIronStep()}, "`effects` to be a sequence of Effects but got a HardIronStep; it is a tuple"),
-        ({"effects": None}, r"`effects` to be a sequence of Effects but got None; .* and \(\) for none"),
-        ({"effects": (HardIronStep,)}, r"got the class HardIronStep; make one, HardIronStep\(\)"),
+        ({"effects": HardIronStep()}, "`effects` to be a sequence of Effects but got a HardIronStep; pass a tuple"),
+        ({"effects": None}, r"`effects` to be a sequence of Effects but got None; .*\(\) for no effects"),
+        ({"effects": (HardIronStep,)}, r"got the class HardIronStep; .*, HardIronStep\(\)"),
         (
             {"effects": (Lacking(),)},
-            "got a Lacking; derive it from mkc_torch.effects.Effect, which has defaults",
+            "got a Lacking; derive it from mkc_torch.effects.Effect",
         ),
         ({"effects": (Nameless(),)}, "got a Nameless; give it an `id`"),
         ({"effects": (Letters(),)}, r"its roles are names, \('temperature',\)"),
         ({"level": "a"}, r"`level` to be a number in \(0, 1\) but got 'a'"),
     ],
 )
-def test_arguments_of_another_kind_are_told_what_to_pass(changed, said):
+def test_arguments_of_another_type_raise_with_a_remedy(changed, message):
     given = {"simulation": Magnetometer(), "recording": recording_of(np.zeros((N, 3)))} | changed
-    with pytest.raises(TypeError, match=said):
+    with pytest.raises(TypeError, match=message):
         diagnose(**given)
 
 
-def test_arguments_that_were_swapped_are_told_their_order():
-    with pytest.raises(
-        TypeError, match=r"`simulation` .* got Recording.*; it comes first, diagnose\(simulation, recording\)"
-    ):
+def test_swapped_arguments_raise_with_their_order():
+    with pytest.raises(TypeError, match=r"`simulation` .* got Recording.*; .*diagnose\(simulation, recording\)"):
         diagnose(recording_of(np.zeros((N, 3))), Magnetometer())
 
 
@@ -249,7 +247,7 @@ def test_effects_may_come_from_an_iterator():
     assert once.candidates_tried > 0
 
 
-def test_two_rows_are_too_few():
+def test_two_samples_raise():
     with pytest.raises(ValueError, match="2 samples are too few for a diagnosis"):
         diagnose(Magnetometer(), tumbling(2))
 
@@ -259,9 +257,9 @@ def test_two_rows_are_too_few():
     ("broad_34_attached_magnet_3cm", 51.5, (1.3, -0.5, -13.4)),
     ("broad_36_attached_magnet_5cm", 54.8, (-0.7, -0.1, 5.7)),
 ])  # fmt: skip
-def test_a_magnet_that_is_taken_off_a_real_sensor_is_seen(name, onset, step):
+def test_a_magnet_removed_from_a_real_sensor_is_found(name, onset, step):
     whole = Recording.read(shared_data(f"magnetometer/{name}.csv"))
-    # every fourth sample, and the length alone: the step has to be seen without optical truth, in seconds
+    # every fourth sample and the length only, for speed
     columns = {key: whole[key][::4] for key in ("time", "mag_x", "mag_y", "mag_z")}
     finding = diagnose(Magnetometer(use="norm"), Recording(columns, name=name)).findings[0]
     assert finding.effect == "hard_iron_step"
@@ -286,10 +284,8 @@ class Divider(Static):
 
 
 @pytest.mark.parametrize("simulation", [Swing(), Divider()])
-def test_an_output_without_noise_is_refused(simulation):
+def test_an_output_without_noise_raises(simulation):
     time = torch.arange(0.0, 6.0, 0.05, dtype=torch.float64)
     recording = Recording({"time": time, "supply": torch.sin(time), simulation.outputs[0]: 0.0 * time}, name="still")
-    with pytest.raises(
-        ValueError, match=rf"still: `{simulation.outputs[0]}` differs .* no noise to tell structure from"
-    ):
+    with pytest.raises(ValueError, match=rf"still: `{simulation.outputs[0]}` differs .* no noise"):
         diagnose(simulation, recording)

@@ -1,4 +1,4 @@
-"""Physics hidden in differential equations has to be named; the truth is made by scipy, with formulas of its own."""
+"""Hidden physics of differential equations is named; the truth is integrated by scipy with independent formulas."""
 
 import math
 
@@ -31,33 +31,33 @@ class Pendulum(Dynamics):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
-def spoilt(values, size, seed):
-    """With normal noise, and one sample in twenty thirty times as far off."""
+def contaminated(values, size, seed):
+    """Add normal noise, with 5 % outliers of thirty times its size."""
     random = np.random.default_rng(seed)
     bad = random.random(values.shape) < 0.05
     return values + size * (1.0 + 29.0 * bad) * random.standard_normal(values.shape)
 
 
 def swung(hidden, seed=0):
-    """600 samples of a damped pendulum's angle, with what is hidden in its equation."""
+    """600 samples of a damped pendulum's angle, with hidden physics in its equation."""
     time = np.arange(600) * 0.02
 
     def rate(_, y):
         return [y[1], -9.0 * math.sin(y[0]) - 0.05 * y[1] + hidden(*y)]
 
     exact = solve_ivp(rate, (0.0, time[-1]), [1.2, 0.0], t_eval=time, rtol=1e-8, atol=1e-9, max_step=0.02)
-    angle = spoilt(exact.y[0], NOISE, seed)
+    angle = contaminated(exact.y[0], NOISE, seed)
     return Recording({"time": torch.from_numpy(time), "angle": torch.from_numpy(angle)}, name="swing")
 
 
 def value(finding, name):
-    """Of a parameter, with its error."""
-    (one,) = [p for p in finding.parameters if p.name == name]
-    return one.value, one.standard_error
+    """Return a parameter's value and standard error."""
+    (match,) = [p for p in finding.parameters if p.name == name]
+    return match.value, match.standard_error
 
 
 def explained(diagnosis, effect):
-    """The one finding of a diagnosis, named as it should be, and confirmed by unseen blocks."""
+    """Return the only finding, with the expected name and confirmed by held-out blocks."""
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
     assert finding.effect == effect
@@ -70,7 +70,7 @@ def explained(diagnosis, effect):
 @pytest.mark.e2e
 @pytest.mark.parametrize(("size", "seed"), [(0.2, 0), pytest.param(0.05, 2, marks=pytest.mark.slow)])
 def test_air_drag_is_named_and_sized(size, seed):
-    """Of a body whose flow turns laminar at small speeds."""
+    """A body whose flow is laminar at small speeds."""
     recording = swung(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
     finding = explained(diagnose(Pendulum(), recording, **QUICK), "quadratic_drag")
     drag, error = value(finding, "drag")
@@ -82,7 +82,7 @@ def test_air_drag_is_named_and_sized(size, seed):
 
 @pytest.mark.slow
 def test_dry_friction_is_named_and_sized():
-    """With a jump that is smoothed by another function."""
+    """The jump is smoothed by another function than the catalogue's."""
     diagnosis = diagnose(Pendulum(), swung(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK)
     finding = explained(diagnosis, "coulomb_friction")
     assert value(finding, "friction")[0] == pytest.approx(0.3, abs=0.03)
@@ -92,7 +92,7 @@ def test_dry_friction_is_named_and_sized():
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
-def test_where_nothing_is_hidden_nothing_is_found(seed):
+def test_noise_alone_has_no_findings(seed):
     diagnosis = diagnose(Pendulum(), swung(lambda _, __: 0.0, seed), **QUICK)
     assert diagnosis.verdict == "adequate"
     assert diagnosis.findings == ()
@@ -103,7 +103,7 @@ def test_where_nothing_is_hidden_nothing_is_found(seed):
 
 
 class Tanks(Dynamics):
-    """Two tanks that are thought to be apart."""
+    """Two tanks without a connection."""
 
     states = ("upper", "lower")
     inputs = ("pump",)
@@ -126,7 +126,7 @@ def filled(leak, seed=0):
     for u in pump[:-1]:
         rest = -np.linalg.solve(flow, [1.2 * u, 0.0])
         levels.append(rest + decay @ (levels[-1] - rest))
-    upper, lower = spoilt(np.array(levels).T, 0.02, seed)
+    upper, lower = contaminated(np.array(levels).T, 0.02, seed)
     columns = {"time": np.arange(400) * step, "pump": pump, "upper": upper, "lower": lower}
     return Recording({name: torch.from_numpy(column) for name, column in columns.items()}, name="tanks")
 
@@ -135,7 +135,7 @@ def filled(leak, seed=0):
 def test_a_pipe_between_two_tanks_is_named_and_sized():
     finding = explained(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")
-    assert exchange == pytest.approx(0.15, abs=0.03)  # what leaves one tank enters the other
+    assert exchange == pytest.approx(0.15, abs=0.03)  # the outflow of one tank is the inflow of the other
     assert error < 0.03
     assert finding.held_out.rmse_after == pytest.approx(0.02, rel=0.25)
 
@@ -145,7 +145,7 @@ def test_two_tanks_apart_are_adequate():
     assert diagnose(Tanks(), filled(0.0), **QUICK).verdict == "adequate"
 
 
-# effects that remember, and fluids; each beside its nearest rivals
+# effects with memory, and fluids; each with its nearest rivals
 
 
 def among(*names):
@@ -153,14 +153,14 @@ def among(*names):
 
 
 def measured(rate, first, time, noise, **columns):
-    """A recording of the first states of an equation that has something hidden in it, by their names and tolerances."""
+    """A recording of the first states of an equation with hidden physics, by names and tolerances."""
     exact = solve_ivp(rate, (0.0, time[-1]), first, t_eval=time, rtol=1e-8, atol=1e-9, max_step=0.02)
-    known = {name: spoilt(exact.y[k], noise, k) for k, name in enumerate(columns.pop("seen"))}
+    known = {name: contaminated(exact.y[k], noise, k) for k, name in enumerate(columns.pop("seen"))}
     return Recording({name: torch.as_tensor(values) for name, values in {"time": time, **known, **columns}.items()})
 
 
 class Servo(Dynamics):
-    """Follows the angle that it is told."""
+    """A servo that follows its commanded angle."""
 
     states = ("angle", "speed")
     inputs = ("command",)
@@ -173,7 +173,7 @@ class Servo(Dynamics):
 
 
 def commanded(behind):
-    """140 samples of a servo that sees of its command, linear between samples, only what is behind its gear."""
+    """140 samples of a servo whose command, linear between samples, passes a gear."""
     time = np.arange(140) * 0.04
     command = np.sin(1.7 * time) + 0.5 * np.sin(4.1 * time + 1.0)
     finely = np.linspace(time[0], time[-1], 139 * 20 + 1)
@@ -201,7 +201,7 @@ def without_small_ones(command):
 @pytest.mark.parametrize(
     ("hidden", "name", "size"), [(with_play, "backlash", "half_gap"), (without_small_ones, "dead_zone", "width")]
 )
-def test_play_and_a_dead_zone_are_told_apart(hidden, name, size):
+def test_backlash_and_a_dead_zone_are_separable(hidden, name, size):
     diagnosis = diagnose(Servo(), commanded(hidden), effects=among("backlash", "dead_zone"), **QUICK)
     finding = explained(diagnosis, name)
     assert value(finding, "share")[0] == pytest.approx(1.0, abs=0.1)
@@ -211,7 +211,7 @@ def test_play_and_a_dead_zone_are_told_apart(hidden, name, size):
 
 @pytest.mark.e2e
 def test_a_hysteretic_spring_is_named_and_sized():
-    """Of a body between joints whose unloading is not that of the catalogue: three quarters of β, one of β′."""
+    """The unloading differs from the catalogue's: three quarters of β, one quarter of β′."""
 
     def rate(_, y):
         angle, v, z = y
@@ -226,7 +226,7 @@ def test_a_hysteretic_spring_is_named_and_sized():
 
 
 class Buoy(Dynamics):
-    """On a spring, pushed by a force that is known; its weight is that of a body without water."""
+    """A float on a spring, driven by a known force; its mass is that of the body without water."""
 
     states = ("heave", "speed")
     inputs = ("push",)
@@ -239,7 +239,7 @@ class Buoy(Dynamics):
 
 
 @pytest.mark.e2e
-def test_water_that_moves_along_is_named_and_sized():
+def test_added_mass_is_named_and_sized():
     time = np.arange(400) * 0.05
     push = np.sin(1.3 * time) + np.sin(2.9 * time)
 
@@ -266,8 +266,8 @@ class Ball(Dynamics):
 
 
 @pytest.mark.e2e
-def test_a_ball_that_spins_is_named_and_sized():
-    """With a spin that dies away."""
+def test_lift_of_a_spinning_ball_is_named_and_sized():
+    """The spin decays."""
 
     def rate(t, s):
         _, _, vx, vy = s
@@ -284,8 +284,8 @@ def test_a_ball_that_spins_is_named_and_sized():
     assert finding.channels == ("rate of vx", "rate of vy")
 
 
-def test_water_that_carries_leads_the_search_of_all_effects():
-    """A sphere, whose displaced volume is not linear in its depth; its refits would take long."""
+def test_buoyancy_leads_the_search_of_all_effects():
+    """A sphere, whose displaced volume is not linear in its depth; the refits would be slow."""
     time = np.arange(140) * 0.05
     push = 1.5 * np.sin(1.3 * time) + np.sin(2.9 * time)
 
@@ -315,8 +315,8 @@ class Sinking(Dynamics):
 
 
 @pytest.mark.e2e
-def test_what_is_under_all_the_time_is_pushed_by_a_constant_force():
-    """Archimedes' push and any other constant one are not told apart, and nobody claims it."""
+def test_a_submerged_body_has_a_constant_force():
+    """Buoyancy is inseparable from any other constant force."""
 
     def rate(_, y):
         return [y[1], -9.81 - 0.8 * y[1] + 2.0]
@@ -342,26 +342,26 @@ def dropped(ball):
     """Both drops of a ball in one table."""
     parts = Recording.read(shared_data("dynamics/falling_balls/ball_drops.csv")).experiments()
     both = [parts[f"{ball}/{k}"] for k in (1, 2)]
-    columns = {name: torch.cat([one[name] for one in both]) for name in ("time", "height")}
-    number = torch.cat([torch.full((len(one),), float(k)) for k, one in enumerate(both)])
+    columns = {name: torch.cat([drop[name] for drop in both]) for name in ("time", "height")}
+    number = torch.cat([torch.full((len(drop),), float(k)) for k, drop in enumerate(both)])
     return Recording({**columns, "experiment": number}, name=ball)
 
 
 @pytest.mark.e2e
-def test_a_light_ball_is_braked_by_the_air():
-    """Which drag it is, short drops do not tell."""
+def test_a_light_ball_has_drag():
+    """Short drops do not separate the kinds of drag."""
     diagnosis = diagnose(Fall(), dropped("Whiffle_Ball_1"), **QUICK)
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
-    alike = [one.effect for one in finding.alternatives if not one.separable]
+    alike = [rival.effect for rival in finding.alternatives if not rival.separable]
     assert {"linear_drag", "quadratic_drag"} & {finding.effect, *alike}
     assert finding.grade == "left_out"
     assert finding.held_out.outputs["height"].after < 0.1 * finding.held_out.outputs["height"].before
 
 
 @pytest.mark.e2e
-def test_of_a_heavy_ball_nothing_is_said():
-    """Its drops are not noise alone, but no effect predicts blocks of them that the fit has not seen."""
+def test_a_heavy_ball_has_no_finding():
+    """Its residual is not only noise, but no effect predicts held-out blocks."""
     diagnosis = diagnose(Fall(), dropped("Bowling_Ball"), **QUICK)
     assert diagnosis.findings == ()
     assert not any(word in text for text in diagnosis.warnings for word in ("drag", "added_mass"))

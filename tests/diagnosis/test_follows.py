@@ -1,4 +1,4 @@
-"""How well a simulation follows each output: sizes, shares, floors and what trivial predictions reach."""
+"""Goodness of fit of each output: sizes, shares, noise floors and trivial predictions."""
 
 import math
 from types import SimpleNamespace
@@ -34,7 +34,7 @@ def test_the_size_of_normal_noise_is_its_standard_deviation():
     torch.testing.assert_close(size_of(values), torch.tensor([0.3, 20.0]).double(), rtol=0.04, atol=0.0)
 
 
-def test_of_an_outlier_two_and_a_half_standard_deviations_count():
+def test_outliers_are_clipped_at_two_and_a_half_standard_deviations():
     values = randn(N, 1)
     clean = float(size_of(values))
     values[:40] = 1000.0
@@ -42,123 +42,123 @@ def test_of_an_outlier_two_and_a_half_standard_deviations_count():
     assert float(size_of(values)) == pytest.approx(clean * (1.0 + 0.5 * share * 6.25), rel=0.03)
 
 
-def test_the_size_of_a_series_that_rests_most_of_the_time_is_its_root_mean_square():
+def test_the_size_of_a_mostly_zero_series_is_its_root_mean_square():
     values = torch.zeros(N, 1).double()
     values[:100] = 2.0
     assert float(size_of(values)) == pytest.approx(2.0 * (100 / N) ** 0.5)
     assert float(size_of(torch.zeros(N, 1).double())) == 0.0
 
 
-def test_an_offset_is_part_of_a_residual_and_no_variation():
-    one = followed(5.0 + WAVE, torch.full((N, 1), 0.1).double())[0]
-    assert one.residual == pytest.approx(0.1, rel=0.02)
-    assert one.variation == pytest.approx(0.5**0.5, rel=0.02)
+def test_an_offset_counts_in_the_residual_only():
+    fit = followed(5.0 + WAVE, torch.full((N, 1), 0.1).double())[0]
+    assert fit.residual == pytest.approx(0.1, rel=0.02)
+    assert fit.variation == pytest.approx(0.5**0.5, rel=0.02)
 
 
 @pytest.mark.parametrize(("size", "share"), [(0.1, 0.98), (0.5**0.5, 0.0), (1.0, -1.0)])
-def test_the_share_explained_is_of_squares_and_below_nothing_where_the_mean_is_better(size, share):
-    one = followed(WAVE, size * randn(N, 1))[0]
-    assert one.explained == pytest.approx(share, abs=0.08)
+def test_the_explained_share_is_negative_if_the_mean_is_better(size, share):
+    fit = followed(WAVE, size * randn(N, 1))[0]
+    assert fit.explained == pytest.approx(share, abs=0.08)
 
 
-def test_each_output_has_sizes_of_its_own_and_its_unit():
+def test_each_output_has_its_own_sizes_and_unit():
     parts = {"angle": "rad", "speed": "rad/s"}
     port = Port(("angle", "speed"), "", carries=("angle", "speed"), parts={k: k for k in parts}, part_units=parts)
     prepared = simulating(torch.cat([WAVE, 100.0 * WAVE], -1), ("angle", "speed"), "")
     prepared.ports = {"output": port}
-    one, other = goodness_of_fit(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
-    assert (one.output, one.unit, other.output, other.unit) == ("angle", "rad", "speed", "rad/s")
-    assert one.explained == pytest.approx(0.51, abs=0.01)
+    fit, other = goodness_of_fit(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
+    assert (fit.output, fit.unit, other.output, other.unit) == ("angle", "rad", "speed", "rad/s")
+    assert fit.explained == pytest.approx(0.51, abs=0.01)
     assert other.explained == pytest.approx(0.99, abs=0.01)
     assert other.residual == pytest.approx(10.0 * 0.5**0.5, rel=0.02)
-    assert poor_fits((one, other), 0.6) == (one,)
+    assert poor_fits((fit, other), 0.6) == (fit,)
 
 
-def test_the_floor_is_what_is_new_from_sample_to_sample():
-    one = followed(WAVE, WAVE + 0.02 * randn(N, 1))[0]
-    assert one.floor_source == "samples"
-    assert one.noise_floor == pytest.approx(0.02, rel=0.1)
+def test_the_floor_is_estimated_from_third_differences():
+    fit = followed(WAVE, WAVE + 0.02 * randn(N, 1))[0]
+    assert fit.floor_source == "samples"
+    assert fit.noise_floor == pytest.approx(0.02, rel=0.1)
 
 
-def test_a_floor_that_was_estimated_is_taken():
-    one = followed(WAVE, 0.02 * randn(N, 1), floor=[0.007])[0]
-    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.007), "samples")
+def test_a_given_floor_is_used():
+    fit = followed(WAVE, 0.02 * randn(N, 1), floor=[0.007])[0]
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.007), "samples")
 
 
-def test_a_recording_in_coarse_steps_has_the_floor_of_its_steps():
-    one = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[1e-4])[0]
-    assert one.floor_source == "quantisation"
-    assert one.noise_floor == pytest.approx(0.05 / 12.0**0.5)
+def test_coarse_quantisation_sets_the_floor():
+    fit = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[1e-4])[0]
+    assert fit.floor_source == "quantisation"
+    assert fit.noise_floor == pytest.approx(0.05 / 12.0**0.5)
 
 
-def test_steps_finer_than_the_noise_are_no_floor():
-    one = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[0.1])[0]
-    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1), "samples")
+def test_fine_quantisation_does_not_set_the_floor():
+    fit = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[0.1])[0]
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1), "samples")
 
 
-def test_a_declared_floor_goes_before_what_samples_and_steps_say():
+def test_a_declared_floor_overrides_estimates():
     measured = (torch.cat([WAVE, WAVE], -1) * 20.0).round() / 20.0
-    one, other = followed(
+    fit, other = followed(
         measured, 0.3 * randn(N, 2), {"rate": 0.001}, floor=[0.1, 0.1], channels=("angle", "rate"), unit=""
     )
-    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1), "samples")
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1), "samples")
     assert (other.noise_floor, other.floor_source) == (0.001, "declared")
 
 
-def test_the_mean_and_the_last_value_predict_what_they_do():
-    one = followed(7.0 + WAVE, 0.1 * randn(N, 1))[0]
-    assert one.rmse_of_mean == pytest.approx(float(WAVE.std()), rel=0.02)
-    assert one.rmse_of_last_value == pytest.approx(float(WAVE.diff(dim=0).square().mean().sqrt()), rel=0.02)
+def test_residuals_of_trivial_predictions():
+    fit = followed(7.0 + WAVE, 0.1 * randn(N, 1))[0]
+    assert fit.rmse_of_mean == pytest.approx(float(WAVE.std()), rel=0.02)
+    assert fit.rmse_of_last_value == pytest.approx(float(WAVE.diff(dim=0).square().mean().sqrt()), rel=0.02)
 
 
 @pytest.mark.parametrize("lost", [None, torch.full((N, 1), torch.nan).double()])
-def test_a_run_that_is_lost_explains_nothing(lost):
-    one = followed(WAVE + 0.02 * randn(N, 1), lost)[0]
-    assert one.explained == 0.0
-    assert one.residual == one.variation == pytest.approx(0.5**0.5, rel=0.02)
-    # the recording's own samples are left to estimate its noise by
-    assert one.noise_floor == pytest.approx(0.02, rel=0.1)
+def test_a_diverging_simulation_explains_nothing(lost):
+    fit = followed(WAVE + 0.02 * randn(N, 1), lost)[0]
+    assert fit.explained == 0.0
+    assert fit.residual == fit.variation == pytest.approx(0.5**0.5, rel=0.02)
+    # the noise is estimated from the recording itself
+    assert fit.noise_floor == pytest.approx(0.02, rel=0.1)
 
 
-def test_an_output_that_never_moves_is_not_explained():
-    one = followed(torch.full((N, 1), 3.0).double(), 0.1 * randn(N, 1))[0]
-    assert (one.variation, one.explained) == (0.0, 0.0)
+def test_a_constant_output_is_not_explained():
+    fit = followed(torch.full((N, 1), 3.0).double(), 0.1 * randn(N, 1))[0]
+    assert (fit.variation, fit.explained) == (0.0, 0.0)
 
 
-def test_of_a_length_varies_what_scattered_readings_would_leave():
+def test_the_variation_of_a_length_is_that_of_isotropic_readings():
     scattered = 30.0 * randn(N, 3)
     left = torch.linalg.vector_norm(scattered, dim=-1, keepdim=True)
-    one = followed(scattered, left - left.mean(), channels=("norm",), unit="µT")[0]
-    assert one.output == "norm"
-    assert one.variation == pytest.approx(float(left.std()), rel=0.03)
-    assert one.explained == pytest.approx(0.0, abs=0.08)
+    fit = followed(scattered, left - left.mean(), channels=("norm",), unit="µT")[0]
+    assert fit.output == "norm"
+    assert fit.variation == pytest.approx(float(left.std()), rel=0.03)
+    assert fit.explained == pytest.approx(0.0, abs=0.08)
     turning = torch.cat([TIME.sin().unsqueeze(-1), TIME.cos().unsqueeze(-1), 0.0 * WAVE], -1) * 50.0
     assert followed(turning, 0.5 * randn(N, 1), channels=("norm",), unit="µT")[0].explained > 0.99
 
 
-def test_a_simulation_without_a_recording_of_its_outputs_is_told_nothing_of():
+def test_without_recorded_outputs_there_is_no_goodness_of_fit():
     assert goodness_of_fit(SimpleNamespace(channels=("gap",), unit="", ports={}), randn(N, 1), {}, None) == ()
     assert followed(randn(N, 3), randn(N, 2), channels=("a", "b")) == ()
 
 
-def test_an_output_of_unknown_share_is_missed():
+def test_an_output_of_unknown_share_is_a_poor_fit():
     known = make_follows(explained=0.95)
     assert poor_fits((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
     assert poor_fits((known,), 0.95) == ()
 
 
-def test_a_floor_is_never_below_the_quantum_of_the_numbers_of_the_file():
+def test_the_floor_is_at_least_the_quantisation():
     rounded = ((20.0 + 5.0 * WAVE + 0.001 * randn(N, 1)) * 10.0).round() / 10.0
-    one = followed(rounded, 0.3 * WAVE, floor=[0.002])[0]
-    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1 / 12.0**0.5), "quantisation")
+    fit = followed(rounded, 0.3 * WAVE, floor=[0.002])[0]
+    assert (fit.noise_floor, fit.floor_source) == (pytest.approx(0.1 / 12.0**0.5), "quantisation")
 
 
-def test_a_floor_that_the_sampling_cannot_show_is_unknown():
+def test_a_floor_below_the_resolution_of_the_sampling_is_unknown():
     assert math.isnan(followed(WAVE, 0.3 * WAVE, floor=[1e-6])[0].noise_floor)
     assert followed(WAVE, 0.3 * WAVE, {"angle": 1e-6}, floor=[1e-6])[0].noise_floor == 1e-6
 
 
-def test_sizes_pool_each_by_its_own_variation_and_worse_than_the_mean_is_nothing():
+def test_pooled_shares_count_negative_shares_as_zero():
     known = (make_follows(explained=0.8), make_follows(explained=0.4), make_follows(explained=-3.0))
     assert pooled(known) == pytest.approx(0.4)
     assert pooled(()) == 0.0
@@ -174,7 +174,7 @@ def smooth(count, seed):
 
 
 def turning_sensor(*, yaw=False, field=None):
-    """A recorded attitude, and a field of 50 µT that it turns; or another field."""
+    """A recorded attitude, and a rotated field of 50 µT; or another field."""
     attitude = smooth(4, 1)
     if yaw:
         turns = TIME[:600]
@@ -193,23 +193,25 @@ def verdict_of(simulation, columns):
     return diagnose(simulation, Recording(columns), effects=(), surrogates=19)
 
 
-def test_a_field_that_has_nothing_to_do_with_the_attitude_is_not_followed():
+def test_a_field_unrelated_to_the_attitude_is_unfit():
     columns, attitude = turning_sensor(field=20.0 * smooth(3, 5))
     result = verdict_of(Magnetometer(), columns | attitude)
     assert pooled(result.environment.goodness_of_fit) < 0.35
     assert result.verdict == "unfit"
 
 
-def test_a_sensor_that_hardly_tilts_follows_in_all_axes():
+def test_a_sensor_that_hardly_tilts_has_a_good_fit_in_all_axes():
     columns, attitude = turning_sensor(yaw=True)
     result = verdict_of(Magnetometer(), columns | attitude)
-    assert {one.variation for one in result.environment.goodness_of_fit} == {result.environment.goodness_of_fit[0].variation}
-    assert all(one.explained > 0.99 for one in result.environment.goodness_of_fit)
+    assert {fit.variation for fit in result.environment.goodness_of_fit} == {
+        result.environment.goodness_of_fit[0].variation
+    }
+    assert all(fit.explained > 0.99 for fit in result.environment.goodness_of_fit)
     assert result.verdict == "adequate"
 
 
 @pytest.mark.parametrize(("useful", "said"), [(True, "adequate"), (False, "unfit")])
-def test_a_vector_without_states_is_followed_or_not(useful, said):
+def test_the_verdict_of_a_vector_without_states(useful, said):
     class Vector(Static):
         inputs, outputs, parameters = ("a",), ("x", "y", "z"), {"k": 1.0}
 

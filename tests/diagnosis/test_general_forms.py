@@ -1,4 +1,4 @@
-"""Forms that have named physics as special cases are named where these will not do, and only there."""
+"""General forms are named only if their named special cases do not fit."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Forward mode where constants stand beside what is differentiated: torch would load its compiler, a second's work."""
+"""Forward mode with constant inputs does not load torch's compiler, which takes a second."""
 
 import subprocess
 import sys

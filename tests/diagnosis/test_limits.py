@@ -1,4 +1,4 @@
-"""A diagnosis that is stopped says what is known and what was not done; a quick look draws no noise and says so."""
+"""Stopped diagnoses and quick looks: they report what is known and what was not done."""
 
 import json
 import math
@@ -24,7 +24,7 @@ NOT_FINISHED = "The search was not finished"
 
 
 class Steps:
-    """Stops a diagnosis at a step of it."""
+    """Stop a diagnosis at one of its deadline checks."""
 
     def __init__(self, monkeypatch, at=math.inf, reason="time limit"):
         self.count, self.at, self.reason = 0, at, reason
@@ -33,7 +33,7 @@ class Steps:
     def step(self):
         self.count += 1
         if self.count >= self.at and self.at < math.inf:
-            # what comes afterwards has a deadline of its own
+            # later stages have their own deadline
             self.at = math.inf
             raise Stopped(self.reason)
 
@@ -47,7 +47,7 @@ def pendulum():
 
 
 def checked(result):
-    """A stopped diagnosis whose files can be written, and say that it was."""
+    """Check that the files of a stopped diagnosis can be written and report the stop."""
     content = json.loads(diagnosis_to_json(result))
     assert content["search"]["stopped"]["reason"] == "time limit"
     assert "the other tests of evidence" in content["search"]["stopped"]["not_done"]
@@ -62,7 +62,7 @@ def checked(result):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("case", [magnetometer, pendulum])
-def test_whenever_it_is_stopped_what_is_known_is_a_diagnosis(monkeypatch, case):
+def test_a_diagnosis_stopped_anywhere_reports_what_is_known(monkeypatch, case):
     simulation, recording = case()
     all_steps = Steps(monkeypatch)
     assert diagnose(simulation, recording, **QUICK).stop is None
@@ -77,13 +77,13 @@ def test_whenever_it_is_stopped_what_is_known_is_a_diagnosis(monkeypatch, case):
         else:
             assert result.candidates
     assert len(seen) > 1
-    # at the end all but the tests of evidence is known
+    # at the end only the tests of evidence are missing
     assert result.findings
     assert "the search for effects" not in result.stop.not_done
 
 
 @pytest.mark.e2e
-def test_before_the_first_fit_nothing_is_known(monkeypatch):
+def test_a_stop_before_the_first_fit_raises(monkeypatch):
     simulation, recording = magnetometer()
     with pytest.raises(TimeoutError, match=r"^concealed: the time limit of 1e-06 s was over before .* Allow more time"):
         diagnose(simulation, recording, time_limit=1e-6)
@@ -94,7 +94,7 @@ def test_before_the_first_fit_nothing_is_known(monkeypatch):
 
 @pytest.mark.e2e
 @pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
-def test_copies_that_are_at_work_are_ended(monkeypatch):
+def test_worker_processes_end_with_a_stop(monkeypatch):
     simulation, recording = pendulum()
     steps = Steps(monkeypatch)
     allow_copies(1)
@@ -108,7 +108,7 @@ def test_copies_that_are_at_work_are_ended(monkeypatch):
 
 
 @pytest.mark.e2e
-def test_time_enough_changes_nothing():
+def test_a_long_time_limit_changes_nothing():
     simulation, recording = magnetometer()
     limited, plain = (diagnose(simulation, recording, **QUICK, time_limit=limit) for limit in (1e6, None))
     assert diagnosis_to_json(limited) == diagnosis_to_json(plain)
@@ -117,16 +117,16 @@ def test_time_enough_changes_nothing():
 @pytest.mark.e2e
 @pytest.mark.parametrize(
     ("case", "effect", "grade"),
-    # process noise that nobody drew, and a shape that nobody asked for, leave it unconfirmed
+    # without surrogates of process noise and a shape check, the finding stays unconfirmed
     [(magnetometer, "current_field", "left_out"), (pendulum, "quadratic_drag", "unconfirmed")],
 )
-def test_a_quick_look_finds_the_same_without_draws_and_says_so(monkeypatch, case, effect, grade):
-    def none(*_, **__):
+def test_a_quick_look_finds_the_same_without_surrogates(monkeypatch, case, effect, grade):
+    def refuse(*_, **__):
         raise AssertionError("noise was drawn")
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.run.judged", none)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.screening.judged", none)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood._drawn", none)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.run.surrogate_p_value", refuse)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.screening.surrogate_p_value", refuse)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood._drawn", refuse)
     result = diagnose(*case(), quick=True)
     (finding,) = result.findings
     assert (finding.effect, finding.grade, finding.p_value) == (effect, grade, None)
@@ -146,38 +146,38 @@ def test_a_quick_look_at_noise_finds_nothing():
     assert (result.verdict, result.findings, result.p_value) == ("adequate", (), None)
 
 
-def test_the_price_grows_with_numbers_samples_and_candidates():
+def test_the_penalty_grows_with_numbers_samples_and_candidates():
     assert price(1, 100, 1) == pytest.approx(0.5 * math.log(100))
     assert price(2, 100, 10) == pytest.approx(math.log(100) + math.log(10))
     assert pays(price(2, 100, 10) + 1e-9, 2, 100, 10)
     assert not pays(price(2, 100, 10), 2, 100, 10)
 
 
-def test_both_are_said_the_stop_first():
-    told = notices(Stop("interrupt", 12.3, ("the search for effects", "the other tests")), quick=True)
-    assert told[0] == (
+def test_the_stop_comes_before_the_quick_look():
+    sentences = notices(Stop("interrupt", 12.3, ("the search for effects", "the other tests")), quick=True)
+    assert sentences[0] == (
         "Stopped by an interrupt after 12 s: the search was not finished; not done: the search for effects; the other "
         "tests."
     )
-    assert told[1].startswith("Quick look")
+    assert sentences[1].startswith("Quick look")
     assert notices(None, quick=False) == ()
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, math.nan, math.inf])
-def test_a_time_limit_is_above_0(limit):
-    with pytest.raises(ValueError, match=r"`time_limit` to be .*; None is for no limit"):
+def test_a_time_limit_must_be_positive(limit):
+    with pytest.raises(ValueError, match=r"`time_limit` to be .*None for no limit"):
         diagnose(*magnetometer(), time_limit=limit)
 
 
 @pytest.mark.parametrize(("name", "bad"), [("time_limit", "60"), ("time_limit", True), ("quick", 1), ("quick", "yes")])
-def test_neither_is_of_another_kind(name, bad):
+def test_limits_of_another_type_raise(name, bad):
     with pytest.raises(TypeError, match=f"`{name}`"):
         diagnose(*magnetometer(), **{name: bad})
 
 
 @pytest.mark.e2e
-def test_what_a_stage_is_made_of_is_counted():
-    class Told:
+def test_progress_counts_the_items_of_a_stage():
+    class Progress:
         def __init__(self):
             self.stages, self.things = [], []
 
@@ -188,9 +188,9 @@ def test_what_a_stage_is_made_of_is_counted():
             assert 0 <= done <= total
             self.things.append(thing)
 
-    told = Told()
-    diagnose(*pendulum(), **QUICK, progress=told)
-    assert told.stages[:2] == ["reading the recording", "fitting the simulation alone"]
-    assert {"fit of a leading candidate", "part held out", "test of evidence"} <= set(told.things) or {
+    progress = Progress()
+    diagnose(*pendulum(), **QUICK, progress=progress)
+    assert progress.stages[:2] == ["reading the recording", "fitting the simulation alone"]
+    assert {"fit of a leading candidate", "part held out", "test of evidence"} <= set(progress.things) or {
         "fit of a candidate", "part held out", "test of evidence",
-    } <= set(told.things)  # fmt: skip
+    } <= set(progress.things)  # fmt: skip

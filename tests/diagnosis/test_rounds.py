@@ -1,4 +1,4 @@
-"""When a finding counts: the draws of noise have judged the first one, unseen blocks have to confirm what follows."""
+"""When a candidate counts: surrogates test the first finding, held-out blocks have to confirm further findings."""
 
 import importlib
 from types import SimpleNamespace
@@ -31,17 +31,17 @@ def located(beyond, with_noise=False):
 @pytest.mark.parametrize(
     ("first", "mean", "spread", "beyond", "counts"),
     [
-        (True, 0.01, 1.0, 0.0, True),  # leans its way
+        (True, 0.01, 1.0, 0.0, True),  # positive gain
         (True, -0.01, 1.0, 0.0, False),
-        (True, -0.01, 1.0, 100.0, True),  # plain beyond all draws
-        (True, -0.5, 1.0, 100.0, False),  # plain, and clearly worse on unseen blocks
-        (False, 0.01, 1.0, 10.0, False),  # leans, and is not confirmed
-        (False, 0.01, 1.0, 100.0, True),  # leans, and is plain
+        (True, -0.01, 1.0, 100.0, True),  # clearly beyond all surrogates
+        (True, -0.5, 1.0, 100.0, False),  # clearly beyond, but clearly worse on held-out blocks
+        (False, 0.01, 1.0, 10.0, False),  # positive gain, not confirmed
+        (False, 0.01, 1.0, 100.0, True),  # positive gain, clearly beyond
         (False, 0.5, 1.0, 0.0, True),
         (False, -0.5, 1.0, 100.0, False),
     ],
 )
-def test_a_finding_counts(first, mean, spread, beyond, counts):
+def test_when_a_candidate_counts(first, mean, spread, beyond, counts):
     assert (
         holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, ConfirmationSettings(), first=first)
         is counts
@@ -49,13 +49,13 @@ def test_a_finding_counts(first, mean, spread, beyond, counts):
 
 
 @pytest.mark.parametrize(("mean", "counts"), [(0.01, True), (-0.01, True), (-0.5, False)])
-def test_blocks_only_veto_where_noise_and_physics_were_chosen_together(mean, counts):
-    one = located(0.0, with_noise=True)
-    assert holds(one, NOTHING, evidence(mean, 1.0), BLOCKS, 0, ConfirmationSettings(), first=True) is counts
+def test_blocks_only_reject_if_noise_and_physics_were_selected_together(mean, counts):
+    candidate = located(0.0, with_noise=True)
+    assert holds(candidate, NOTHING, evidence(mean, 1.0), BLOCKS, 0, ConfirmationSettings(), first=True) is counts
 
 
 def walks(step):
-    """Evidence a little against it, and a residual that wanders, with a fast course and without."""
+    """Evidence with a small loss, and residuals with a random walk, with and without a fast course."""
     draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     drift = draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]
     course = step * torch.sin(torch.arange(N, dtype=torch.float64))
@@ -64,20 +64,20 @@ def walks(step):
     return before, SimpleNamespace(log_likelihood=below, residual=drift.unsqueeze(-1))
 
 
-def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone():
+def test_a_clear_gain_of_innovations_counts_under_drift():
     before, after = walks(0.5)
     assert innovation_gain(before.residual, after.residual) > 50.0
     assert holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
     assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=False)
 
 
-def test_what_is_worth_less_than_its_parameters_does_not():
+def test_a_gain_below_the_penalty_does_not_count():
     before, after = walks(0.05)
     assert innovation_gain(before.residual, after.residual) < 10.0
     assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
 
 
-def test_the_gain_of_innovations_is_that_of_least_squares_in_white_noise():
+def test_the_innovation_gain_in_white_noise_equals_least_squares():
     draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     course = 0.2 * torch.sin(torch.arange(N, dtype=torch.float64)).unsqueeze(-1)
     before, after = SimpleNamespace(residual=draws + course), SimpleNamespace(residual=draws)

@@ -1,4 +1,4 @@
-"""The numbers that decide: each has a word, reaches what it decides, and is refused where it makes no sense."""
+"""Settings: each number is documented, used, and checked."""
 
 import ast
 import importlib
@@ -35,43 +35,45 @@ holds = importlib.import_module("mkc_torch.diagnosis.stepwise")._holds
 
 
 def is_number(node):
-    """Whether an expression is a number, or numbers in a row, written out."""
+    """Whether an expression is a literal number, or a sequence of literal numbers."""
     if isinstance(node, ast.Constant):
         return isinstance(node.value, (int, float)) and not isinstance(node.value, bool)
     if isinstance(node, (ast.Tuple, ast.List)):
-        return bool(node.elts) and all(is_number(one) for one in node.elts)
+        return bool(node.elts) and all(is_number(element) for element in node.elts)
     if isinstance(node, ast.BinOp):
         return is_number(node.left) and is_number(node.right)
     if isinstance(node, ast.Call):
-        return ast.unparse(node.func).startswith("math.") and all(is_number(one) for one in node.args)
+        return ast.unparse(node.func).startswith("math.") and all(is_number(argument) for argument in node.args)
     return isinstance(node, ast.UnaryOp) and is_number(node.operand)
 
 
-def wordless(source):
-    """Assignments of numbers at the top of a module that neither a string nor a comment explains."""
+def undocumented(source):
+    """Yield module-level assignments of numbers without a docstring or comment."""
     lines, body = source.splitlines(), ast.parse(source).body
     for node, after in zip(body, [*body[1:], None], strict=True):
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None or not is_number(node.value):
             continue
-        told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
         noted = "#" in lines[node.lineno - 1] or lines[max(node.lineno - 2, 0)].startswith("#")
-        if not told and not noted:
+        if not documented and not noted:
             yield ast.unparse(node)
 
 
-def test_every_number_has_a_word():
-    assert {path.name: found for path in SOURCES if (found := list(wordless(path.read_text(encoding="utf-8"))))} == {}
+def test_every_number_is_documented():
+    assert {
+        path.name: found for path in SOURCES if (found := list(undocumented(path.read_text(encoding="utf-8"))))
+    } == {}
 
 
-def test_a_number_without_a_word_is_found():
+def test_an_undocumented_number_is_found():
     source = 'A = 1.0\n"""Said."""\n\n# said\nB = -2\nC, D = 3, 4\nE = 2.0 * math.log(3.0)\nF = 5  # said\nG = "text"\n'
-    assert list(wordless(source)) == ["C, D = (3, 4)", "E = 2.0 * math.log(3.0)"]
+    assert list(undocumented(source)) == ["C, D = (3, 4)", "E = 2.0 * math.log(3.0)"]
 
 
 @pytest.mark.parametrize("stage", [Settings, *STAGES])
 def test_every_setting_is_documented(stage):
-    told = re.findall(r"^    (\w+): ", inspect.getdoc(stage).partition("Attributes:")[2], re.MULTILINE)
-    assert told == [field.name for field in fields(stage)]
+    documented = re.findall(r"^    (\w+): ", inspect.getdoc(stage).partition("Attributes:")[2], re.MULTILINE)
+    assert documented == [field.name for field in fields(stage)]
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -82,7 +84,7 @@ def test_every_setting_is_used(stage):
     assert {field.name for field in fields(stage)} <= used
 
 
-def test_settings_are_equal_by_value_and_stay_as_they_are():
+def test_settings_are_immutable_and_compare_by_value():
     changed = replace(Settings(), naming=NamingSettings(separable=8.0))
     assert Settings() == Settings()
     assert hash(Settings()) == hash(Settings())
@@ -103,10 +105,10 @@ def test_settings_are_equal_by_value_and_stay_as_they_are():
         (lambda: ConfirmationSettings(folds=2), ValueError, "`folds`.*at least 3 but got 2; 5 are usual"),
         (lambda: ConfirmationSettings(unrecorded=0.0), ValueError, "`unrecorded`.*got 0.0; 0.1 is usual"),
         (lambda: NoiseSettings(plateaus=((0.0, 1.0),)), ValueError, "`plateaus`.*got 0.0; .* is usual"),
-        (lambda: Settings(noise=NamingSettings()), TypeError, "`noise` to be NoiseSettings.*; pass one, NoiseSett"),
+        (lambda: Settings(noise=NamingSettings()), TypeError, "`noise` to be NoiseSettings.*pass NoiseSett"),
     ],
 )
-def test_numbers_that_make_no_sense_are_refused(make, error, sentence):
+def test_invalid_numbers_raise(make, error, sentence):
     with pytest.raises(error, match=sentence):
         make()
 
@@ -119,7 +121,7 @@ EFFECTS = [effect for effect in CATALOGUE if effect.id in ("current_field", "dri
 
 
 def diagnosis(settings):
-    """Of a sensor that follows a column of unknown role, along with which a known driver goes."""
+    """Diagnose a sensor that depends on a column of unknown role, which correlates with a known driver."""
     recording = tumbling(N, noise=0.3, sensor=np.outer(CAUSE, [0.9, -0.8, 0.9]), current=CURRENT, load=CAUSE)
     return diagnose(Magnetometer("norm"), recording, effects=EFFECTS, surrogates=19, max_findings=1, settings=settings)
 
@@ -130,26 +132,26 @@ def usual():
 
 
 @pytest.mark.parametrize("other", ["strict", None, Settings, NamingSettings(), {"separable": 8.0}])
-def test_what_is_no_settings_is_refused(other):
-    with pytest.raises(TypeError, match=r"`settings` to be Settings but got .*; make one, Settings\("):
+def test_other_types_than_settings_raise(other):
+    with pytest.raises(TypeError, match=r"`settings` to be Settings but got .*Settings\("):
         diagnosis(other)
 
 
 @pytest.mark.e2e
-def test_the_known_driver_is_named_and_told_from_the_column(usual):
+def test_the_known_driver_is_named_and_separable_from_the_column(usual):
     (finding,) = usual.findings
     (rival,) = finding.alternatives
     assert (finding.effect, rival.effect, rival.separable) == ("current_field", "driver_offset", True)
 
 
 @pytest.mark.e2e
-def test_without_its_handicap_the_column_is_named():
+def test_without_its_penalty_the_column_is_named():
     (finding,) = diagnosis(Settings(naming=NamingSettings(roleless=0.0, follower=0.0))).findings
     assert finding.effect == "driver_offset"
 
 
 @pytest.mark.e2e
-def test_rivals_nearer_than_asked_for_are_inseparable(usual):
+def test_rivals_within_separable_are_inseparable(usual):
     far = 2.0 * usual.findings[0].alternatives[0].log_likelihood_gap
     (finding,) = diagnosis(Settings(naming=NamingSettings(separable=far))).findings
     assert (finding.effect, finding.alternatives[0].separable) == ("current_field", False)
@@ -157,32 +159,32 @@ def test_rivals_nearer_than_asked_for_are_inseparable(usual):
 
 
 @pytest.mark.e2e
-def test_a_warning_is_said_from_the_gain_that_is_asked_for(usual):
-    told = [warning for warning in usual.warnings if "Something smooth remains along load" in warning]
-    assert len(told) == 1
+def test_remaining_gain_is_the_limit_of_the_warning(usual):
+    warned = [warning for warning in usual.warnings if "Something smooth remains along load" in warning]
+    assert len(warned) == 1
     quiet = diagnosis(Settings(evidence=EvidenceSettings(remaining_gain=100.0)))
-    assert not set(told) & set(quiet.warnings)
+    assert not set(warned) & set(quiet.warnings)
     assert (usual.verdict, quiet.verdict) == ("unexplained", "explained")
 
 
 @pytest.mark.e2e
-def test_fewer_folds_are_other_evidence(usual):
+def test_folds_change_the_held_out_evidence(usual):
     held_out = diagnosis(Settings(confirmation=ConfirmationSettings(folds=3))).findings[0].held_out
     assert held_out.log_likelihood_gain != usual.findings[0].held_out.log_likelihood_gain
 
 
 @pytest.mark.e2e
-def test_residuals_are_rejected_below_the_weight_that_is_asked_for(usual):
+def test_rejected_below_changes_the_gains(usual):
     rejecting = diagnosis(Settings(noise=NoiseSettings(rejected_below=0.8)))
     assert rejecting.candidates[0].log_likelihood_gain != usual.candidates[0].log_likelihood_gain
 
 
-def test_a_recording_shorter_than_asked_for_is_refused():
+def test_a_recording_shorter_than_fewest_samples_raises():
     with pytest.raises(ValueError, match="400 samples are too few for a diagnosis; it needs 500 at least"):
         diagnosis(Settings(search=SearchSettings(fewest_samples=500)))
 
 
-def test_a_column_with_fewer_values_than_asked_for_drives_nothing():
+def test_a_column_below_fewest_finite_is_left_out():
     time, load = torch.from_numpy(TIME), torch.from_numpy(np.where(np.arange(N) % 5 == 0, np.nan, CAUSE))
     recording, taken = Recording({"time": time, "load": load}), frozenset({"time"})
     assert len(find_drivers(recording, taken, DriverSettings()).drivers) == 1
@@ -194,7 +196,7 @@ def test_a_column_with_fewer_values_than_asked_for_drives_nothing():
     ("first", "beyond", "changed"),
     [(True, 100.0, {"beyond_doubt": 200.0}), (False, 100.0, {"further": 200.0})],
 )
-def test_a_finding_that_is_less_plain_than_asked_for_does_not_count(first, beyond, changed):
+def test_beyond_doubt_and_further_are_limits(first, beyond, changed):
     after = evidence(-0.01 if first else 0.01, 1.0)
     assert holds(located(beyond), NOTHING, after, BLOCKS, 0, ConfirmationSettings(), first=first)
     assert not holds(located(beyond), NOTHING, after, BLOCKS, 0, ConfirmationSettings(**changed), first=first)

@@ -1,7 +1,7 @@
-"""What every effect promises, whatever its physics: the case that each of the catalogue, and a user's own, has to pass.
+"""The common test case of all effects of the catalogue, and of users' own effects.
 
-A new effect is asked all of it as soon as it is in the catalogue. One that bends with its amplitude, or whose numbers
-have no unit, is entered in a list here.
+A new effect of the catalogue is tested automatically. An effect that is not linear in its amplitude, or whose
+amplitudes have no unit, must be entered in a list here.
 """
 
 from dataclasses import replace
@@ -16,19 +16,19 @@ from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.protocol import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
-BENT = ("delay", "clock_drift", "backlash")
-"""Not linear in γ, on an output: it is a time or a gap."""
+NONLINEAR = ("delay", "clock_drift", "backlash")
+"""Effects on an output that are not linear in γ, a time or a gap."""
 
 
-def bends(effect):
-    return effect.id in BENT and effect.port != "input"
+def is_nonlinear(effect):
+    return effect.id in NONLINEAR and effect.port != "input"
 
 
 UNITLESS = ("share", "share_of_load", "gain_error", "rate")
-"""Quantities that are shares."""
+"""Names of quantities without a unit."""
 
-SAID_ALL_THE_SAME = {"constant_force": True, "heading_reset": False}
-"""Whether these say that they follow the signal: all on a rate do, and what passes a heading's port has no noise."""
+DECLARED_FOLLOWS_SIGNAL = {"constant_force": True, "heading_reset": False}
+"""Exceptions of ``follows_signal``: all effects on a rate have it; the signal of a heading has no noise."""
 
 
 def cases(effects):
@@ -39,17 +39,17 @@ def cases(effects):
                 yield pytest.param(effect, shape, context, id=f"{type(effect).__name__}-{effect.plot_axis}-{place}-{k}")
 
 
-def asked_of(cases):
-    """A class whose questions are each asked of all cases in one test, and that names the case that fails.
+def over_all_cases(cases):
+    """A decorator of a class: each of its tests runs over all cases and names the failing case.
 
     Args:
-        cases: a function that gives them, with their arguments and their name.
+        cases: a function that returns the cases, with their arguments and names.
     """
 
-    def in_turn(question):
+    def over_cases(check):
         def named(self, case):
             try:
-                question(self, *case.values)
+                check(self, *case.values)
             except AssertionError as error:
                 raise AssertionError(f"{case.id}: {error}") from error
 
@@ -61,7 +61,7 @@ def asked_of(cases):
 
     def decorated(cls):
         for name in [name for name in dir(cls) if name.startswith("test_")]:
-            setattr(cls, name, in_turn(getattr(cls, name)))
+            setattr(cls, name, over_cases(getattr(cls, name)))
         return cls
 
     return decorated
@@ -73,7 +73,7 @@ def random_gammas(count, size):
 
 
 class OfEveryEffect:
-    """Asked of an effect alone: give it the argument ``effect``."""
+    """Tests of an effect, with the argument ``effect``."""
 
     def test_it_is_an_effect_with_an_id_a_port_and_roles(self, effect):
         assert isinstance(effect, Effect)
@@ -82,7 +82,7 @@ class OfEveryEffect:
         assert isinstance(effect.roles, tuple)
         assert isinstance(effect.needs, tuple)
 
-    def test_users_are_told_what_it_is(self, effect):
+    def test_texts_for_the_user_are_sentences(self, effect):
         assert "=" in effect.equation
         for sentence in (effect.explanation, effect.advice):
             assert sentence.endswith(".")
@@ -90,25 +90,25 @@ class OfEveryEffect:
         assert len(effect.source) > 5
         assert effect.plausible > 0.0
 
-    def test_its_name_in_words_is_a_name(self, effect):
+    def test_display_name_is_in_words(self, effect):
         assert effect.display_name.strip() == effect.display_name != ""
         assert "_" not in effect.display_name
 
-    def test_what_another_recording_shows_is_a_clause(self, effect):
+    def test_recurrence_is_a_clause(self, effect):
         assert effect.recurrence == "" or (effect.recurrence[0].islower() and not effect.recurrence.endswith("."))
 
-    def test_its_bounds_hold_nothing(self, effect):
+    def test_bounds_contain_zero(self, effect):
         assert effect.lower < effect.upper
         assert effect.lower <= 0.0 <= effect.upper
         assert effect.one_sided == (effect.lower == 0.0)
 
-    def test_what_it_says_of_its_shapes_is_of_its_shapes(self, effect):
-        # of a recording of one second, shares of its length are times
+    def test_declarations_name_existing_shape_parameters(self, effect):
+        # with a length of 1 s, shares of the length are times
         shapes = effect.shapes(torch.linspace(0.0, 1.0, 100).double())
         assert shapes
         numbers = {name for shape in shapes for name in shape}
-        for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.form_parameters):
-            assert set(said) <= numbers
+        for declared in (effect.relative, effect.continuous, effect.fitted_shape, effect.form_parameters):
+            assert set(declared) <= numbers
         assert all(which in SignalSizes._fields for _, which in effect.relative.values())
         assert all(low < high for low, high in effect.continuous.values())
         for name, (low, high) in effect.fitted_shape.items():
@@ -117,7 +117,7 @@ class OfEveryEffect:
         assert not set(effect.shape_units) & set(effect.relative)
         assert all(effect.shape_units[name] == "s" for name in effect.continuous)
 
-    def test_a_simpler_form_is_the_same_physics(self, effect):
+    def test_simpler_form_equals_equal_amplitudes(self, effect):
         simpler = effect.simpler
         if simpler is None:
             assert type(effect).simpler is Effect.simpler
@@ -126,46 +126,46 @@ class OfEveryEffect:
         for context in contexts_of(effect):
             assert simpler.shapes(context.time) == effect.shapes(context.time)
             for shape in effect.shapes(context.time):
-                sizes = [size_of(one, shape, context) for one in (simpler, effect)]
+                sizes = [size_of(form, shape, context) for form in (simpler, effect)]
                 gamma = random_gammas(1, sizes[0])[0]
                 each = gamma.repeat_interleave(sizes[1] // sizes[0])
-                alike = [one.change(g, shape, context) for one, g in ((simpler, gamma), (effect, each))]
+                alike = [form.change(g, shape, context) for form, g in ((simpler, gamma), (effect, each))]
                 torch.testing.assert_close(*alike)
 
 
 class OfEveryShape:
-    """Asked of an effect with a shape in a context: give it the arguments ``effect``, ``shape`` and ``context``."""
+    """Tests of an effect with a shape in a context, with the arguments ``effect``, ``shape`` and ``context``."""
 
-    def test_nothing_changes_without_an_amplitude(self, effect, shape, context):
+    def test_zero_amplitude_changes_nothing(self, effect, shape, context):
         change = effect.change(random_gammas(1, size_of(effect, shape, context))[0] * 0.0, shape, context)
         assert change.shape == (len(context.time), len(context.channels))
         assert change.dtype == torch.float64
-        assert float(change.abs().max()) <= (1e-12 if bends(effect) else 0.0)
+        assert float(change.abs().max()) <= (1e-12 if is_nonlinear(effect) else 0.0)
 
-    def test_the_change_is_linear_in_the_amplitude(self, effect, shape, context):
+    def test_change_is_linear_in_the_amplitude(self, effect, shape, context):
         a, b = random_gammas(2, size_of(effect, shape, context))
         together = effect.change(2.0 * a - 3.0 * b, shape, context)
         parts = 2.0 * effect.change(a, shape, context) - 3.0 * effect.change(b, shape, context)
         largest = float(parts.abs().max())
         assert largest > 1e-4
-        assert (float((together - parts).abs().max()) > 1e-6 * largest) == bends(effect)
-        if not bends(effect):
+        assert (float((together - parts).abs().max()) > 1e-6 * largest) == is_nonlinear(effect)
+        if not is_nonlinear(effect):
             torch.testing.assert_close(together, parts, rtol=1e-9, atol=1e-9 * largest)
 
-    def test_each_amplitude_has_a_tangent_of_its_own(self, effect, shape, context):
+    def test_tangents_of_amplitudes_are_independent(self, effect, shape, context):
         size = size_of(effect, shape, context)
         gamma = torch.full((size,), 0.0123, dtype=torch.float64)
         tangent = torch.func.jacfwd(lambda g: effect.change(g, shape, context))(gamma)
         assert tangent.shape == (len(context.time), len(context.channels), size)
-        h = 1e-6 if effect.id in BENT else 1e-3
+        h = 1e-6 if effect.id in NONLINEAR else 1e-3
         steps = h * torch.eye(size, dtype=torch.float64)
         near = [effect.change(gamma + s, shape, context) - effect.change(gamma - s, shape, context) for s in steps]
         near = torch.stack(near, -1) / (2.0 * h)
         torch.testing.assert_close(tangent, near, rtol=1e-5, atol=1e-6 * float(near.abs().max()))
         assert int(torch.linalg.matrix_rank(tangent.flatten(0, 1))) == size
 
-    def test_its_slope_along_the_signal_is_finite_everywhere(self, effect, shape, context):
-        """Trajectories are found by Newton's method: standstill and rest must not break it."""
+    def test_derivative_by_the_signal_is_finite(self, effect, shape, context):
+        """Trajectories are solved by Newton's method, also at standstill."""
         gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
         for values in (context.signal, torch.zeros_like(context.signal), 1e4 * context.signal):
             slope = torch.func.jvp(
@@ -173,13 +173,13 @@ class OfEveryShape:
             )[1]
             assert bool(slope.isfinite().all())
 
-    def test_an_effect_of_the_signal_says_so(self, effect, shape, context):
+    def test_follows_signal_is_declared(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
         doubled = replace(context, signal=2.0 * context.signal)
         follows = not torch.equal(effect.change(gamma, shape, context), effect.change(gamma, shape, doubled))
-        assert effect.follows_signal == SAID_ALL_THE_SAME.get(effect.id, follows)
+        assert effect.follows_signal == DECLARED_FOLLOWS_SIGNAL.get(effect.id, follows)
 
-    def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(self, effect, shape, context):
+    def test_derivative_by_fitted_shape_parameters(self, effect, shape, context):
         gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
         assert set(effect.fitted_shape) <= set(shape)
         for name in effect.fitted_shape:
@@ -195,7 +195,7 @@ class OfEveryShape:
             assert largest > 0.0
             torch.testing.assert_close(slope, numerical, rtol=1e-4, atol=1e-4 * largest)
 
-    def test_its_amplitudes_have_names_and_units(self, effect, shape, context):
+    def test_amplitudes_have_names_and_units(self, effect, shape, context):
         quantities = effect.quantities(shape, context)
         assert len({quantity.name for quantity in quantities}) == len(quantities)
         for quantity in quantities:
@@ -204,7 +204,7 @@ class OfEveryShape:
             assert (quantity.unit == "") == (quantity.name in UNITLESS)
             assert len(effect.components(quantity.name, shape, context)) in (0, quantity.size)
 
-    def test_its_numbers_have_their_units(self, effect, shape, context):
+    def test_shape_parameters_have_units(self, effect, shape, context):
         assert effect.unit_of_shape("none of its numbers", context) == ""
         for name in shape:
             unit = effect.unit_of_shape(name, context)
@@ -215,26 +215,26 @@ class OfEveryShape:
                 assert unit == effect.shape_units.get(name, unit)
             assert unit == "s" or name not in effect.continuous
 
-    def test_its_equation_is_of_the_form_that_the_shape_chose(self, effect, shape, context):
-        told = effect.equation_of(shape, context)
-        assert told.startswith(effect.equation.partition("=")[0])
-        assert not any(word in told for word in ("terms", "degree", "radius", "power", "order", "width =", "nan"))
+    def test_equation_has_the_form_of_the_shape(self, effect, shape, context):
+        equation = effect.equation_of(shape, context)
+        assert equation.startswith(effect.equation.partition("=")[0])
+        assert not any(word in equation for word in ("terms", "degree", "radius", "power", "order", "width =", "nan"))
         assert all(effect.reports(name) == (name not in effect.form_parameters) for name in shape)
 
-    def test_its_moments_ascend_within_the_recording(self, effect, shape, context):  # noqa: ARG002
+    def test_moments_ascend_within_the_recording(self, effect, shape, context):  # noqa: ARG002
         moments = effect.moments(context)
         assert list(moments) == sorted(set(moments))
-        assert all(float(context.time[0]) <= one <= float(context.time[-1]) for one in moments)
+        assert all(float(context.time[0]) <= moment <= float(context.time[-1]) for moment in moments)
         assert bool(moments) == (type(effect).moments is not Effect.moments)
 
-    def test_its_shape_is_anchored_once(self, effect, shape, context):
-        anchored = effect.bind(shape, context)
-        assert effect.bind(anchored, context) == anchored
-        assert anchored.items() >= shape.items()
+    def test_bind_is_idempotent(self, effect, shape, context):
+        bound = effect.bind(shape, context)
+        assert effect.bind(bound, context) == bound
+        assert bound.items() >= shape.items()
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
-        torch.testing.assert_close(effect.change(gamma, anchored, context), effect.change(gamma, shape, context))
+        torch.testing.assert_close(effect.change(gamma, bound, context), effect.change(gamma, shape, context))
 
-    def test_a_basis_or_a_course_is_the_change(self, effect, shape, context):
+    def test_basis_and_waveform_equal_the_change(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
         change = effect.change(gamma, shape, context)
         if effect.has_basis:
@@ -245,7 +245,7 @@ class OfEveryShape:
         if effect.has_waveform:
             assert torch.equal(gained(effect.waveform(shape, context), gamma), change)
 
-    def test_what_lasts_is_nothing_without_an_amplitude(self, effect, shape, context):
+    def test_lasting_change_is_zero_without_an_amplitude(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
         if not effect.persistent_change:
             with pytest.raises(NotImplementedError, match="`lasting`"):
@@ -256,24 +256,24 @@ class OfEveryShape:
         assert torch.equal(left, effect.change(gamma, shape, context)[-1].expand_as(left))
         assert not bool(effect.lasting(0.0 * gamma, context).any())
 
-    def test_its_line_of_python_is_the_change(self, effect, shape, context):
+    def test_code_equals_the_change(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0].abs()
         if not effect.has_code:
             with pytest.raises(NotImplementedError, match="`code`"):
                 effect.code(gamma.tolist(), shape, {})
             return
-        if context.units:  # what a column drives is not written out
+        if context.units:  # effects with a driver have no code
             assert effect.driver_optional
             return
         carried = context.carries or context.channels
         inner = ("memory", "memory_2")[: len(memory_at(effect.port, "speed"))]
-        if inner:  # internal states are solved for
+        if inner:  # internal states are solved jointly
             more = [(k * context.time).cos() for k, _ in enumerate(inner, start=1)]
             context = replace(context, signal=torch.cat([context.signal, torch.stack(more, -1)], -1))
         x = SimpleNamespace(**dict(zip((*carried, *inner), context.signal.unbind(-1), strict=True)))
-        names = {part: f"x.{name}" for part, name in context.parts.items()} | {one: f"x.{one}" for one in inner}
+        names = {part: f"x.{name}" for part, name in context.parts.items()} | {name: f"x.{name}" for name in inner}
         names["zero"] = "273.15" if context.unit_of("own") == "°C" else "0.0"
-        if not effect.needs and effect.port == "output":  # it is of all outputs
+        if not effect.needs and effect.port == "output":  # it acts on all outputs
             names = {name: f"x.{name}" for name in carried}
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}

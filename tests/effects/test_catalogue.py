@@ -29,16 +29,16 @@ def test_quantities_have_their_names_and_units(effect):
         assert [tuple(q) for q in effect.quantities(shape, context)] == QUANTITIES[effect.id]
 
 
-def test_the_cubic_s_are_of_two_forms():
+def test_cubic_nonlinearity_has_two_forms():
     effect = next(e for e in SENSOR if e.id == "cubic_nonlinearity")
     context = make_context(effect)
-    told = [[tuple(q) for q in effect.quantities(shape, context)] for shape in effect.shapes(context.time)]
+    found = [[tuple(q) for q in effect.quantities(shape, context)] for shape in effect.shapes(context.time)]
     cubic, quadratic = ("coefficient", 3, "1/µT²"), ("quadratic_coefficient", 3, "1/µT")
-    assert told == [[cubic], [cubic, quadratic]]
+    assert found == [[cubic], [cubic, quadratic]]
 
 
-def test_a_magnet_that_the_element_feels_is_a_square_beside_the_cube():
-    """``α (B + h)³`` but for what an offset and a gain take over."""
+def test_a_magnet_at_the_element_adds_a_square_to_the_cube():
+    """``α (B + h)³`` without the parts that offset and gain absorb."""
     effect = next(e for e in SENSOR if e.id == "cubic_nonlinearity")
     context = make_context(effect)
     alpha, magnet = 1e-6 * torch.tensor([3.0, -2.0, 5.0]).double(), torch.tensor([20.0, -35.0, 8.0]).double()
@@ -54,7 +54,7 @@ def test_units_of_drivers_without_a_unit():
 
 
 @pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.id)
-def test_plausible_sizes_are_those_of_the_first_edition(effect):
+def test_plausible_sizes_are_unchanged(effect):
     known = {
         "hard_iron_step": 200.0, "offset_drift": 50.0, "temperature_offset": 5.0, "current_field": 20.0,
         "cubic_nonlinearity": 4e-5, "driver_offset": math.inf, "unknown": math.inf,

@@ -1,4 +1,4 @@
-"""The physics of each effect, against formulas written anew."""
+"""The physics of each sensor effect, against independent formulas."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def driven(values, unit):
     return Context(time, values.unsqueeze(-1), (unit,), values.new_zeros(len(values), 3), "µT", ("x", "y", "z"))
 
 
-def test_a_step_is_there_from_its_onset_on():
+def test_a_step_is_constant_from_its_onset_on():
     gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
     change = STEP.change(gamma, {"onset": 40.0}, timed())
     before = TIME < 40.0
@@ -37,7 +37,7 @@ def test_a_step_is_there_from_its_onset_on():
     assert after(torch.tensor([1.0, 2.0, 3.0]), 2.0).tolist() == [0.0, 1.0, 1.0]
 
 
-def test_onsets_are_searched_all_along_but_the_ends():
+def test_onsets_cover_the_recording_except_its_ends():
     onsets = np.array([shape["onset"] for shape in STEP.shapes(TIME)])
     np.testing.assert_allclose(np.diff(onsets), 0.9, rtol=1e-9)
     assert 7.0 + 0.01 * 90.0 < onsets[0] < 7.0 + 0.1 * 90.0
@@ -48,7 +48,7 @@ DRIFTS = DRIFT.shapes(TIME)
 
 
 @pytest.mark.parametrize("shape", DRIFTS, ids=str)
-def test_a_drift_runs_once_from_nothing_to_all(shape):
+def test_a_drift_is_monotonic_from_0_to_1(shape):
     course = DRIFT.waveform(shape, timed())
     assert float(course[0]) == pytest.approx(0.0, abs=1e-12)
     assert float(course[-1]) == pytest.approx(1.0, abs=1e-12)
@@ -56,7 +56,7 @@ def test_a_drift_runs_once_from_nothing_to_all(shape):
     assert bool((course.diff() > 0).float().mean() > 0.5)
 
 
-def test_drifts_are_those_of_their_formulas():
+def test_drifts_equal_their_formulas():
     t = TIME.numpy() - 7.0
     expected = {
         (): t / 90.0,
@@ -73,7 +73,7 @@ def test_drifts_are_those_of_their_formulas():
     np.testing.assert_allclose(np.corrcoef(middle, logistic)[0, 1], 1.0, rtol=1e-12)
 
 
-def test_drifts_of_every_kind_are_searched():
+def test_grid_has_drifts_of_every_kind():
     kinds = [tuple(sorted(shape)) for shape in DRIFTS]
     assert {k: kinds.count(k) for k in set(kinds)} == {
         (): 1, ("power",): 1, ("time_constant",): 4, ("middle", "width"): 6,
@@ -81,7 +81,7 @@ def test_drifts_of_every_kind_are_searched():
 
 
 @pytest.mark.parametrize("effect", [STEP, DRIFT], ids=lambda e: e.id)
-def test_what_lasts_is_the_offset_at_the_end(effect):
+def test_lasting_change_is_the_offset_at_the_end(effect):
     gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
     shape = effect.shapes(TIME)[-1]
     end = effect.change(gamma, shape, timed())[-1]
@@ -90,26 +90,26 @@ def test_what_lasts_is_the_offset_at_the_end(effect):
 
 
 @pytest.mark.parametrize(("effect", "unit"), [(CURRENT, "A"), (COLUMN, "V"), (TEMPERATURE, "°C")])
-def test_offsets_are_in_proportion_to_their_column(effect, unit):
+def test_offsets_are_proportional_to_their_column(effect, unit):
     context = driven([-2.0, 0.0, 3.0], unit)
     change = effect.change(torch.tensor([1.0, 0.0, -0.5], dtype=torch.float64), {}, context)
     assert change.tolist() == [[-2.0, 0.0, 1.0], [0.0, 0.0, 0.0], [3.0, 0.0, -1.5]]
 
 
-def test_a_temperature_can_be_lagged_and_bent():
+def test_temperature_offset_has_lag_and_curvature():
     context = driven([0.0, 10.0, 10.0, -5.0], "°C")
     shapes = TEMPERATURE.shapes(context.time)
     assert [dict(s) for s in shapes] == [{}, {"lag": 1.0}, {"lag": 5.0}, {"curvature": 0.02}, {"curvature": -0.02}]
-    bent = TEMPERATURE.waveform({"curvature": 0.02}, context)
-    np.testing.assert_allclose(bent, [0.0, 12.0, 12.0, -4.5])
-    a = np.exp(-0.1)  # of samples 0.1 s apart, between which the temperature goes straight
+    curved = TEMPERATURE.waveform({"curvature": 0.02}, context)
+    np.testing.assert_allclose(curved, [0.0, 12.0, 12.0, -4.5])
+    a = np.exp(-0.1)  # samples 0.1 s apart, linear in between
     first = 10.0 * (1.0 - (1.0 - a) / 0.1)
     second = a * first + 10.0 * (1.0 - a)
     third = a * second + 10.0 * ((1.0 - a) / 0.1 - a) - 5.0 * (1.0 - (1.0 - a) / 0.1)
     np.testing.assert_allclose(TEMPERATURE.waveform({"lag": 1.0}, context), [0.0, first, second, third])
 
 
-def test_the_cubic_bends_each_axis_by_its_own_field():
+def test_cubic_nonlinearity_acts_on_each_axis_separately():
     context = make_context(CUBIC)
     gamma = torch.tensor([1e-5, 0.0, -2e-5], dtype=torch.float64)
     B = context.signal.numpy()
@@ -117,7 +117,7 @@ def test_the_cubic_bends_each_axis_by_its_own_field():
     np.testing.assert_allclose(CUBIC.change(gamma, {}, context), expected, rtol=1e-12)
 
 
-def test_the_cubic_follows_the_unit_of_the_signal():
+def test_unit_of_cubic_nonlinearity_follows_the_signal():
     assert CUBIC.quantities({}, replace(make_context(CUBIC), signal_unit="counts"))[0].unit == "1/counts²"
 
 

@@ -1,4 +1,4 @@
-"""Every effect of the catalogue, the simpler forms of some, and one as a user writes it pass the same case."""
+"""All effects of the catalogue, their simpler forms, and users' effects pass the common test case."""
 
 import pytest
 import torch
@@ -20,13 +20,13 @@ from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from tests.effects.contexts import make_context
-from tests.effects.effect_case import OfEveryEffect, OfEveryShape, asked_of, cases
+from tests.effects.effect_case import OfEveryEffect, OfEveryShape, cases, over_all_cases
 
 SIMPLER = tuple(effect.simpler for effect in CATALOGUE if effect.simpler is not None)
 
 
 class SupplyOffset(GainEffect):
-    """As the README has it."""
+    """The example of the README."""
 
     id = "supply_offset"
     roles = ("voltage",)
@@ -41,13 +41,13 @@ class SupplyOffset(GainEffect):
 
 
 class Square(Effect):
-    """With the two methods that an effect has to have, and no more."""
+    """An effect with the two required methods only."""
 
     id = "squared_response"
     follows_signal = True
     equation = "δB = γ B²"
-    explanation = "The response bends."
-    advice = "Look for a magnet beside the element."
+    explanation = "The response is quadratic."
+    advice = "Look for a magnet near the element."
     source = "our bench"
 
     def quantities(self, shape, context):  # noqa: ARG002
@@ -60,38 +60,38 @@ class Square(Effect):
 ALL = (*CATALOGUE, SupplyOffset(), Square())
 
 
-@asked_of(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.plot_axis}") for effect in ALL])
+@over_all_cases(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.plot_axis}") for effect in ALL])
 class TestEveryEffect(OfEveryEffect):
     pass
 
 
-@asked_of(lambda: cases((*ALL, *SIMPLER)))
+@over_all_cases(lambda: cases((*ALL, *SIMPLER)))
 class TestEveryShape(OfEveryShape):
     pass
 
 
-COURSES = {f"{COURSE}{k}": 0.5 / k for k in (1, 3)}
+COEFFICIENTS = {f"{COURSE}{k}": 0.5 / k for k in (1, 3)}
 
 
-@pytest.mark.parametrize(("effect", "shape", "context"), [(Unrecorded(), COURSES, make_context(Unrecorded()))])
-class TestACourse(OfEveryShape):
-    """It has no shapes that could be tried, and is one all the same."""
+@pytest.mark.parametrize(("effect", "shape", "context"), [(Unrecorded(), COEFFICIENTS, make_context(Unrecorded()))])
+class TestUnrecorded(OfEveryShape):
+    """An effect without a grid of shapes passes the tests of a shape."""
 
-    def test_its_equation_is_of_the_form_that_the_shape_chose(self, effect, shape, context):
-        told = effect.equation_of(shape, context)
-        assert told.startswith(effect.equation)
-        assert told.endswith("2 numbers c_k in model.json")
+    def test_equation_has_the_form_of_the_shape(self, effect, shape, context):
+        equation = effect.equation_of(shape, context)
+        assert equation.startswith(effect.equation)
+        assert equation.endswith("2 numbers c_k in model.json")
         assert not any(effect.reports(name) for name in shape)
         assert effect.shapes(context.time) == ()
 
 
-def test_docstrings_say_what_effects_are():
+def test_docstrings_have_all_headings():
     for effect in CATALOGUE:
         for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
             assert heading in type(effect).__doc__, effect.id
 
 
-def test_ids_are_the_contract():
+def test_ids_are_unchanged():
     assert tuple(effect.id for effect in SENSOR) == (
         "hard_iron_step", "offset_drift", "temperature_offset", "current_field", "field_gradient", "field_gradient",
         "cubic_nonlinearity", "driver_offset", "unknown",
@@ -116,7 +116,7 @@ def test_ids_are_the_contract():
     assert len(set(named)) == len(named)
 
 
-def test_what_effects_can_do_beside():
+def test_optional_abilities_of_effects():
     assert {e.id for e in CATALOGUE if e.persistent_change} == {"hard_iron_step", "offset_drift"}
     assert {e.id for e in CATALOGUE if type(e).bind is not Effect.bind} == {"unknown"}
     assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
@@ -131,42 +131,42 @@ def test_what_effects_can_do_beside():
     assert {e.id for e in CATALOGUE if not e.has_waveform} & {"hard_iron_step", "linear_drag", "gain"} == set()
 
 
-def test_what_belongs_to_a_place_or_an_attitude_says_so():
+def test_effects_of_field_and_heading_are_location_specific():
     assert {e.id for e in CATALOGUE if e.location_specific} == {"field_gradient", "heading_reset"}
     assert {e.port for e in CATALOGUE if e.location_specific} == {"field", "heading"}
 
 
-def test_names_in_words_are_one_for_each_id():
-    words = {effect.id: {e.display_name for e in CATALOGUE if e.id == effect.id} for effect in CATALOGUE}
-    assert all(len(told) == 1 for told in words.values())
-    assert len({told for each in words.values() for told in each}) == len(words)
-    assert all({words_of(effect_id)} == told for effect_id, told in words.items())
+def test_each_id_has_a_single_display_name():
+    names = {effect.id: {e.display_name for e in CATALOGUE if e.id == effect.id} for effect in CATALOGUE}
+    assert all(len(known) == 1 for known in names.values())
+    assert len({name for known in names.values() for name in known}) == len(names)
+    assert all({words_of(effect_id)} == known for effect_id, known in names.items())
     assert words_of("bouc_wen_hysteresis") == "Bouc Wen hysteresis"
     assert words_of("driver_linear") == "linear dependence"
     assert words_of("temperature_offset") == "temperature offset"
     assert words_of("supply_offset") == SupplyOffset().display_name == "supply offset"
 
 
-def test_an_id_says_whether_it_is_a_curve():
+def test_is_curve_by_id():
     assert is_curve(Unrecorded.id)
     assert not is_curve("supply_offset")
     assert Unrecorded().is_curve
 
 
-def test_names_of_abilities_that_files_import_are_effects():
+def test_former_base_classes_are_aliases_of_effect():
     for name in ("Anchored", "Continuous", "Lasting", "Linear", "Nested", "Shaped", "Signal"):
         assert getattr(effects, f"{name}Effect") is Effect
 
 
-def test_an_effect_has_to_say_what_it_changes():
+def test_missing_methods_of_an_effect_are_named():
     class Empty(GainEffect):
         id = "empty"
 
-    with pytest.raises(NotImplementedError, match="the effect empty to have a method `waveform`; give it one"):
+    with pytest.raises(NotImplementedError, match=r"effect empty .* method `waveform`"):
         Empty().change(torch.ones(3, dtype=torch.float64), {}, make_context(Empty()))
 
-    class Silent(Effect):
-        id = "silent"
+    class WithoutMethods(Effect):
+        id = "without_methods"
 
     with pytest.raises(TypeError, match="change"):
-        Silent()
+        WithoutMethods()

@@ -1,4 +1,4 @@
-"""Words suit the kind of quantity that an effect acts on."""
+"""Names and texts of effects suit the kind of quantity."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.kinds import MOTION, kind_at, zero_of
 from mkc_torch.recording import Recording
-from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import findings as report
 from mkc_torch.simulation import Dynamics
 from tests.effects.contexts import dynamic_context
 
@@ -26,7 +26,7 @@ STORE = {"time_constant": 7560.0}
 def at_state(effect, unit, name="x"):
     """The context of an effect at the rate of a state in this unit."""
     context = dynamic_context(effect)
-    carries = tuple(name if one == "speed" else one for one in context.carries)
+    carries = tuple(name if carried == "speed" else carried for carried in context.carries)
     parts = {part: name if of == "speed" else of for part, of in context.parts.items() if part != "level"}
     units = {**context.part_units, "own": unit}
     return replace(context, carries=carries, channels=(name,), parts=parts, part_units=units)
@@ -41,7 +41,7 @@ def at_state(effect, unit, name="x"):
         ("m/s", "temp", "speed"), ("", "x", ""),
     ],
 )  # fmt: skip
-def test_units_tell_the_kind_and_names_where_there_are_none(unit, name, kind):
+def test_kind_is_from_the_unit_or_else_the_name(unit, name, kind):
     assert kind_of(unit, name) == kind
     assert kind_at(at_state(ConstantForce(), unit, name)) == kind
 
@@ -53,23 +53,23 @@ def test_a_length_without_a_speed_is_a_level():
 
 
 @pytest.mark.parametrize("kind", ["°C", "V", "A", "bar"])
-def test_what_does_not_move_has_no_speeds_and_loads(kind):
+def test_texts_of_other_kinds_have_no_mechanical_words(kind):
     at_all = [
         e for e in DYNAMICS if e.port in ("rate", "lagged rate") and {*e.needs} <= {"own", "temperature", "flowing"}
     ]
     assert len(at_all) > 5
     for effect in at_all:
         if "flowing" in effect.needs and kind == "°C":
-            continue  # no physics of a temperature
+            continue  # it has no meaning for a temperature
         context = at_state(effect, kind)
         shape = {**effect.shapes(context.time)[0], **dict.fromkeys(effect.relative, 1.0)}
-        for told in (effect.explained([0.4], shape, context), effect.advised([0.4], shape, context)):
-            assert not any(word in told.lower() for word in MECHANICAL), (effect.id, told)
-            assert told.endswith(".")
+        for text in (effect.explained([0.4], shape, context), effect.advised([0.4], shape, context)):
+            assert not any(word in text.lower() for word in MECHANICAL), (effect.id, text)
+            assert text.endswith(".")
 
 
 @pytest.mark.parametrize(
-    ("unit", "gamma", "told"),
+    ("unit", "gamma", "text"),
     [
         ("°C", 0.382, "There is a second store of heat, 38 % of the first, exchanging in 2.1 h, that is"),
         (
@@ -80,16 +80,16 @@ def test_what_does_not_move_has_no_speeds_and_loads(kind):
         ("V", 0.05, "There is a second capacitor behind a resistor, 5 % of the first, exchanging in 2.1 h"),
     ],
 )
-def test_a_second_store_is_told_with_its_size_and_its_time(unit, gamma, told):
+def test_hidden_lag_states_size_and_time_constant(unit, gamma, text):
     effect = HiddenLag()
-    assert effect.explained([gamma], STORE, at_state(effect, unit)).startswith(told)
+    assert effect.explained([gamma], STORE, at_state(effect, unit)).startswith(text)
 
 
 MODE = {"period": 0.1408, "damping": 0.0224}
 
 
 @pytest.mark.parametrize(
-    ("unit", "gamma", "shape", "told"),
+    ("unit", "gamma", "shape", "text"),
     [
         ("m/s", 0.213, MODE, "a second mass, 21 % of the moving one, on a spring: 7.1 Hz, damping ratio 0.02"),
         (
@@ -102,19 +102,19 @@ MODE = {"period": 0.1408, "damping": 0.0224}
         ("bar", 0.5, MODE | {"period": 420.0}, "a second volume, 50 % of the first, behind a column with inertia: "),
     ],
 )  # fmt: skip
-def test_what_swings_along_is_told_with_its_size_its_frequency_and_its_damping(unit, gamma, shape, told):
+def test_hidden_mode_states_size_frequency_and_damping(unit, gamma, shape, text):
     effect = HiddenMode()
     context = at_state(effect, unit)
-    assert effect.explained([gamma], shape, context).startswith(f"Not in the equations is {told}")
-    assert effect.advised([gamma], shape, context).startswith(f"Add {told}")
+    assert effect.explained([gamma], shape, context).startswith(f"Not in the equations is {text}")
+    assert effect.advised([gamma], shape, context).startswith(f"Add {text}")
 
 
-def test_a_second_store_of_a_level_is_a_side_tank():
+def test_hidden_lag_of_a_level_is_a_side_tank():
     context = at_state(HiddenLag(), "cm", "level")
     assert "a side tank, 38 % of the first" in HiddenLag().advised([0.38], STORE, context)
 
 
-def test_an_excess_says_what_it_is_counted_from():
+def test_an_excess_states_its_reference():
     effect = PowerLaw("excess")
     context = at_state(effect, "degC")
     shape = {"lowest_of_own": 25.84, "highest_of_own": 98.2, "exponent": 3.0}
@@ -139,7 +139,7 @@ class Cup(Dynamics):
 
 
 @pytest.mark.parametrize("unit", ["degC", "°C", ""])
-def test_a_temperature_does_not_run_over_or_swing_however_it_is_written(unit):
+def test_a_temperature_has_no_overflow_or_resonance_in_any_notation(unit):
     time = torch.linspace(0.0, 30.0, 100, dtype=torch.float64)
 
     class Written(Cup):
@@ -148,27 +148,27 @@ def test_a_temperature_does_not_run_over_or_swing_however_it_is_written(unit):
     prepared = Written().prepare(Recording({"time": time, "temp": 20.0 + 60.0 * torch.exp(-0.1 * time)}))
     tried = {t.effect.id for t in candidate_terms(prepared, (), DYNAMICS)}
     assert not tried & {"overflow", "hidden_mode", "quadratic_drag", "coulomb_friction"}
-    # where the unit is not known nothing tells what absolute zero is
+    # without a unit absolute zero is not known
     assert ("thermal_loss" in tried) == ("power_law" in tried) == bool(unit)
 
 
-def test_times_are_told_in_the_unit_that_a_person_reads():
-    assert [duration(one) for one in (0.5, 119.0, 121.0, 7300.0, 4e5)] == ["0.5 s", "120 s", "2 min", "2 h", "4.6 d"]
+def test_durations_have_a_suitable_unit():
+    assert [duration(time) for time in (0.5, 119.0, 121.0, 7300.0, 4e5)] == ["0.5 s", "120 s", "2 min", "2 h", "4.6 d"]
     assert (zero_of("degC"), zero_of("K")) == (273.15, 0.0)
     assert "speed" in MOTION
 
 
 @pytest.mark.parametrize("unit", ["°C", "V", "A", "bar"])
-def test_names_suit_what_does_not_move(unit):
+def test_names_of_other_kinds_have_no_mechanical_words(unit):
     kind = kind_of(unit)
     for effect in DYNAMICS:
         if effect.port in ("rate", "lagged rate") and {*effect.needs} <= {"own", "temperature"}:
-            told = words_of(effect.id, kind)
-            assert not any(word in told.lower() for word in (*MECHANICAL, "overflow")), told
+            text = words_of(effect.id, kind)
+            assert not any(word in text.lower() for word in (*MECHANICAL, "overflow")), text
     assert words_of("linear_drag") == "linear drag"
 
 
-def test_a_finding_at_a_temperature_and_its_rivals_have_the_names_of_heat():
+def test_a_finding_at_a_temperature_and_its_rivals_have_thermal_names():
     rivals = (
         Alternative("constant_force", (), 0.1, False, "rate of room"),
         Alternative("linear_drag", (), 0.2, False, "rate of speed"),
@@ -176,7 +176,7 @@ def test_a_finding_at_a_temperature_and_its_rivals_have_the_names_of_heat():
     found = Finding(
         "linear_drag", (), ("rate of room",), (), None, "", "", (), 0.01, rivals, True, "", kind="temperature"
     )
-    assert say.finding_name(found) == "loss of heat"
-    assert say.rivals(found) == "constant heat flow, linear drag on the rate of speed"
-    told = say.with_names("Do not correct for linear_drag yet.", {"linear_drag"}, {"linear_drag": "temperature"})
-    assert told == "Do not correct for loss of heat yet."
+    assert report.finding_name(found) == "loss of heat"
+    assert report.rivals(found) == "constant heat flow, linear drag on the rate of speed"
+    text = report.with_names("Do not correct for linear_drag yet.", {"linear_drag"}, {"linear_drag": "temperature"})
+    assert text == "Do not correct for loss of heat yet."

@@ -13,7 +13,7 @@ RANDOM = np.random.default_rng(4)
 
 @pytest.mark.parametrize("N", [2, 3, 64, 65, 1000])
 @pytest.mark.parametrize("lag", [1e-3, 0.3, 5.0, 1e4])
-def test_even_samples_are_filtered_as_scipy_does(N, lag):
+def test_even_samples_equal_scipys_filter(N, lag):
     x = RANDOM.standard_normal(N).cumsum() + 20.0
     system = cont2discrete(([1.0 / lag], [1.0, 1.0 / lag]), 0.02, method="foh")
     b, a = system[0].ravel(), system[1]
@@ -39,7 +39,7 @@ def test_uneven_samples_solve_the_differential_equation():
     np.testing.assert_allclose(found, y, atol=1e-8)
 
 
-def test_a_long_gap_forgets_what_was_before():
+def test_a_long_gap_forgets_the_past():
     time = torch.tensor([0.0, 1.0, 1001.0, 1002.0], dtype=torch.float64)
     found = lagged(torch.tensor([5.0, 5.0, 2.0, 2.0], dtype=torch.float64), time, 1.0)
     late = 3.0 / 1000.0  # behind the straight line through the gap
@@ -57,15 +57,15 @@ def test_samples_at_one_time_jump():
     assert found.tolist() == pytest.approx([0.0, 0.0, 0.0, 4.0 * (1.0 - np.exp(-1.0))], abs=1e-9)
 
 
-def test_a_lag_that_is_fitted_has_a_slope():
+def test_derivative_by_the_lag():
     time = torch.cat([torch.linspace(0.0, 3.0, 30, dtype=torch.float64), torch.tensor([3.0, 3.5]).double()])
     values = torch.sin(2.0 * time)
     for size in (0.05, 0.5, 20.0):
         lag = torch.tensor(size, dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(lambda one: lagged(values, time, one), (lag,), check_forward_ad=True)
+        assert torch.autograd.gradcheck(lambda size: lagged(values, time, size), (lag,), check_forward_ad=True)
 
 
-def test_derivatives_go_through_the_lag():
+def test_derivative_by_the_values():
     time = torch.linspace(0.0, 3.0, 50, dtype=torch.float64)
     values = torch.sin(time).requires_grad_()
     assert torch.autograd.gradcheck(lambda v: lagged(v, time, 0.5), (values,))

@@ -1,4 +1,4 @@
-"""What is passed on from sample to sample, against loops and a differential equation."""
+"""Recurrences along samples, against loops and a differential equation."""
 
 import numpy as np
 import pytest
@@ -15,17 +15,17 @@ TIME = torch.arange(60, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.complex128])
-def test_what_is_passed_on_has_the_derivatives_of_a_loop(dtype):
+def test_recurrence_has_the_derivatives_of_a_loop(dtype):
     generator = torch.Generator().manual_seed(0)
     factor, level = (0.5 * torch.randn(9, dtype=dtype, generator=generator) for _ in range(2))
     factor[4] = 0.0
     inputs = (factor.requires_grad_(), level.requires_grad_())
     assert torch.autograd.gradcheck(passed_on, inputs, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(passed_on, inputs)
-    assert torch.autograd.gradcheck(lambda one: passed_on(factor.detach(), one), inputs[1], check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda values: passed_on(factor.detach(), values), inputs[1], check_forward_ad=True)
 
 
-def test_what_is_passed_on_has_tangents_along_many_directions_at_once():
+def test_recurrence_has_tangents_under_vmap():
     generator = torch.Generator().manual_seed(0)
     factor, level = (0.5 * torch.randn(9, 4, dtype=torch.float64, generator=generator) for _ in range(2))
 
@@ -36,7 +36,7 @@ def test_what_is_passed_on_has_tangents_along_many_directions_at_once():
     forward, reverse = torch.func.jacfwd(moved)(theta), torch.func.jacrev(moved)(theta)
     torch.testing.assert_close(forward, reverse)
     step = 1e-6 * torch.eye(4, dtype=torch.float64)
-    differences = [(moved(theta + one) - moved(theta - one)) / 2e-6 for one in step]
+    differences = [(moved(theta + change) - moved(theta - change)) / 2e-6 for change in step]
     torch.testing.assert_close(forward, torch.stack(differences, -1), rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(
         torch.func.vmap(passed_on, 1, 1)(factor, level)[:, 2], passed_on(factor[:, 2], level[:, 2])
@@ -44,7 +44,7 @@ def test_what_is_passed_on_has_tangents_along_many_directions_at_once():
 
 
 @pytest.mark.parametrize("N", [1, 2, 3, 64, 65, 300])
-def test_scans_are_loops(N):
+def test_scans_equal_loops(N):
     factor, level = torch.from_numpy(RANDOM.uniform(-1.0, 1.0, (2, N)))
     low = torch.from_numpy(RANDOM.standard_normal(N).cumsum())
     high = low + torch.from_numpy(RANDOM.uniform(0.0, 2.0, N))
@@ -59,7 +59,7 @@ def test_scans_are_loops(N):
     np.testing.assert_allclose(passed_on_within(low, high), within, rtol=0, atol=0)
 
 
-def test_play_has_memory_and_a_dead_zone_has_none():
+def test_play_has_memory():
     there = torch.linspace(0.0, 3.0, 31, dtype=torch.float64)
     back = played(torch.cat([there, there.flip(0)]), torch.arange(62.0), 0.5)
     assert back[20].item() == pytest.approx(1.5)
@@ -68,21 +68,21 @@ def test_play_has_memory_and_a_dead_zone_has_none():
 
 
 @pytest.mark.parametrize("N", [40, 41])
-def test_play_is_the_play_operator(N):
+def test_played_equals_the_play_operator(N):
     u = RANDOM.standard_normal(N).cumsum()
     y = [u[0]]
-    for one in u[1:]:
-        y.append(max(one - 0.8, min(one + 0.8, y[-1])))
+    for value in u[1:]:
+        y.append(max(value - 0.8, min(value + 0.8, y[-1])))
     np.testing.assert_allclose(played(torch.from_numpy(u), torch.arange(float(N)), 0.8), y, rtol=0, atol=1e-14)
 
 
-def test_play_without_a_gap_is_none():
+def test_play_without_a_gap_changes_nothing():
     u = torch.from_numpy(RANDOM.standard_normal(20))
     assert torch.equal(played(u, torch.arange(20.0), 0.0), u)
 
 
 @pytest.mark.parametrize("of", ["play", "hysteresis", "lag", "shift"])
-def test_derivatives_go_through(of):
+def test_derivatives_in_all_modes(of):
     """In reverse and forward mode, and under vmap."""
     function = {
         "play": lambda v: played(v, TIME[:12], 0.7),
@@ -93,13 +93,13 @@ def test_derivatives_go_through(of):
     values = torch.from_numpy(RANDOM.standard_normal((3, 12)).cumsum(-1)).requires_grad_()
     assert torch.autograd.gradcheck(function, (values[0].detach().requires_grad_(),), check_forward_ad=True)
     together = torch.vmap(function)(values)
-    torch.testing.assert_close(together, torch.stack([function(one) for one in values]))
-    pushed = torch.vmap(lambda v: torch.func.jvp(function, (v,), (torch.ones_like(v),))[1])(values)
-    assert bool(pushed.isfinite().all())
+    torch.testing.assert_close(together, torch.stack([function(row) for row in values]))
+    tangents = torch.vmap(lambda v: torch.func.jvp(function, (v,), (torch.ones_like(v),))[1])(values)
+    assert bool(tangents.isfinite().all())
 
 
 @pytest.mark.parametrize("yields", [0.05, 0.3, 2.0])
-def test_the_path_of_a_hysteretic_force_solves_bouc_and_wen_s_equation(yields):
+def test_hysteretic_path_solves_the_bouc_wen_equation(yields):
     time = np.linspace(0.0, 6.0, 3001)
 
     def rate(t, z):
@@ -113,16 +113,16 @@ def test_the_path_of_a_hysteretic_force_solves_bouc_and_wen_s_equation(yields):
     assert float(found.abs().max()) <= yields * (1.0 + 1e-9)
 
 
-def test_a_hysteretic_loop_takes_energy_out():
+def test_a_hysteretic_loop_dissipates_energy():
     turn = torch.linspace(0.0, 2.0 * np.pi, 2001, dtype=torch.float64)
     x = torch.cat([turn.sin(), turn.sin()[1:]])
     z = hysteretic_path(x, 0.2, torch.zeros(4001, dtype=torch.long))
     work = (0.5 * (z[1:] + z[:-1]) * x.diff())[2000:].sum()
-    assert float(work) > 0.5 * 4.0 * 0.2  # of a loop of half its largest area, at least
+    assert float(work) > 0.5 * 4.0 * 0.2  # at least half of the largest area of a loop
 
 
-def test_runs_begin_where_they_are_said_to():
-    """On one clock that goes on: each run is what it is alone."""
+def test_runs_are_separated_by_their_numbers():
+    """On a common clock each run equals its separate evaluation."""
     values = torch.from_numpy(RANDOM.standard_normal(60).cumsum())
     run = torch.arange(3).repeat_interleave(20)
     for function in (

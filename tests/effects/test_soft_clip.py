@@ -1,4 +1,4 @@
-"""A clip with a rounded corner: a hard one, a hyperbolic tangent, and all between."""
+"""A clip with rounded corners, from a hard clip to a hyperbolic tangent."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def test_with_much_softness_it_is_a_hyperbolic_tangent():
 
 @settings(deadline=None)
 @given(limit=POSITIVE, softness=SOFT)
-def test_its_slope_at_zero_is_one_and_its_limit_is_reached_by_no_less(limit, softness):
+def test_slope_at_zero_is_one_and_values_stay_within_the_limit(limit, softness):
     at = torch.tensor([1e-6 * limit, 40.0 * limit * (1.0 + softness)], dtype=torch.float64)
     near, far = soft_clip(at, limit, softness).tolist()
     assert near / float(at[0]) == pytest.approx(1.0, abs=1e-4)
@@ -33,11 +33,11 @@ def test_its_slope_at_zero_is_one_and_its_limit_is_reached_by_no_less(limit, sof
     torch.testing.assert_close(course, -course.flip(0), rtol=0.0, atol=1e-12 * limit)
 
 
-def test_its_slopes_are_those_of_its_formula():
+def test_derivatives_are_correct():
     numbers = (VALUES[::20].clone(), torch.tensor(1.3).double(), torch.tensor(0.4).double())
     assert torch.autograd.gradcheck(soft_clip, [n.requires_grad_() for n in numbers])
     assert torch.autograd.gradcheck(soft_clip, numbers, check_forward_ad=True, check_backward_ad=False)
 
 
-def test_it_keeps_the_precision_of_its_values():
+def test_dtype_is_kept():
     assert soft_clip(VALUES.float(), 1.5, 0.1).dtype == torch.float32

@@ -1,4 +1,4 @@
-"""What effects say of themselves: the form of their equation, what their numbers are, and when they set in."""
+"""Reported texts of effects: equations of their forms, labels of components, and moments."""
 
 from dataclasses import replace
 
@@ -17,12 +17,12 @@ GRADIENT = FieldGradient()
 VECTOR, STRENGTH = ("east", "north", "up"), ("strength",)
 
 
-def test_forms_differ_in_their_equations():
+def test_equations_of_forms_differ():
     context = make_context(OffsetDrift())
-    told = [OffsetDrift().equation_of(s, context).partition("s(t) = ")[2].partition(",  t from")[0] for s in (
+    found = [OffsetDrift().equation_of(s, context).partition("s(t) = ")[2].partition(",  t from")[0] for s in (
         {}, {"power": 0.5}, {"time_constant": 9.0},
     )]  # fmt: skip
-    assert told == ["t / T", "√(t / T)", "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"]
+    assert found == ["t / T", "√(t / T)", "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"]
     length = float(context.time[-1] - context.time[0])
     assert f"T = {length:.4g} s" in OffsetDrift().equation_of({}, context)
     cubic = make_context(CubicNonlinearity())
@@ -35,12 +35,12 @@ def test_forms_differ_in_their_equations():
     assert TemperatureOffset().unit_of_shape("lag", warm) == "s"
 
 
-def slopes_and_bends(gamma, degree, context):
-    """First and second derivatives, by the position, of what is added at its mean."""
-    one = replace(context, time=context.time[:1], signal=context.signal[:1])
+def first_and_second_derivatives(gamma, degree, context):
+    """First and second derivatives of the change by the position, at its mean."""
+    sample = replace(context, time=context.time[:1], signal=context.signal[:1])
 
     def field(point):
-        return GRADIENT.change(gamma, {"degree": degree}, replace(one, drivers=point.unsqueeze(0))).squeeze(0)
+        return GRADIENT.change(gamma, {"degree": degree}, replace(sample, drivers=point.unsqueeze(0))).squeeze(0)
 
     here = torch.zeros(3, dtype=torch.float64)
     first = torch.func.jacfwd(field)
@@ -48,7 +48,7 @@ def slopes_and_bends(gamma, degree, context):
 
 
 def evaluated(label, first, second):
-    """A component's label as a formula in derivatives of the field."""
+    """The value of a component's label, a formula in derivatives of the field."""
     axes = {axis: k for k, axis in enumerate("xyz")}
 
     def derivative(of, by):
@@ -72,19 +72,19 @@ def evaluated(label, first, second):
 
 @pytest.mark.parametrize("channels", [VECTOR, STRENGTH], ids=len)
 @pytest.mark.parametrize("degree", [1.0, 2.0])
-def test_components_of_a_gradient_are_the_derivatives_that_they_are_called(channels, degree):
+def test_components_of_a_gradient_equal_their_labels(channels, degree):
     shape, context = {"degree": degree}, make_context(GRADIENT, channels=channels)
     quantities = GRADIENT.quantities(shape, context)
     generator = torch.Generator().manual_seed(5)
     gamma = torch.randn(sum(q.size for q in quantities), generator=generator, dtype=torch.float64)
-    first, second = slopes_and_bends(gamma, degree, context)
+    first, second = first_and_second_derivatives(gamma, degree, context)
     labels = [label for q in quantities for label in GRADIENT.components(q.name, shape, context)]
     assert len(labels) == len(gamma)
     for label, value in zip(labels, gamma.tolist(), strict=True):
         assert evaluated(label, first, second) == pytest.approx([value] * len(label.split(" = ")), abs=1e-12)
 
 
-def test_a_heading_that_is_set_anew_tells_when():
+def test_heading_reset_lists_its_moments():
     time = torch.arange(6.0, dtype=torch.float64)
     since = torch.stack([time >= 2.0, time >= 5.0], -1).double()
     none = torch.zeros(6, 0, dtype=torch.float64)

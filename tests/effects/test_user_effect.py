@@ -1,4 +1,4 @@
-"""An effect of a user's own, found and named among those of the catalogue."""
+"""A user's own effect is found and named together with the catalogue."""
 
 import numpy as np
 import pytest
@@ -41,12 +41,12 @@ def diagnosis():
 
 
 @pytest.mark.e2e
-def test_it_is_named_by_the_role_its_column_is_called(diagnosis):
+def test_a_user_effect_is_found_by_the_role_of_its_column(diagnosis):
     assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
 
 
-def test_a_curve_without_a_name_is_tried_on_its_column_too():
-    """Where the user's formula is not the right one, the mismatch must not pass for adequate."""
+def test_the_unknown_curve_is_tried_on_the_column_too():
+    """With a wrong formula of the user, the mismatch must not count as adequate."""
     prepared = Magnetometer().prepare(tumbling(600, noise=0.3, voltage=np.sin(np.arange(600) / 25.0)))
     effects = (*CATALOGUE, SupplyOffset())
     drivers = find_drivers(prepared.recording, Magnetometer().columns, DriverSettings(), frozenset({"voltage", "any"}))
@@ -58,7 +58,7 @@ def test_a_curve_without_a_name_is_tried_on_its_column_too():
 
 
 @pytest.mark.e2e
-def test_the_finding_speaks_with_its_words(diagnosis):
+def test_the_finding_has_the_texts_of_the_effect(diagnosis):
     (finding,) = diagnosis.findings
     assert finding.equation == SupplyOffset.equation
     assert finding.explanation.startswith(SupplyOffset.explanation)
@@ -72,16 +72,16 @@ def test_the_finding_speaks_with_its_words(diagnosis):
 
 
 @pytest.mark.e2e
-def test_the_model_takes_it_off_again(diagnosis):
+def test_the_model_removes_the_effect(diagnosis):
     time = np.arange(300) / 50.0
     voltage = 12.0 + np.cos(3.0 * time)
-    clean, spoilt = (
+    clean, contaminated = (
         tumbling(300, voltage=voltage),
         tumbling(300, sensor=np.outer(voltage - 12.0, GAIN), voltage=voltage),
     )
     model = DiagnosedModel.from_json(diagnosis.model.to_json(), effects=(*CATALOGUE, SupplyOffset()))
     strengths = []
-    for recording in (clean, spoilt):
+    for recording in (clean, contaminated):
         columns, _ = model.correct(recording)
         strengths.append(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1).norm(dim=-1))
     assert float(strengths[1].std()) < 0.1

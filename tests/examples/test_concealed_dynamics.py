@@ -34,7 +34,7 @@ def drops(ball):
 
 
 @pytest.mark.manual
-def test_a_light_ball_is_slowed_by_air_and_its_other_drop_says_so(loaded, tmp_path):
+def test_drag_of_a_light_ball_is_confirmed_by_its_second_drop(loaded, tmp_path):
     one, other = drops("Whiffle_Ball_1")
     (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
     (finding,) = proof.diagnosis.findings

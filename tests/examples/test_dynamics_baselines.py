@@ -64,7 +64,7 @@ def test_a_free_run_follows_the_solution_and_a_run_that_is_over_stands_still(loa
     assert bool((states[24:, 1] == states[24, 1]).all())
 
 
-def test_models_run_beside_each_other_and_one_that_diverges_does_not_spoil_the_others(load):
+def test_a_diverging_model_does_not_affect_the_others(load):
     module, runs = load("free_run"), oscillation(load, [40, 25])
     grows = torch.tensor([0.0, 1e6], dtype=torch.float64).view(2, 1, 1)
 

@@ -53,11 +53,11 @@ def cells(load, found):
     return dict(zip(module.COLUMNS, module.line(one, found, load("by_hand").BY_HAND[ROCKET]), strict=True))
 
 
-def test_a_right_diagnosis_stands_beside_the_fit_by_hand(load):
+def test_a_right_diagnosis_is_compared_with_the_fit_by_hand(load):
     assert cells(load, row()) == {
         "recording": ROCKET,
         "left out": "quadratic drag",
-        "told": "quadratic drag (right)",
+        "claimed": "quadratic drag (right)",
         "located": "89% in 30%: altitude below 2.14e+03 (right)",
         "size": "drag 9.3e-05 ± 1e-06, by hand 9.2e-05",
         "bias": "gravity -1.0%",
@@ -69,7 +69,7 @@ def test_a_right_diagnosis_stands_beside_the_fit_by_hand(load):
 
 def test_a_diagnosis_that_names_nothing_is_wrong_and_has_no_size(load):
     found = cells(load, row(verdict="unexplained", findings=[], residual_after={}))
-    assert found["told"] == "unexplained (wrong)"
+    assert found["claimed"] == "unexplained (wrong)"
     assert found["located"] == "-"
     assert found["size"] == "drag -, by hand 9.2e-05"
     assert found["open loop"] == "altitude 24.2"
@@ -84,9 +84,9 @@ def test_each_recording_with_missing_physics_has_its_words(load):
     assert names - set(by_hand) == adequate | heavy
 
 
-def test_a_search_that_was_stopped_says_so_in_its_row(load):
+def test_a_stopped_search_is_marked_in_its_row(load):
     found = cells(load, row(stopped={"reason": "time limit", "seconds": 30.2, "not_done": []}))
-    assert found["told"] == "quadratic drag (right), search stopped after 30 s"
+    assert found["claimed"] == "quadratic drag (right), search stopped after 30 s"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_a_limit_that_is_over_at_once_is_a_row(load, tmp_path):
     name, found = load("real").diagnosed((one, tmp_path, 0.01))
     assert name == ROCKET
     assert "0.01 s" in found["failed"]
-    assert cells(load, found)["told"] == "no answer (wrong)"
+    assert cells(load, found)["claimed"] == "no answer (wrong)"
 
 
 def test_absent_recordings_are_named_and_left_out(load, tmp_path, capsys):
@@ -136,7 +136,7 @@ def test_a_diagnosis_that_fails_costs_its_row_alone(load, tmp_path):
     name, failed = load("real").diagnosed((one, tmp_path / "out", 300.0))
     assert name == ROCKET
     assert failed["failed"]
-    assert cells(load, failed)["told"] == "no answer (wrong)"
+    assert cells(load, failed)["claimed"] == "no answer (wrong)"
 
 
 @pytest.mark.e2e

@@ -170,7 +170,7 @@ def test_all_runs_scripts_and_links_what_they_left(monkeypatch, capsys, tmp_path
         assert name in page
 
 
-def test_all_says_which_script_failed(monkeypatch, capsys, tmp_path):
+def test_all_names_the_failed_scripts(monkeypatch, capsys, tmp_path):
     module = example("all")
     monkeypatch.setattr(module, "SCRIPTS", (module.Script("no_such_script", "nothing"),))
     monkeypatch.setattr("sys.argv", ["all", "--output", str(tmp_path)])

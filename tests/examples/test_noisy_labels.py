@@ -25,7 +25,7 @@ def example():
     return module
 
 
-def test_the_share_of_labels_that_is_wrong_is_the_one_asked_for(example):
+def test_the_share_of_wrong_labels_is_the_requested_share(example):
     data = example.digits(0.4, seed=1)
     assert float((data.given != data.true).double().mean()) == pytest.approx(0.4, abs=0.04)
     assert data.given.unique().tolist() == list(range(10))

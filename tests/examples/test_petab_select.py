@@ -70,6 +70,6 @@ def test_good_models_of_several_searches_are_counted_once(load):
 
 
 @pytest.mark.e2e
-def test_the_diagnosis_claims_the_one_rate_that_all_good_models_have(load):
+def test_the_diagnosis_claims_the_rate_common_to_all_good_models(load):
     logs = load("acetylation").measured(FOLDER / "data" / "measurements.tsv")
     assert load("petab_select_0009").claimed(logs) == {"a_k05_k05k12": pytest.approx(27.8, abs=0.5)}

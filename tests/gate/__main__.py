@@ -1,7 +1,7 @@
 """The gate for changes of the verdict: `python -m tests.gate --output DIR [--compare STORED.json]`.
 
-Diagnoses the real recordings and cases that lie beside the repository, a few recordings of each scenario, and small draws
-of both proofs, always the same ones, and writes `DIR/gate.json`: for each recording verdict, findings, residuals, CPU
+Diagnoses the real recordings and cases next to the repository, a few recordings of each scenario, and small draws of
+both proofs, always the same, and writes `DIR/gate.json`: for each recording verdict, findings, residuals, CPU
 and wall seconds, and whether it is right. Prints the counts and the recordings that are not right; with `--compare`,
 also each recording in which a stored `gate.json` and this one differ.
 

@@ -28,7 +28,7 @@ from mkc_torch.challenge.pool import content_of
 from mkc_torch.challenge.run import SIMULATIONS
 from mkc_torch.challenge.subject import Case
 from mkc_torch.challenge.thresholds import STRONG_Z
-from mkc_torch.challenge.verdict import stated_diagnosis, named_right
+from mkc_torch.challenge.verdict import named_right, stated_diagnosis
 from mkc_torch.cli.challenge_jobs import diagnose_dynamics
 from mkc_torch.recording.recording import write_table
 

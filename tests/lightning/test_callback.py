@@ -45,7 +45,7 @@ def drawn(*shape, sigma=2.5, d=0.5, bound=100.0, seed=0):
 
 
 class Replay(LightningModule):
-    """Every training step calls the loss with residuals as they are in the batch: (error,) or (error, weight)."""
+    """Every training step calls the loss with the residuals of the batch: (error,) or (error, weight)."""
 
     def __init__(self, num_channels=2, growth=1.0, **options):
         super().__init__()
@@ -91,7 +91,7 @@ class Regression(LightningModule):
 
 
 class Watch(Callback):
-    """What the parameters were after each training batch and each epoch."""
+    """Records the parameters after each training batch and each epoch."""
 
     def __init__(self):
         self.batches, self.epochs = [], []
@@ -137,29 +137,29 @@ def trained(module, data, *callbacks, val=None, **options):
 
 
 def assert_fitted(loss, error, weight=None, rtol=5e-4):
-    """σ and d are the likeliest of these residuals."""
+    """Assert that σ and d have the maximum likelihood for these residuals."""
     fit = fit_density(error.double(), weight=weight, bound=loss.bound.double(), d_min=loss.d_min.double())
     torch.testing.assert_close(loss.d.detach().double(), fit.d, rtol=rtol, atol=0)
     torch.testing.assert_close(loss.sigma.detach().double().pow(-2), fit.sigma.pow(-2), rtol=rtol, atol=5e-5)
 
 
-def said(record):
-    """What the callback warned of, among warnings of others."""
+def warnings_of(record):
+    """Warnings of the callback among all warnings."""
     return [str(w.message) for w in record if "of the loss `criterion`" in str(w.message)]
 
 
-# --- what it finds
+# --- fitted values
 
 
 @each_kind
-def test_each_epoch_ends_with_the_likeliest_density_of_its_residuals(kind):
+def test_each_epoch_ends_with_the_maximum_likelihood_density_of_its_residuals(kind):
     error = drawn(1000, 2)
     module, _ = trained(Replay(**kind), loader(error), max_epochs=2)
     assert_fitted(module.criterion, error)
 
 
 @pytest.mark.e2e
-def test_on_a_linear_model_it_agrees_with_the_regression():
+def test_a_linear_model_agrees_with_mkc_regression():
     torch.manual_seed(0)
     x, truth = torch.randn(1000, 3), torch.tensor([1.0, -2.0, 0.5])
     y = (x @ truth + drawn(1000)).unsqueeze(-1)
@@ -195,11 +195,11 @@ def test_alternation_raises_the_likelihood():
 
 
 def quantiles(count):
-    """Residuals as Gaussian as can be."""
+    """Quantiles of a Gaussian as residuals."""
     return torch.erfinv(2 * (torch.arange(count) + 0.5) / count - 1) * 2**0.5
 
 
-def test_clean_channel_becomes_gaussian_and_the_dirty_one_does_not():
+def test_a_clean_channel_becomes_gaussian_and_a_contaminated_channel_does_not():
     error = torch.stack([0.3 * quantiles(2000), drawn(2000)], -1)
     fixed, _ = trained(Replay(**FIXED), loader(error))
     learned, _ = trained(Replay(**LEARNED), loader(error))
@@ -236,7 +236,7 @@ def test_weights_by_keyword():
     assert_fitted(module.criterion, error, weight.double())
 
 
-# --- when it takes a step
+# --- timing of the E-steps
 
 
 def test_gradient_accumulation_counts_optimiser_steps():
@@ -289,13 +289,13 @@ def test_the_epoch_ends_before_its_validation():
     assert not torch.equal(seen[-1], torch.ones(2))
 
 
-def test_training_that_stops_within_an_epoch_uses_what_came_in():
+def test_training_that_stops_within_an_epoch_uses_the_collected_residuals():
     error = drawn(1000, 2)
     module, _ = trained(Replay(), loader(error), max_epochs=None, max_steps=4)
     assert_fitted(module.criterion, error[:400])
 
 
-def test_warm_up_leaves_the_values_and_its_residuals_are_not_used():
+def test_warm_up_changes_no_values_and_its_residuals_are_not_used():
     watch, module = Watch(), Replay(growth=3.0, bound=900.0)
     error = drawn(500, 2)
     trained(module, loader(error), MKCExpectationMaximization(warmup_epochs=2), watch, max_epochs=3)
@@ -326,10 +326,10 @@ def test_damping_keeps_part_of_the_values_from_the_second_step_on():
     torch.testing.assert_close(watch.epochs[1][1].double().pow(-2), between, rtol=2e-3, atol=0)
 
 
-# --- which residuals
+# --- collected residuals
 
 
-def test_residuals_of_the_last_epoch_alone_count():
+def test_only_residuals_of_the_last_epoch_are_used():
     error = drawn(500, 2)
     module, _ = trained(Replay(growth=2.0, bound=400.0), loader(error), max_epochs=3)
     assert_fitted(module.criterion, 4 * error)
@@ -359,7 +359,7 @@ def test_calls_without_gradients_or_in_evaluation_mode_add_nothing():
 
 
 @pytest.mark.parametrize("call", ["validate", "test"])
-def test_validate_and_test_leave_all_as_it_is(call):
+def test_validate_and_test_change_nothing(call):
     module = Replay(**LEARNED)
     before = copy.deepcopy(module.state_dict())
     trainer = trainer_of(MKCExpectationMaximization())
@@ -435,7 +435,7 @@ def test_fast_dev_run(batches):
     assert_fitted(module.criterion, error[: 100 * batches])
 
 
-def test_batches_of_none_are_passed_over():
+def test_batches_of_none_are_skipped():
     class Sparse(Replay):
         def on_before_batch_transfer(self, batch, _):
             return None if batch[0][0, 0] == 0 else batch
@@ -444,11 +444,11 @@ def test_batches_of_none_are_passed_over():
     error[200] = error[400] = 0
     with pytest.warns(UserWarning, match="train_dataloader yielded None") as record:
         trained(Sparse(), loader(error), MKCExpectationMaximization(every_n_steps=2))
-    assert not said(record)
+    assert not warnings_of(record)
 
 
 class Dropped(Regression):
-    """A network that is another one in training."""
+    """A network that differs between training and evaluation."""
 
     def __init__(self):
         super().__init__(outputs=2)
@@ -467,7 +467,7 @@ def pairs(count=500):
 
 
 @pytest.mark.parametrize("combined", [False, True])
-def test_a_pass_of_its_own_takes_the_module_as_it_is_in_evaluation(combined):
+def test_a_separate_pass_uses_the_module_in_evaluation_mode(combined):
     x, y = pairs()
     data = loader(x, y)
     if combined:
@@ -494,7 +494,7 @@ def test_a_pass_of_its_own_takes_the_module_as_it_is_in_evaluation(combined):
         assert_fitted(module.criterion, (module.net(x) - y)[:count])
 
 
-def test_a_pass_of_its_own_leaves_the_order_of_training_alone():
+def test_a_separate_pass_does_not_change_the_order_of_training():
     orders = []
     for options in ({}, {"residuals": lambda module, batch: (module.net(batch[0]), batch[1])}):
         torch.manual_seed(3)
@@ -517,7 +517,7 @@ def test_a_pass_every_few_steps():
         trained(Replay(), loader(error), callback)
 
 
-def test_workers_that_persist_serve_one_pass_at_a_time():
+def test_persistent_workers_with_a_separate_pass_are_refused():
     error = drawn(100, 2)
     callback = MKCExpectationMaximization(every_n_steps=2, residuals=lambda _, batch: (batch[0], 0 * batch[0]))
     data = loader(error, num_workers=1, persistent_workers=True)
@@ -541,7 +541,7 @@ class TwoLosses(Replay):
         return super().training_step((error[:, :2],)) + self.heads["b"](error[:, 2:], 0 * error[:, 2:])
 
 
-def test_two_losses_take_a_callback_each():
+def test_two_losses_have_a_callback_each():
     error = drawn(500, 3)
     callbacks = MKCExpectationMaximization("criterion"), MKCExpectationMaximization(loss="heads.b", log=False)
     module, trainer = trained(TwoLosses(), loader(error), *callbacks)
@@ -552,7 +552,7 @@ def test_two_losses_take_a_callback_each():
     assert callbacks[0].state_key != callbacks[1].state_key
 
 
-def test_a_loss_of_two_names_is_one_loss():
+def test_a_loss_of_two_names_is_a_single_loss():
     module, error = Replay(bound=200.0), drawn(300, 2)
     module.alias = module.criterion
     trained(module, loader(error), MKCExpectationMaximization("alias"))
@@ -604,7 +604,7 @@ def test_two_callbacks_for_one_loss_are_refused():
 
 
 @pytest.mark.parametrize(("learned", "named"), [("sigma", "raw_kappa"), ("d", "raw_d")])
-def test_parameters_in_an_optimiser_are_refused_with_the_remedy(learned, named):
+def test_parameters_in_an_optimiser_are_refused_with_a_remedy(learned, named):
     class Joint(Replay):
         def configure_optimizers(self):
             return torch.optim.SGD(self.parameters(), lr=0.1)
@@ -613,7 +613,7 @@ def test_parameters_in_an_optimiser_are_refused_with_the_remedy(learned, named):
     refused(module, error=drawn(300, 2), match=f"got criterion.{named}: .*learn_sigma=False.*configure_optimizers")
 
 
-def test_learned_parameters_have_no_gradient_while_it_owns_them():
+def test_learned_parameters_have_no_gradient_while_the_callback_owns_them():
     class Checked(Replay):
         def training_step(self, batch):
             assert not self.criterion.raw_kappa.requires_grad
@@ -626,7 +626,7 @@ def test_learned_parameters_have_no_gradient_while_it_owns_them():
     assert module.criterion.raw_d.grad is None
 
 
-def test_an_exception_gives_the_loss_back():
+def test_an_exception_releases_the_loss():
     class Failing(Replay):
         def training_step(self, _batch):
             raise RuntimeError("broken")
@@ -654,7 +654,7 @@ def test_a_copy_of_the_module_adds_nothing_and_the_module_can_be_pickled():
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.filterwarnings("ignore:.* should not be instantiated. Methods on autograd functions")
 @pytest.mark.parametrize("how", ["module", "in place", "whole"])
-def test_compiled_losses_are_heard(how):
+def test_residuals_of_compiled_losses_are_collected(how):
     torch._dynamo.reset()
     error, module = drawn(500, 2), Replay()
     if how == "module":
@@ -672,11 +672,11 @@ def _losses_of(module):
     return next(m for m in module.modules() if isinstance(m, MKCLoss))
 
 
-# --- what goes wrong
+# --- errors and warnings
 
 
 @pytest.mark.parametrize("bad", [NAN, INF])
-def test_residuals_that_are_not_finite_name_step_channel_and_remedy(bad, monkeypatch):
+def test_residuals_that_are_not_finite_are_refused_with_step_channel_and_remedy(bad, monkeypatch):
     error = drawn(500, 2)
     error[320, 1] = bad
     refused(Replay(), error=error, match=r"`input` to be finite but got 1 values .* \(20, 1\)")
@@ -685,19 +685,19 @@ def test_residuals_that_are_not_finite_name_step_channel_and_remedy(bad, monkeyp
     refused(Replay(), error=error, match=r"step 3 of the loss `criterion`.*channel 1; .*torch.isfinite\(target\)")
 
 
-def test_a_loss_that_is_never_heard_warns_once():
+def test_a_loss_without_collected_residuals_warns_once():
     class Silent(Replay):
         def training_step(self, batch):
             return self.criterion.forward(batch[0] + 0 * self.shift, 0 * batch[0])
 
     with pytest.warns(UserWarning, match=r"No residual of the loss `criterion`.*`self.criterion\(input, ") as record:
         module, _ = trained(Silent(), loader(drawn(300, 2)), max_epochs=3)
-    assert len(said(record)) == 1
+    assert len(warnings_of(record)) == 1
     assert torch.equal(module.criterion.d, torch.ones(2))
 
 
 @each_kind
-def test_channels_with_too_few_residuals_keep_their_values_to_the_last_bit(kind):
+def test_channels_with_too_few_residuals_keep_bitwise_equal_values(kind):
     error, weight = drawn(500, 9), torch.ones(500, 9)
     weight[:, 1] = 0
     weight[29:, 2:] = 0
@@ -706,14 +706,14 @@ def test_channels_with_too_few_residuals_keep_their_values_to_the_last_bit(kind)
     before = copy.deepcopy(module.criterion.state_dict())
     with pytest.warns(UserWarning, match="Fewer than 30 residuals .* in channel 1, 2, .*8 of the loss") as record:
         trained(module, loader(error, weight), max_epochs=2)
-    assert len(said(record)) == 1
+    assert len(warnings_of(record)) == 1
     for key, value in module.criterion.state_dict().items():
         assert torch.equal(value[1:], before[key][1:]), key
     fit = fit_density(error[:, :1].double(), bound=100.0, d_min=1e-3)
     torch.testing.assert_close(module.criterion.d[:1].detach().double(), fit.d, rtol=1e-3, atol=0)
 
 
-def test_nothing_but_zero_weights_changes_nothing():
+def test_zero_weights_change_nothing():
     module = Replay()
     before = copy.deepcopy(module.state_dict())
     with pytest.warns(UserWarning, match="Fewer than 30 residuals"):
@@ -722,20 +722,20 @@ def test_nothing_but_zero_weights_changes_nothing():
     assert "criterion/log_likelihood_0" not in trainer.callback_metrics
 
 
-def test_residuals_beyond_the_bound_are_counted_and_warned_of():
+def test_residuals_beyond_the_bound_are_counted_with_a_warning():
     error = drawn(1000, 2)
     error[:50, 1] = 140.0
     error[:5, 0] = 140.0
     with pytest.warns(UserWarning, match="More than 1 % of the residuals .* in channel 1; ") as record:
         module, trainer = trained(Replay(), loader(error), max_epochs=2)
-    assert len(said(record)) == 1
+    assert len(warnings_of(record)) == 1
     found = [trainer.callback_metrics[f"criterion/share_beyond_bound_{i}"].item() for i in (0, 1)]
     assert found == pytest.approx([0.005, 0.05])
     assert_fitted(module.criterion, error)
 
 
 @each_kind
-def test_a_bound_without_room_falls_back_to_least_squares(kind):
+def test_a_narrow_bound_falls_back_to_least_squares(kind):
     error = drawn(500, 2) * torch.tensor([1.0, 1e5])
     with pytest.warns(UserWarning, match="less than twice the typical residual in channel 1: least squares"):
         module, _ = trained(Replay(**kind), loader(error))
@@ -744,11 +744,11 @@ def test_a_bound_without_room_falls_back_to_least_squares(kind):
 
 
 @each_kind
-def test_a_network_that_interpolates_is_warned_of_once(kind):
+def test_a_network_that_interpolates_warns_once(kind):
     module = Replay(growth=0.3, **kind)
     with pytest.warns(UserWarning, match=r"collapses in channel .*validation set.*weight decay.*d_min") as record:
         trained(module, loader(drawn(300, 2)), max_epochs=9)
-    assert sorted(c for text in said(record) for c in text.partition(":")[0] if c.isdigit()) == ["0", "1"]
+    assert sorted(c for text in warnings_of(record) for c in text.partition(":")[0] if c.isdigit()) == ["0", "1"]
     assert (module.criterion.d >= module.criterion.d_min).all()
 
 
@@ -782,13 +782,16 @@ def test_arguments_out_of_range_are_refused(options, match):
         ({"damping": "a"}, r"`damping` to be a number in \[0, 1\) but got 'a'"),
         (
             {"loss": MKCLoss(2)},
-            "`loss` to be the loss's name in the module, or None but got MKCLoss.*; write 'criterion'",
+            "`loss` to be the loss's name in the module, or None but got MKCLoss.*; for example 'criterion'",
         ),
         ({"loss": 3}, "`loss` to be the loss's name in the module, or None but got 3"),
-        ({"residuals": 3}, r"`residuals` to be a function \(pl_module, batch\) -> .* but got 3; None takes those"),
+        (
+            {"residuals": 3},
+            r"`residuals` to be a function \(pl_module, batch\) -> .* but got 3; None uses the residuals",
+        ),
     ],
 )
-def test_arguments_of_another_kind_are_refused(options, match):
+def test_arguments_of_another_type_are_refused(options, match):
     with pytest.raises(TypeError, match=match):
         MKCExpectationMaximization(**options)
 
@@ -812,7 +815,7 @@ def test_a_logger_gets_finite_values_of_each_channel(tmp_path):
         )
 
 
-def test_a_logger_gets_each_step_where_asked(tmp_path):
+def test_a_logger_gets_each_step_with_every_n_steps(tmp_path):
     logger = CSVLogger(tmp_path)
     callback = MKCExpectationMaximization(every_n_steps=2)
     trained(Replay(1, growth=0.5), loader(drawn(600, 1)), callback, max_epochs=2, logger=logger, log_every_n_steps=1)
@@ -821,7 +824,7 @@ def test_a_logger_gets_each_step_where_asked(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"barebones": True, "logger": None}, {}])
-def test_it_can_be_quiet(options):
+def test_logging_can_be_switched_off(options):
     callback = MKCExpectationMaximization(log=bool(options))
     quiet = {"enable_progress_bar": None, "enable_model_summary": None, "enable_checkpointing": None} if options else {}
     error = drawn(300, 2)
@@ -880,7 +883,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, saved,
     assert not torch.equal(module.criterion.d, straight.criterion.d)
 
 
-def test_a_checkpoint_brings_the_bound(tmp_path):
+def test_a_checkpoint_restores_the_bound(tmp_path):
     error = drawn(500, 2)
     _, trainer = trained(Replay(bound=400.0), loader(error))
     trainer.save_checkpoint(tmp_path / "c.ckpt")
@@ -889,7 +892,7 @@ def test_a_checkpoint_brings_the_bound(tmp_path):
     assert_fitted(module.criterion, 4 * error)
 
 
-def test_state_holds_tensors_and_plain_values_alone(tmp_path):
+def test_the_state_contains_only_tensors_and_plain_values(tmp_path):
     callback = MKCExpectationMaximization(every_n_steps=2)
     assert callback.state_dict() == {}
     trained(Replay(), loader(drawn(500, 2)), callback)
@@ -907,7 +910,7 @@ def test_a_checkpoint_of_other_channels_is_refused():
         trained(Replay(3), loader(drawn(300, 3)), many)
 
 
-def test_fit_goes_on_and_a_new_training_starts_afresh():
+def test_a_second_fit_continues_and_a_new_training_starts_afresh():
     callback, error = MKCExpectationMaximization(damping=0.5), drawn(500, 2)
     module, trainer = trained(Replay(bound=400.0), loader(error), callback)
     first = module.criterion.d.clone()
@@ -918,7 +921,7 @@ def test_fit_goes_on_and_a_new_training_starts_afresh():
     assert_fitted(again.criterion, 4 * error)
 
 
-def test_it_may_join_a_run_that_is_resumed(tmp_path):
+def test_the_callback_may_be_added_to_a_resumed_run(tmp_path):
     error = drawn(500, 2)
     _, trainer = trained(Replay(), loader(error), Watch(), max_epochs=2)
     trainer.save_checkpoint(tmp_path / "c.ckpt")
@@ -932,7 +935,7 @@ def test_it_may_join_a_run_that_is_resumed(tmp_path):
 
 
 class Written(Callback):
-    """Each process writes what it ends with."""
+    """Each process writes its final state."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -942,7 +945,7 @@ class Written(Callback):
         torch.save((loss.sigma.detach(), loss.d.detach()), self.folder / f"{trainer.global_rank}.pt")
 
 
-# forked processes start in a second, fresh ones import everything anew
+# forked processes start in a second; new processes import everything again
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
 @pytest.mark.skipif(torch.cuda.is_initialized(), reason="a process that uses CUDA cannot fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
@@ -974,7 +977,7 @@ def test_nothing_else_imports_lightning():
     assert importers == {"lightning"}
 
 
-def test_without_lightning_the_error_says_what_to_install(monkeypatch):
+def test_without_lightning_the_error_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "lightning", None)
     path = Path(mkc_torch.__file__).parent / "lightning" / "__init__.py"
     spec = importlib.util.spec_from_file_location("without_lightning", path)
@@ -982,7 +985,7 @@ def test_without_lightning_the_error_says_what_to_install(monkeypatch):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
-def test_a_scale_that_follows_the_residuals_is_frozen_and_fitted_from_the_first_e_step_on():
+def test_a_running_scale_is_frozen_and_fitted_from_the_first_e_step_on():
     error = drawn(400, 2)
     module = Replay(d="auto")
     trainer_of(MKCExpectationMaximization()).fit(module, loader(error))
@@ -994,7 +997,7 @@ def test_a_scale_that_follows_the_residuals_is_frozen_and_fitted_from_the_first_
 
 
 @pytest.mark.e2e
-def test_d_and_bound_that_are_automatic_have_the_unit_of_the_targets():
+def test_automatic_d_and_bound_have_the_unit_of_the_targets():
     x, y = permuted(1)
     found = []
     for unit in (1.0, 1e-4, 1e4):
@@ -1020,7 +1023,7 @@ class Times(nn.Module):
         return self.unit * x
 
 
-def test_a_run_resumed_after_the_scale_was_frozen_goes_on_as_it_was(tmp_path):
+def test_a_run_resumed_after_freezing_equals_the_uninterrupted_run(tmp_path):
     x, y = permuted(2)
 
     def fitted(epochs, path=None):
@@ -1037,7 +1040,7 @@ def test_a_run_resumed_after_the_scale_was_frozen_goes_on_as_it_was(tmp_path):
         torch.testing.assert_close(resumed.state_dict()[name], value, rtol=0.0, atol=0.0, msg=name)
 
 
-def test_a_loss_as_it_comes_trains_a_network_whatever_becomes_of_sigma_and_d():
+def test_a_default_loss_trains_a_network_for_any_sigma_and_d():
     torch.manual_seed(0)
     x = torch.randn(400, 3)
     y = 1000.0 * (x @ torch.tensor([[1.0], [-2.0], [0.5]])) + 10.0 * torch.randn(400, 1)
@@ -1065,10 +1068,10 @@ def test_from_any_start_half_of_the_targets_may_be_permuted(kind, d):
     x, y = permuted(0)
     module, _ = trained(Regression(d=d, sigma=3.0, **kind), loader(x, y), max_epochs=40)
     torch.testing.assert_close(module.net.weight.detach().T, TRUTH, rtol=0.0, atol=0.05)
-    assert module.criterion._guide is None  # with the training it is over
+    assert module.criterion._guide is None  # the guide ends with the training
 
 
-def test_without_its_graduation_the_likelihood_alone_moves_the_network():
+def test_without_graduated_the_likelihood_alone_trains_the_network():
     x, y = permuted(0)
     weights = []
     for graduated in (True, False):

@@ -41,12 +41,12 @@ def filled(*batches, bound=20.0, channel_dim=-1, on_accelerator=False):
 
 
 def simulated_accelerator():
-    """Tensors of the CPU go the way of an accelerator's."""
+    """Treat tensors of the CPU like those of an accelerator."""
     return mock.patch.object(residual_histogram, "_can_read", return_value=False)
 
 
 class RefuseReads(TorchDispatchMode):
-    """Fails where Python looks at a value or a shape depends on it: on an accelerator the host would wait."""
+    """Fails if Python reads a value or a shape depends on a value: on an accelerator the host would wait."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = str(func)
@@ -71,7 +71,7 @@ def fitted(histogram, bound=20.0):
 
 @pytest.mark.parametrize(("sigma", "d"), [(1.5, 2.0), (2.0, 0.5), (3.0, 0.01), (INF, 1.5)])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_density_fitted_to_the_histogram_is_that_of_the_residuals(sigma, d, weighted):
+def test_a_density_fitted_to_the_histogram_equals_that_of_the_residuals(sigma, d, weighted):
     error = drawn(4000, 2, sigma=sigma, d=d)
     weight = torch.rand(4000, 2, dtype=torch.float64) if weighted else None
     raw = fit_density(error, weight=weight, bound=20.0, d_min=1e-4)
@@ -81,7 +81,7 @@ def test_density_fitted_to_the_histogram_is_that_of_the_residuals(sigma, d, weig
     torch.testing.assert_close(found.log_likelihood, raw.log_likelihood, rtol=0, atol=5e-5)
 
 
-def test_residuals_beyond_the_bound_count_as_the_flat_tail():
+def test_residuals_beyond_the_bound_have_the_density_of_the_flat_tail():
     error = torch.cat([drawn(1000, 1), torch.tensor([[25.0], [-80.0], [1e30], [20.0], [-20.0]])])
     histogram = filled(error)
     assert histogram.share_beyond().item() == pytest.approx(3 / 1005)
@@ -90,7 +90,7 @@ def test_residuals_beyond_the_bound_count_as_the_flat_tail():
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-1e-5, 1e-5), min_size=1, max_size=20))
-def test_share_beyond_a_bound_given_at_the_start_is_that_of_the_last_bin(offsets):
+def test_share_beyond_a_bound_given_at_the_start_is_the_last_bin(offsets):
     error = 20.0 * (1.0 + torch.tensor(offsets, dtype=torch.float64).unsqueeze(-1))
     histogram = filled(error, (torch.zeros(3, 1), torch.rand(3, 1)))
     assert torch.equal(histogram.share_beyond(), histogram.sums[0, :, -1] / histogram.weight())
@@ -127,7 +127,7 @@ def test_memory_does_not_grow():
     assert histogram.batches == 3
 
 
-# --- what it is filled with
+# --- added batches
 
 
 @pytest.mark.parametrize(("shape", "channel_dim"), [((3,), 0), ((5, 3), -1), ((5, 3, 4), 1), ((3, 2, 4), 0)])
@@ -142,7 +142,7 @@ def test_channels_may_lie_in_any_dimension(shape, channel_dim, weighted):
     torch.testing.assert_close(found.count, expected.count)
 
 
-def test_a_mask_is_a_weight_and_hides_what_has_no_value():
+def test_a_mask_is_a_weight_and_hides_nan():
     error = drawn(100, 2).float()
     mask = torch.rand(100, 2) < 0.5
     holed = torch.where(mask, error, NAN)
@@ -156,7 +156,7 @@ def test_weight_is_repetition():
     torch.testing.assert_close(filled((error, times)).sums, filled(repeated).sums)
 
 
-def test_autocast_does_not_reach_it():
+def test_autocast_does_not_affect_the_histogram():
     error = drawn(500, 2).float()
     with torch.autocast("cpu", torch.bfloat16):
         found = filled(error)
@@ -215,7 +215,7 @@ def test_no_value_is_read_on_an_accelerator(kind, bound, dtype, shape, channel_d
     assert histogram.sums.device.type == histogram.refused.device.type == "meta"
 
 
-def test_values_are_read_on_the_cpu_as_the_guard_notices():
+def test_the_guard_detects_reads_on_the_cpu():
     with pytest.raises(AssertionError, match="_local_scalar_dense"), RefuseReads():
         ResidualHistogram(torch.ones(2)).add(torch.rand(3, 2))
 
@@ -223,7 +223,7 @@ def test_values_are_read_on_the_cpu_as_the_guard_notices():
 @pytest.mark.parametrize("kind", WEIGHTS)
 @pytest.mark.parametrize("bound", [20.0, None])
 @pytest.mark.parametrize(("shape", "channel_dim"), [((3,), 0), ((50, 3), -1), ((5, 3, 4), 1)])
-def test_an_accelerator_gets_the_sums_of_the_cpu(kind, bound, shape, channel_dim):
+def test_sums_on_an_accelerator_equal_the_cpu(kind, bound, shape, channel_dim):
     batches = [(drawn(*shape, seed=seed).float(), WEIGHTS[kind](*shape)) for seed in (0, 1)]
     found = filled(*batches, bound=bound, channel_dim=channel_dim, on_accelerator=True)
     expected = filled(*batches, bound=bound, channel_dim=channel_dim)
@@ -260,7 +260,7 @@ def test_elements_that_are_not_finite_are_left_out_and_reported_by_channel(data,
     found.check()
 
 
-def test_what_elements_of_weight_0_hold_is_not_refused_on_an_accelerator():
+def test_non_finite_elements_of_weight_0_are_accepted_on_an_accelerator():
     error = torch.tensor([[NAN, 1.0], [INF, 2.0], [1.0, 3.0]])
     for weight in (torch.isfinite(error), torch.isfinite(error).float(), torch.isfinite(error).int()):
         histogram = filled((error, weight), on_accelerator=True)
@@ -276,7 +276,7 @@ def test_refused_elements_survive_a_saved_state():
         restored.check()
 
 
-# --- a bound that is not known at the start
+# --- a bound unknown at the start
 
 
 @settings(max_examples=60, deadline=None)
@@ -297,7 +297,7 @@ def test_bins_reach_64_to_128_times_as_far_as_the_first_batch(values, unit, on_a
 
 
 @pytest.mark.parametrize("on_accelerator", [False, True])
-def test_zeros_and_masked_residuals_leave_the_reach_to_a_later_batch(on_accelerator):
+def test_zeros_and_masked_residuals_do_not_set_the_reach(on_accelerator):
     first = torch.tensor([[0.0, 5.0], [0.0, -0.0]]), torch.tensor([[True, False], [True, True]])
     second = torch.tensor([[0.0, 3.0]]), None
     histogram = filled(first, second, bound=None, on_accelerator=on_accelerator)
@@ -327,7 +327,7 @@ def test_largest_and_smallest_numbers_of_float32_give_a_usable_reach(on_accelera
 
 
 @pytest.mark.parametrize(("sigma", "d"), [(1.5, 2.0), (2.0, 0.5), (INF, 1.5)])
-def test_density_fitted_without_knowing_the_bound_is_that_of_the_residuals(sigma, d):
+def test_a_density_fitted_with_an_unknown_bound_equals_that_of_the_residuals(sigma, d):
     error = drawn(4000, 2, sigma=sigma, d=d)
     raw = fit_density(error, bound=20.0, d_min=1e-4)
     found = fitted(filled(*error.split(100), bound=None))
@@ -355,7 +355,7 @@ def test_a_bin_is_within_a_64th_of_its_residuals(values, first, bound):
     first=st.floats(20.0, 1e3, width=32),
     bound=st.floats(1e-2, 1e3),
 )
-def test_share_beyond_a_bound_set_later_is_right_to_a_bins_width(values, first, bound):
+def test_share_beyond_a_bound_set_later_is_accurate_to_a_bin(values, first, bound):
     histogram = filled(torch.tensor([[first]]), torch.tensor(values).unsqueeze(-1), bound=None)
     sums, reach = histogram.sums.clone(), histogram.reach.clone()
     assert math.isnan(histogram.share_beyond().item())
@@ -367,7 +367,7 @@ def test_share_beyond_a_bound_set_later_is_right_to_a_bins_width(values, first, 
     assert torch.equal(histogram.reach, reach)
 
 
-def test_a_bound_set_before_the_first_batch_is_as_given_at_the_start():
+def test_a_bound_set_before_the_first_batch_equals_a_bound_given_at_the_start():
     error = torch.cat([drawn(100, 2), torch.tensor([[30.0, 20.0]])])
     late = ResidualHistogram(num_channels=2)
     late.set_bound(torch.full((2,), 20.0))
@@ -402,7 +402,7 @@ def test_a_histogram_without_a_number_of_channels_or_with_two_is_refused(bound, 
     on_accelerator=st.booleans(),
     order=st.randoms(use_true_random=False),
 )
-def test_order_of_the_batches_does_not_matter(values, bound, on_accelerator, order):
+def test_the_sums_do_not_depend_on_the_order_of_batches(values, bound, on_accelerator, order):
     first = torch.tensor([[50.0]])
     batches = [torch.tensor(v).unsqueeze(-1) for v in values]
     shuffled = order.sample(batches, len(batches))
@@ -421,7 +421,7 @@ def test_order_of_the_batches_does_not_matter(values, bound, on_accelerator, ord
     ),
     order=st.randoms(use_true_random=False),
 )
-def test_whatever_batch_sets_the_reach_weights_and_squares_are_the_same(values, order):
+def test_weights_and_squares_do_not_depend_on_the_batch_that_sets_the_reach(values, order):
     batches = [torch.tensor(v).unsqueeze(-1) for v in values]
     histogram = filled(*order.sample(batches, len(batches)), bound=None)
     error = torch.cat(batches)
@@ -435,7 +435,7 @@ def test_whatever_batch_sets_the_reach_weights_and_squares_are_the_same(values, 
     cut=st.integers(0, 40),
     weighted=st.booleans(),
 )
-def test_merged_histograms_are_the_histogram_of_all(values, cut, weighted):
+def test_merged_histograms_equal_the_histogram_of_all(values, cut, weighted):
     error = torch.tensor(values).unsqueeze(-1)
     weight = torch.arange(len(values)).remainder(3).unsqueeze(-1) if weighted else None
     parts = [slice(0, cut), slice(cut, None)]
@@ -446,7 +446,7 @@ def test_merged_histograms_are_the_histogram_of_all(values, cut, weighted):
     assert torch.equal(sum(p.weight() for p in pieces), whole.weight())
 
 
-def test_saved_histogram_goes_on_to_the_last_bit():
+def test_a_resumed_histogram_is_bitwise_equal():
     first, second = drawn(50, 2).split(25)
     whole, restored = filled(first, second), ResidualHistogram(torch.full((2,), 20.0))
     restored.load_state_dict(filled(first).state_dict())
@@ -459,7 +459,7 @@ def test_saved_histogram_goes_on_to_the_last_bit():
 @pytest.mark.parametrize("on_accelerator", [False, True])
 @pytest.mark.parametrize("kind", WEIGHTS)
 @pytest.mark.parametrize("saved_after", range(4))
-def test_collection_that_was_saved_and_loaded_ends_with_the_same_bits(saved_after, kind, on_accelerator, tmp_path):
+def test_a_resumed_collection_is_bitwise_equal(saved_after, kind, on_accelerator, tmp_path):
     batches = [(drawn(25, 2, seed=seed).float() * (seed > 0), WEIGHTS[kind](25, 2)) for seed in range(4)]
     whole = filled(*batches, bound=None, on_accelerator=on_accelerator)
     resumed = ResidualHistogram(num_channels=2)
@@ -480,14 +480,14 @@ def test_collection_that_was_saved_and_loaded_ends_with_the_same_bits(saved_afte
     assert all(map(torch.equal, resumed.residuals(), whole.residuals()))
 
 
-def test_empty_state_empties_a_histogram():
+def test_loading_an_empty_state_empties_a_histogram():
     histogram = filled(drawn(50, 2))
     histogram.load_state_dict(ResidualHistogram(torch.ones(2)).state_dict())
     assert not histogram.sums.any()
     assert histogram.bound.tolist() == [1, 1]
 
 
-def test_bins_of_a_loaded_histogram_stay_where_a_bound_is_set():
+def test_setting_a_bound_does_not_change_loaded_bins():
     histogram = filled(drawn(50, 2), bound=None)
     restored = ResidualHistogram(num_channels=2)
     restored.load_state_dict(histogram.state_dict())
@@ -495,7 +495,7 @@ def test_bins_of_a_loaded_histogram_stay_where_a_bound_is_set():
     assert torch.equal(restored.reach, histogram.reach)
 
 
-def test_a_bound_that_was_set_late_is_saved():
+def test_a_bound_set_late_is_saved():
     histogram = filled(drawn(50, 2), bound=None)
     histogram.set_bound(torch.full((2,), 1.0))
     restored = ResidualHistogram(num_channels=2)
@@ -614,7 +614,7 @@ def test_processes_add_up_to_the_histogram_of_all_residuals(tmp_path):
     assert last[0].sum(-1).tolist() == [1, 0, 1]
 
 
-def test_alone_there_is_nothing_to_reduce():
+def test_without_processes_all_reduce_changes_nothing():
     histogram = filled(drawn(5, 2))
     before = histogram.sums.clone()
     histogram.all_reduce()

@@ -180,7 +180,7 @@ def test_data_are_checked_before_whitening():
 
 
 @pytest.mark.parametrize(
-    ("x_shape", "y_shape", "mend"),
+    ("x_shape", "y_shape", "remedy"),
     [
         ((1000,), (1000,), r"\(1000,\) and \(1000,\); one column is X\[:, None\]"),
         ((1000, 3), (1000, 1), r"\(1000, 3\) and \(1000, 1\); one channel is Y\.squeeze\(-1\)"),
@@ -188,8 +188,8 @@ def test_data_are_checked_before_whitening():
         ((1000, 3), (999,), r"\(1000, 3\) and \(999,\)\."),
     ],
 )
-def test_errors_for_wrong_shapes_name_the_remedy(x_shape, y_shape, mend):
-    with pytest.raises(ValueError, match=mend):
+def test_errors_for_wrong_shapes_name_the_remedy(x_shape, y_shape, remedy):
+    with pytest.raises(ValueError, match=remedy):
         LeastSquares().fit(sample(0, *x_shape), sample(1, *y_shape))
 
 
@@ -202,9 +202,7 @@ def test_prediction_takes_what_the_fit_took(kind):
         fit.predict(X.tolist())
     with pytest.raises(TypeError, match=r"`X` of the dtype .* of the fit, torch\.float64 .* but got torch\.float32"):
         fit.predict(X.float())
-    with pytest.raises(
-        ValueError, match="`X` with 2 columns in its last dimension but got 3; pass those of the fit"
-    ):
+    with pytest.raises(ValueError, match="`X` with 2 columns in its last dimension but got 3; pass those of the fit"):
         fit.predict(sample(0, 30, 3))
 
 

@@ -94,7 +94,7 @@ def test_missing_values_of_a_frame_are_reported_by_column():
     frame.loc[3:5, "b"] = pd.NA
     with pytest.raises(ValueError, match=r"column `b` of argument `X` to have a value .* 3 missing of 30"):
         LeastSquares().fit(frame, y)
-    with pytest.raises(TypeError, match=r"column `kind` of argument `X` .* text, 'x' say"):
+    with pytest.raises(TypeError, match=r"column `kind` of argument `X` .* text, .*'x'"):
         LeastSquares().fit(framed(pd.DataFrame, X).assign(kind="x"), y)
     with pytest.raises(ValueError, match="`Y` to be finite but got nan"):
         LeastSquares().fit(X, np.full(30, np.nan))

@@ -464,12 +464,12 @@ def test_one_design_serves_many_targets():
 def test_the_unit_of_the_targets_does_not_matter(exponent, sign):
     X, Y = channels(0)
     factor = 10.0**exponent
-    one, other = MKCRegression().fit(X, Y), MKCRegression().fit(X, sign * factor * Y)
-    torch.testing.assert_close(other.coef_, sign * factor * one.coef_, rtol=1e-5, atol=0)
-    torch.testing.assert_close(other.d_, factor * one.d_, rtol=1e-5, atol=0)
-    torch.testing.assert_close(other.bound_, factor * one.bound_, rtol=1e-5, atol=0)
-    torch.testing.assert_close(other.sigma_.pow(-2), one.sigma_.pow(-2), rtol=1e-4, atol=1e-6)
-    shifted = one.log_likelihood_ - 160 * math.log(factor)
+    reference, other = MKCRegression().fit(X, Y), MKCRegression().fit(X, sign * factor * Y)
+    torch.testing.assert_close(other.coef_, sign * factor * reference.coef_, rtol=1e-5, atol=0)
+    torch.testing.assert_close(other.d_, factor * reference.d_, rtol=1e-5, atol=0)
+    torch.testing.assert_close(other.bound_, factor * reference.bound_, rtol=1e-5, atol=0)
+    torch.testing.assert_close(other.sigma_.pow(-2), reference.sigma_.pow(-2), rtol=1e-4, atol=1e-6)
+    shifted = reference.log_likelihood_ - 160 * math.log(factor)
     torch.testing.assert_close(other.log_likelihood_, shifted, rtol=0, atol=1e-5)
 
 
@@ -477,31 +477,31 @@ def test_the_unit_of_the_targets_does_not_matter(exponent, sign):
 def test_the_unit_of_one_channel_does_not_matter(factor):
     X, Y = channels(0)
     unit, bound = torch.tensor([1.0, factor]).double(), torch.tensor([10.0, 20.0]).double()
-    one = MKCRegression(bound=bound).fit(X, Y)
+    reference = MKCRegression(bound=bound).fit(X, Y)
     other = MKCRegression(bound=bound * unit).fit(X * unit.unsqueeze(-1), Y * unit)
-    torch.testing.assert_close(other.coef_, one.coef_, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(other.d_, one.d_ * unit, rtol=1e-5, atol=0)
+    torch.testing.assert_close(other.coef_, reference.coef_, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(other.d_, reference.d_ * unit, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_the_unit_of_one_channel_hardly_moves_the_default_domain(factor):
     X, Y = channels(0)
     unit = torch.tensor([1.0, factor]).double()
-    one, other = MKCRegression().fit(X, Y), MKCRegression().fit(X * unit.unsqueeze(-1), Y * unit)
-    torch.testing.assert_close(other.bound_, one.bound_ * unit, rtol=1e-2, atol=0)
-    torch.testing.assert_close(other.coef_, one.coef_, rtol=0, atol=1e-3)
-    torch.testing.assert_close(other.d_, one.d_ * unit, rtol=1e-3, atol=0)
+    reference, other = MKCRegression().fit(X, Y), MKCRegression().fit(X * unit.unsqueeze(-1), Y * unit)
+    torch.testing.assert_close(other.bound_, reference.bound_ * unit, rtol=1e-2, atol=0)
+    torch.testing.assert_close(other.coef_, reference.coef_, rtol=0, atol=1e-3)
+    torch.testing.assert_close(other.d_, reference.d_ * unit, rtol=1e-3, atol=0)
 
 
 def test_columns_of_very_different_size_and_regression_equivariance():
     X, y = line(0, n=4)
     factor, shift = torch.tensor([1e-8, 1.0, 1e3, 1e8], dtype=torch.float64), sample(7, 4)
-    one = MKCRegression().fit(X, y)
+    reference = MKCRegression().fit(X, y)
     other = MKCRegression().fit(X * factor, y)
-    torch.testing.assert_close(other.coef_ * factor, one.coef_, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(other.coef_ * factor, reference.coef_, rtol=1e-5, atol=1e-6)
     moved = MKCRegression().fit(X, y + X @ shift)
-    torch.testing.assert_close(moved.coef_, one.coef_ + shift, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(moved.d_, one.d_, rtol=1e-5, atol=0)
+    torch.testing.assert_close(moved.coef_, reference.coef_ + shift, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(moved.d_, reference.d_, rtol=1e-5, atol=0)
 
 
 def test_float32_stays_float32():

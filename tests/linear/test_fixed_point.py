@@ -140,10 +140,10 @@ def test_telef_at_h_1():
 @given(ratio=st.floats(0.01, 100.0))
 def test_one_channel_depends_on_sigma_times_d_alone(ratio):
     X, y = contaminated_line(0)
-    one, other = FixedPointLinear(sigma=3.0, d=0.5).fit(X, y), FixedPointLinear(sigma=3.0 * ratio, d=0.5 / ratio)
-    torch.testing.assert_close(other.fit(X, y).coef_, one.coef_, rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(other.weights_, one.weights_, rtol=0, atol=1e-6)
-    torch.testing.assert_close(other.covariance_, one.covariance_, rtol=1e-4, atol=1e-9)
+    reference, other = FixedPointLinear(sigma=3.0, d=0.5).fit(X, y), FixedPointLinear(sigma=3.0 * ratio, d=0.5 / ratio)
+    torch.testing.assert_close(other.fit(X, y).coef_, reference.coef_, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(other.weights_, reference.weights_, rtol=0, atol=1e-6)
+    torch.testing.assert_close(other.covariance_, reference.covariance_, rtol=1e-4, atol=1e-9)
 
 
 # the equation and its objective
@@ -387,10 +387,10 @@ def test_one_design_serves_many_targets():
 def test_columns_of_very_different_size_are_solved():
     X, y = contaminated_line(0, n=4)
     factor = torch.tensor([1e-8, 1.0, 1e3, 1e8], dtype=torch.float64)
-    one, other = FixedPointLinear(sigma=2.0).fit(X, y), FixedPointLinear(sigma=2.0).fit(X * factor, y)
-    torch.testing.assert_close(other.coef_ * factor, one.coef_, rtol=1e-7, atol=1e-8)
+    reference, other = FixedPointLinear(sigma=2.0).fit(X, y), FixedPointLinear(sigma=2.0).fit(X * factor, y)
+    torch.testing.assert_close(other.coef_ * factor, reference.coef_, rtol=1e-7, atol=1e-8)
     scaled = other.covariance_ * factor * factor.unsqueeze(-1)
-    torch.testing.assert_close(scaled, one.covariance_, rtol=1e-5, atol=1e-10)
+    torch.testing.assert_close(scaled, reference.covariance_, rtol=1e-5, atol=1e-10)
 
 
 def test_dependent_columns_are_refused_by_name():

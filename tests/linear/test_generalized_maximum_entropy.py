@@ -141,8 +141,8 @@ def test_a_batch_is_a_loop():
     assert fit.probabilities_.shape == (4, 3, 5)
     assert fit.n_iter_.shape == fit.entropy_.shape == (4,)
     for i in range(4):
-        one = GeneralizedMaximumEntropy(5.0, d).fit(X[i], Y[i])
-        torch.testing.assert_close(fit.coef_[i], one.coef_, rtol=1e-8, atol=1e-10)
+        reference = GeneralizedMaximumEntropy(5.0, d).fit(X[i], Y[i])
+        torch.testing.assert_close(fit.coef_[i], reference.coef_, rtol=1e-8, atol=1e-10)
     torch.testing.assert_close(fit.predict(X)[2], X[2] @ fit.coef_[2], rtol=1e-12, atol=1e-12)
 
 

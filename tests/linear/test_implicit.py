@@ -1,4 +1,4 @@
-"""Fits as differentiable layers: comparison with unrolled steps and finite differences, transforms, limits, refusals."""
+"""Fits as differentiable layers: comparison with unrolled steps and differences of fits, transforms, limits."""
 
 import math
 
@@ -307,12 +307,12 @@ def em_scale(X: Tensor, y: Tensor, weight: Tensor) -> Tensor:
     return torch.cat([fit.coef_, fit.d_])
 
 
-def led_scale(X: Tensor, y: Tensor, weight: Tensor) -> Tensor:
+def graduated_scale(X: Tensor, y: Tensor, weight: Tensor) -> Tensor:
     fit = FixedPointLinear(2.0, 0.3, start=X[:3].sum(-1)).fit(X, y, weight)
     return torch.cat([fit.coef_, fit.weights_.sum(-2)])
 
 
-@pytest.mark.parametrize("function", [em_scale, led_scale])
+@pytest.mark.parametrize("function", [em_scale, graduated_scale])
 def test_vmap_is_a_loop(function):
     X, y, weight = line(0, batch=(4,))
     one_by_one = torch.stack([function(*leaves(*v)) for v in zip(X, y, weight, strict=True)])
@@ -324,7 +324,7 @@ def test_vmap_is_a_loop(function):
     torch.testing.assert_close(shared, one_by_one, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("function", [em_scale, led_scale])
+@pytest.mark.parametrize("function", [em_scale, graduated_scale])
 def test_gradients_under_vmap_are_those_of_a_loop(function):
     data = line(0, batch=(3,))
     slope = torch.func.grad(lambda *a: function(*a).square().sum(), argnums=(0, 1, 2))
@@ -444,7 +444,7 @@ def test_a_fit_that_has_not_converged_is_refused(estimator):
     fit = estimator.fit(X, y.requires_grad_(), weight)
     assert not bool(fit.converged_)
     torch.testing.assert_close(fit.coef_.detach(), plain, rtol=1e-12, atol=1e-13)
-    with pytest.raises(NotDifferentiableError, match="a converged fit .* has not converged; raise `max_iter`"):
+    with pytest.raises(NotDifferentiableError, match=r"a converged fit .* has not converged; raise `max_iter`"):
         fit.coef_.sum().backward()
 
 

@@ -80,12 +80,12 @@ def test_inference_has_the_shapes_of_the_batch(estimator):
 def test_covariances_are_equivariant(estimator, covariance):
     X, y = line(2, 60, outliers=0.1)
     mix = torch.tensor([[1.0, 0.5, 0.0], [0.0, 30.0, 1.0], [0.0, 2.0, -0.01]], dtype=torch.float64)
-    one = set_to(estimator, covariance=covariance, bandwidth=4.0).fit(X, y)
-    other = set_to(one).fit(X @ mix, 1e3 * y)
+    reference = set_to(estimator, covariance=covariance, bandwidth=4.0).fit(X, y)
+    other = set_to(reference).fit(X @ mix, 1e3 * y)
     back = mix @ other.covariance_ @ mix.mT / 1e6
     # the searches start elsewhere, and are converged to half of the digits
-    torch.testing.assert_close(back, one.covariance_, rtol=1e-3, atol=1e-6)
-    torch.testing.assert_close(other.r_squared_, one.r_squared_, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(back, reference.covariance_, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(other.r_squared_, reference.r_squared_, rtol=1e-4, atol=1e-4)
 
 
 def test_without_rejections_standard_errors_are_those_of_least_squares():
@@ -147,8 +147,8 @@ def test_a_weight_of_two_is_a_sample_that_occurs_twice(estimator, covariance):
 def test_a_series_of_no_lags_is_the_sandwich_and_a_slow_one_is_less_certain(estimator):
     X, y = line(10, 400, 2)
     plain = set_to(estimator).fit(X, y)
-    none = set_to(estimator, covariance="hac", bandwidth=0.0).fit(X, y)
-    torch.testing.assert_close(none.covariance_, plain.covariance_)
+    no_lags = set_to(estimator, covariance="hac", bandwidth=0.0).fit(X, y)
+    torch.testing.assert_close(no_lags.covariance_, plain.covariance_)
     slow = y + 3.0 * torch.sin(torch.arange(400.0) / 30.0)
     independent, series = set_to(estimator).fit(X, slow), set_to(estimator, covariance="hac").fit(X, slow)
     assert float(series.standard_error_[0]) > 1.3 * float(independent.standard_error_[0])
@@ -239,12 +239,12 @@ def test_standard_errors_of_the_values_kept_have_derivatives(estimator):
 
 def test_wald_of_one_coefficient_is_the_square_of_its_t():
     fit = MMRegression().fit(*line(20, 60))
-    one = fit.wald_test([1])
-    torch.testing.assert_close(one.statistic, (fit.coef_[1] / fit.standard_error_[1]).square())
-    torch.testing.assert_close(one.p_value, fit.p_value_[1])
-    assert one.restrictions == 1
+    reference = fit.wald_test([1])
+    torch.testing.assert_close(reference.statistic, (fit.coef_[1] / fit.standard_error_[1]).square())
+    torch.testing.assert_close(reference.p_value, fit.p_value_[1])
+    assert reference.restrictions == 1
     same = fit.wald_test(torch.tensor([0.0, 5.0, 0.0]))
-    torch.testing.assert_close(same.p_value, one.p_value)
+    torch.testing.assert_close(same.p_value, reference.p_value)
     assert float(fit.wald_test([0, 1, -1], value=fit.coef_).p_value) == pytest.approx(1.0)
 
 

@@ -56,7 +56,7 @@ def channels() -> tuple[Tensor, Tensor]:
     return X, Y
 
 
-def seldom() -> tuple[Tensor, Tensor]:
+def rare_column() -> tuple[Tensor, Tensor]:
     """A column that is 1 in 30 rows and 0 elsewhere."""
     X, y = sample()
     X = torch.cat([X, torch.zeros(N, 1).double()], 1)
@@ -86,7 +86,7 @@ HARD = {
     "heavy tails": heavy_tailed,
     "ties": rounded,
     "two channels": channels,
-    "a column that is seldom other than 0": seldom,
+    "a column that is seldom other than 0": rare_column,
     "a column far from 0": lambda: changed(move_x=1e8),
     "targets far from 0": lambda: changed(move_y=1e8),
     "columns of different size": lambda: changed(unit_x=1e-8),
@@ -100,12 +100,12 @@ def piloted(monkeypatch) -> list[bool]:
     ends: list[bool] = []
     whole = _large.large_maximum
 
-    def told(*args, **kwargs):
+    def recorded(*args, **kwargs):
         found = whole(*args, **kwargs)
         ends.append(found is not None)
         return found
 
-    monkeypatch.setattr(em, "large_maximum", told)
+    monkeypatch.setattr(em, "large_maximum", recorded)
     return ends
 
 
@@ -116,10 +116,14 @@ def directly(monkeypatch) -> None:
 
 def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = None, **given: float) -> MKCRegression:
     """The converged fit on the same domain, by the Newton steps of a differentiable fit."""
-    rest = MKCRegression(bound=fit.bound_, start=fit.coef_, **given).fit(X.clone().requires_grad_(), Y, weight)
-    rest.coef_, rest.sigma_, rest.d_ = rest.coef_.detach(), rest.sigma_.detach(), rest.d_.detach()
-    rest.weights_, rest.log_likelihood_ = rest.weights_.detach(), rest.log_likelihood_.detach()
-    return rest
+    polished = MKCRegression(bound=fit.bound_, start=fit.coef_, **given).fit(X.clone().requires_grad_(), Y, weight)
+    polished.coef_, polished.sigma_, polished.d_ = (
+        polished.coef_.detach(),
+        polished.sigma_.detach(),
+        polished.d_.detach(),
+    )
+    polished.weights_, polished.log_likelihood_ = polished.weights_.detach(), polished.log_likelihood_.detach()
+    return polished
 
 
 def apart(fit: MKCRegression, other: MKCRegression) -> float:
@@ -132,16 +136,16 @@ def test_a_large_fit_is_fully_converged(case, piloted):
     X, Y = HARD[case]()
     fit = MKCRegression().fit(X, Y)
     assert piloted == [True]
-    rest = converged(fit, X, Y)
+    polished = converged(fit, X, Y)
     # coefficients of 1e8 have coarser last digits
-    assert apart(fit, rest) < (1e-4 if "far" in case else 1e-6)
-    gaussian = torch.isinf(rest.sigma_)
+    assert apart(fit, polished) < (1e-4 if "far" in case else 1e-6)
+    gaussian = torch.isinf(polished.sigma_)
     assert torch.equal(torch.isinf(fit.sigma_), gaussian)
-    torch.testing.assert_close(fit.sigma_[~gaussian], rest.sigma_[~gaussian], rtol=1e-6, atol=0.0)
-    torch.testing.assert_close(fit.d_, rest.d_, rtol=1e-7, atol=0.0)
-    torch.testing.assert_close(fit.log_likelihood_, rest.log_likelihood_, rtol=1e-9, atol=1e-6)
-    torch.testing.assert_close(fit.weights_, rest.weights_, rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(fit.standard_error_, rest.standard_error_, rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(fit.sigma_[~gaussian], polished.sigma_[~gaussian], rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(fit.d_, polished.d_, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(fit.log_likelihood_, polished.log_likelihood_, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(fit.weights_, polished.weights_, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(fit.standard_error_, polished.standard_error_, rtol=1e-4, atol=0.0)
     assert bool(fit.converged_)
     assert not bool(fit.exact_fit_)
 
@@ -225,7 +229,7 @@ def test_more_levels_end_at_the_same_maximum(monkeypatch, piloted):
     X, y = sample()
     fit = MKCRegression().fit(X, y)
     monkeypatch.setattr(_large, "_GROWTH", 2)
-    monkeypatch.setattr(_large, "_AHEAD", 2)
+    monkeypatch.setattr(_large, "_LEAST_FACTOR_TO_ALL", 2)
     again = MKCRegression(bound=fit.bound_).fit(X, y)
     assert piloted == [True, True]
     assert apart(fit, again) < 1e-6
@@ -346,8 +350,8 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     monkeypatch.setattr(_blocks, "_STRIP", 100)
     monkeypatch.setattr(_passes, "blocks", lambda *args: blocks(*args, 1234))
     again, transformed = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
-    for one, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-6)
+    for reference, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
+        torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
 
 
 def test_a_frame_is_a_change_of_columns():
@@ -383,7 +387,7 @@ def test_score_is_the_slope_of_the_energy():
 
 
 def test_rows_in_use_are_drawn_and_rare_rows_by_leverage():
-    X, y = seldom()
+    X, y = rare_column()
     weight = (torch.arange(N) % 2).double()
     index = drawn_rows(checked_shapes(X, y, weight), 2000, 0)
     assert (weight[index] == 1).all()

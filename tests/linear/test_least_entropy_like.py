@@ -217,9 +217,9 @@ def test_a_batch_is_a_loop(weighted, monkeypatch):
     assert fit.weights_.shape == (5, 60, 1)
     assert fit.n_iter_.shape == fit.converged_.shape == fit.entropy_.shape == (5,)
     for i in range(5):
-        one = LeastEntropyLike().fit(X[i], Y[i], None if w is None else w[i])
-        torch.testing.assert_close(fit.minima_[i], one.minima_, rtol=1e-8, atol=1e-9)
-        torch.testing.assert_close(fit.coef_[i], one.coef_, rtol=1e-8, atol=1e-9)
+        reference = LeastEntropyLike().fit(X[i], Y[i], None if w is None else w[i])
+        torch.testing.assert_close(fit.minima_[i], reference.minima_, rtol=1e-8, atol=1e-9)
+        torch.testing.assert_close(fit.coef_[i], reference.coef_, rtol=1e-8, atol=1e-9)
     monkeypatch.setattr("mkc_torch.linear.least_entropy_like._CHUNK", 2000)
     parts = LeastEntropyLike().fit(X.unsqueeze(-2), Y.unsqueeze(-1), w)
     torch.testing.assert_close(parts.minima_, fit.minima_, rtol=1e-8, atol=1e-9)
@@ -262,7 +262,7 @@ def test_float32_gives_the_fit_of_float64():
     torch.testing.assert_close(single.coef_.double(), LeastEntropyLike().fit(X, y).coef_, rtol=1e-4, atol=1e-4)
 
 
-# no solution, or an exact one
+# no solution, or an exact solution
 
 
 def test_an_exact_fit_is_least_squares_with_entropy_zero():

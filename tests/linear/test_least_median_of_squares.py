@@ -20,10 +20,10 @@ def sample(seed: int, *shape: int) -> Tensor:
 def linear_program(X: np.ndarray, y: np.ndarray) -> float:
     """Minimum over the coefficients of the largest absolute residual."""
     N, n = X.shape
-    one = np.ones((N, 1))
+    column = np.ones((N, 1))
     found = linprog(
         [0.0] * n + [1.0],
-        np.block([[X, -one], [-X, -one]]),
+        np.block([[X, -column], [-X, -column]]),
         np.concatenate([y, -y]),
         bounds=[(None, None)] * n + [(0, None)],
         method="highs",

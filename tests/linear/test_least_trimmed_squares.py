@@ -154,8 +154,8 @@ def test_scale_of_gaussian_residuals_is_their_standard_deviation():
 def test_order_statistic_counts_ties():
     values = torch.tensor([3.0, 1.0, 2.0, 2.0, 2.0, 5.0], dtype=torch.float64).reshape(1, 6, 1)
     assert [float(order_statistic(values, None, h)) for h in range(1, 7)] == [1, 2, 2, 2, 3, 5]
-    ones = torch.ones_like(values)
-    assert [float(order_statistic(values, ones, h)) for h in range(1, 7)] == [1, 2, 2, 2, 3, 5]
+    unit_weight = torch.ones_like(values)
+    assert [float(order_statistic(values, unit_weight, h)) for h in range(1, 7)] == [1, 2, 2, 2, 3, 5]
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)
@@ -266,11 +266,14 @@ def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_the_unit_of_a_channel_does_not_matter(factor):
-    one, other = LeastTrimmedSquares().fit(*two_channels(0, 1.0)), LeastTrimmedSquares().fit(*two_channels(0, factor))
-    torch.testing.assert_close(other.coef_, one.coef_, rtol=1e-8, atol=1e-9)
-    torch.testing.assert_close(other.scale_, one.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-7, atol=0)
-    torch.testing.assert_close(other.weights_, one.weights_)
-    torch.testing.assert_close(one.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
+    reference, other = (
+        LeastTrimmedSquares().fit(*two_channels(0, 1.0)),
+        LeastTrimmedSquares().fit(*two_channels(0, factor)),
+    )
+    torch.testing.assert_close(other.coef_, reference.coef_, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(other.scale_, reference.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-7, atol=0)
+    torch.testing.assert_close(other.weights_, reference.weights_)
+    torch.testing.assert_close(reference.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
 
 
 def test_each_channel_keeps_its_own_samples():
@@ -307,8 +310,8 @@ def test_no_starts_are_refused():
 def test_one_seed_gives_one_result():
     X, y = sample(0, 30, 4), sample(1, 30)
     state = torch.random.get_rng_state()
-    one, other = LeastTrimmedSquares(starts=3, seed=5).fit(X, y), LeastTrimmedSquares(starts=3, seed=5).fit(X, y)
-    assert torch.equal(one.coef_, other.coef_)
+    reference, other = LeastTrimmedSquares(starts=3, seed=5).fit(X, y), LeastTrimmedSquares(starts=3, seed=5).fit(X, y)
+    assert torch.equal(reference.coef_, other.coef_)
     assert torch.equal(torch.random.get_rng_state(), state)  # the global generator is not used
 
 

@@ -127,7 +127,7 @@ def test_channels_have_scales_of_their_own():
     fit = MEstimator().fit(X, Y)
     assert fit.scale_.shape == (2,)
     assert float(fit.scale_[1] / fit.scale_[0]) > 300
-    # the noisy channel has no say
+    # the noisy channel has no influence
     torch.testing.assert_close(fit.coef_, MEstimator().fit(X[:, 0], Y[:, 0]).coef_, rtol=0, atol=0.02)
 
 

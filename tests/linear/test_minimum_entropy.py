@@ -182,8 +182,8 @@ def test_a_batch_is_a_loop_and_samples_have_no_order():
     assert fit.bandwidth_.shape == (3, 1)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
     for i, (x, y) in enumerate(pairs):
-        one = MinimumEntropy(start=start).fit(x[order], y[order])
-        torch.testing.assert_close(fit.coef_[i], one.coef_, rtol=1e-6, atol=1e-7)
+        reference = MinimumEntropy(start=start).fit(x[order], y[order])
+        torch.testing.assert_close(fit.coef_[i], reference.coef_, rtol=1e-6, atol=1e-7)
 
 
 def test_channels_share_their_coefficients():

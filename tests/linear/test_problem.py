@@ -117,7 +117,7 @@ def test_normal_equations_in_chunks_equal_those_at_once(few, x_batch, stack, mon
     whole = problem.normal_equations(weight)
     monkeypatch.setattr("mkc_torch.linear._problem._CHUNK", 300)
     monkeypatch.setattr("mkc_torch.linear._problem._BLOCK", 6)
-    monkeypatch.setattr("mkc_torch.linear._problem._FEW", few)
+    monkeypatch.setattr("mkc_torch.linear._problem._MAX_SETS_IN_BLOCKS", few)
     for part, at_once in zip(problem.normal_equations(weight), whole, strict=True):
         torch.testing.assert_close(part, at_once)
 
@@ -127,11 +127,12 @@ def test_select_keeps_the_problems_at_the_index(x_batch):
     X, Y, weight = sample(0, *x_batch, 20, 3), sample(1, 4, 20), sample(2, 4, 20).exp()
     problem = linear_problem(X, Y, weight)
     index = torch.tensor([2, 0])
-    ones = torch.ones_like(problem.Y)
+    unit_weight = torch.ones_like(problem.Y)
     part = problem.select(index)
     assert part.batch == (2,)
     torch.testing.assert_close(
-        part.coefficients(part.weighted_fit(ones[index])), problem.coefficients(problem.weighted_fit(ones))[index]
+        part.coefficients(part.weighted_fit(unit_weight[index])),
+        problem.coefficients(problem.weighted_fit(unit_weight))[index],
     )
 
 

@@ -101,7 +101,7 @@ def test_bisquare_breakdown_is_the_mean_of_rho():
 
 
 @pytest.mark.parametrize(
-    ("name", "tuning", "wanted"),
+    ("name", "tuning", "expected"),
     [
         ("huber", 0.0, "one positive number"),
         ("tukey", (1.0, 2.0), "one positive number"),

@@ -185,10 +185,10 @@ def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_the_unit_of_a_channel_does_not_matter(factor):
-    one, other = SRegression().fit(*two_channels(0, 1.0)), SRegression().fit(*two_channels(0, factor))
-    torch.testing.assert_close(other.coef_, one.coef_, rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(other.scale_, one.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-6, atol=0)
-    torch.testing.assert_close(one.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
+    reference, other = SRegression().fit(*two_channels(0, 1.0)), SRegression().fit(*two_channels(0, factor))
+    torch.testing.assert_close(other.coef_, reference.coef_, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(other.scale_, reference.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(reference.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
 
 
 def test_the_product_of_the_channels_scales_is_minimal():
@@ -251,8 +251,8 @@ def test_no_starts_are_refused():
 
 def test_one_seed_gives_one_result():
     X, y = sample(0, 30, 4), sample(1, 30)
-    one, other = SRegression(starts=3, seed=5).fit(X, y), SRegression(starts=3, seed=5).fit(X, y)
-    assert torch.equal(one.coef_, other.coef_)
+    reference, other = SRegression(starts=3, seed=5).fit(X, y), SRegression(starts=3, seed=5).fit(X, y)
+    assert torch.equal(reference.coef_, other.coef_)
 
 
 @pytest.mark.parametrize(("n", "drawn"), [(1, 30), (2, 73), (3, 156), (4, 322), (5, 500), (6, 500), (12, 500)])

@@ -45,7 +45,7 @@ def undetermined(_):
     }
 
 
-@parametrize_with_checks([ScikitLearnRegressor(estimator) for estimator in CHECKED], expected_failed_checks=undetermined)
+@parametrize_with_checks([ScikitLearnRegressor(inner) for inner in CHECKED], expected_failed_checks=undetermined)
 def test_scikit_learn_finds_nothing_to_object_to(estimator, check):
     check(estimator)
 
@@ -58,7 +58,7 @@ def data(count=60, outliers=12):
     return X, y
 
 
-def with_ones(X):
+def with_intercept(X):
     return torch.from_numpy(np.column_stack([X, np.ones(len(X))])).unsqueeze(-2)
 
 
@@ -66,14 +66,14 @@ def with_ones(X):
 def test_the_numbers_are_those_of_the_estimator(kind):
     X, y = data()
     fit = ScikitLearnRegressor(made(kind)).fit(X, y)
-    inner = made(kind).fit(with_ones(X), torch.from_numpy(y).unsqueeze(-1))
+    inner = made(kind).fit(with_intercept(X), torch.from_numpy(y).unsqueeze(-1))
     np.testing.assert_array_equal(fit.coef_, inner.coef_[:-1].numpy())
     assert fit.intercept_ == inner.coef_[-1].item()
     np.testing.assert_array_equal(fit.weights_, inner.weights_[:, 0].numpy())
     assert hasattr(fit, "scale_") == hasattr(inner, "scale_")
     if hasattr(inner, "scale_"):
         assert fit.scale_ == inner.scale_.item()
-    np.testing.assert_allclose(fit.predict(X), inner.predict(with_ones(X)).squeeze(-1).numpy(), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fit.predict(X), inner.predict(with_intercept(X)).squeeze(-1).numpy(), rtol=0, atol=1e-12)
 
 
 def test_without_an_intercept_least_squares_is_that_of_scikit_learn():
@@ -169,7 +169,7 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="at least 4 values for 4 coefficients but got 3 samples"):
         ScikitLearnRegressor().fit(X[:3], y[:3])
     X[:, 1] = 2.0
-    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] .* Column 3 is the constant column of the intercept"):
+    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] .* Column 3 is the constant column"):
         ScikitLearnRegressor().fit(X, y)
     with pytest.raises(ValueError, match="`sample_weight` to be >= 0"):
         ScikitLearnRegressor().fit(*data(), sample_weight=-np.ones(60))

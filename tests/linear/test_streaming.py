@@ -108,10 +108,10 @@ def test_a_weight_of_two_is_two_rows():
     weight = 1.0 + torch.arange(len(X)).double() % 2
     index = torch.arange(len(X)).repeat_interleave(weight.long())
     bound = 30.0
-    one = StreamedMKCRegression(bound=bound).fit(cut(X, Y, weight))
+    reference = StreamedMKCRegression(bound=bound).fit(cut(X, Y, weight))
     other = StreamedMKCRegression(bound=bound).fit(cut(X[index], Y[index]))
-    torch.testing.assert_close(one.coef_, other.coef_, rtol=1e-9, atol=0)
-    torch.testing.assert_close(one.log_likelihood_, other.log_likelihood_, rtol=1e-9, atol=0)
+    torch.testing.assert_close(reference.coef_, other.coef_, rtol=1e-9, atol=0)
+    torch.testing.assert_close(reference.log_likelihood_, other.log_likelihood_, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -158,14 +158,14 @@ def test_a_pass_in_float32_is_good_to_six_digits(weighted):
     exact = StreamSums.of(slopes_pass(cut(*arrays), shape, point, curvature=False), shape)
     assert rough.rows == exact.rows
     for name in ("residual", "energy", "first", "qw", "score"):
-        one, other = getattr(rough, name), getattr(exact, name)
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()), msg=name)
+        reference, other = getattr(rough, name), getattr(exact, name)
+        torch.testing.assert_close(reference, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()), msg=name)
 
 
 def test_the_first_steps_of_float32_data_are_made_in_float32(monkeypatch):
     X, Y = (t.float() for t in problem(1, N=6000))
     calls = []
-    monkeypatch.setattr(regression, "rough_pass", lambda *given: calls.append(given) or float32_pass(*given))
+    monkeypatch.setattr(regression, "float32_pass", lambda *given: calls.append(given) or float32_pass(*given))
     fit = StreamedMKCRegression(pilot=1000).fit(cut(X, Y, rows=1000))
     assert calls
     assert_same(fit, in_memory(X.double(), Y.double(), bound=fit.bound_))
@@ -189,13 +189,13 @@ def test_an_exact_fit_of_most_rows():
 
 def test_neither_the_size_of_batches_nor_of_blocks_matters(monkeypatch):
     X, Y = problem(2, N=3000)
-    one = StreamedMKCRegression(pilot=300).fit(cut(X, Y, rows=3000))
+    reference = StreamedMKCRegression(pilot=300).fit(cut(X, Y, rows=3000))
     monkeypatch.setattr(_blocks, "BLOCK_VALUES", 400)
     for rows in (7, 1000):
         other = StreamedMKCRegression(pilot=300).fit(cut(X, Y, rows=rows))
-        torch.testing.assert_close(one.coef_, other.coef_, rtol=1e-10, atol=0)
-        torch.testing.assert_close(one.covariance_, other.covariance_, rtol=1e-8, atol=1e-15)
-        assert torch.allclose(one.bound_, other.bound_, rtol=1e-12)
+        torch.testing.assert_close(reference.coef_, other.coef_, rtol=1e-10, atol=0)
+        torch.testing.assert_close(reference.covariance_, other.covariance_, rtol=1e-8, atol=1e-15)
+        assert torch.allclose(reference.bound_, other.bound_, rtol=1e-12)
 
 
 def test_a_loader_that_shuffles():

@@ -1,4 +1,4 @@
-"""Streamed fits of a process group: two ranks give the results of one; an error or death of a rank is an error on all."""
+"""Streamed fits of a process group: two ranks give the results of one rank; an error or loss of a rank fails all."""
 
 import multiprocessing
 import os
@@ -136,13 +136,13 @@ def _errors_of_ranks(rank, folder):
 @pytest.mark.process
 def test_two_ranks_are_one(tmp_path):
     assert run(_fits, tmp_path) == [0, 0]
-    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
-    for name, fields in one.items():
+    reference, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    for name, fields in reference.items():
         assert all(torch.equal(value, other[name][field]) for field, value in fields.items()), name
     X, Y = table()
     alone = fitted(StreamedMKCRegression(pilot=300).fit(from_memmap(X, Y)))
     given = fitted(StreamedMKCRegression(pilot=300, bound=30.0).fit(from_memmap(X, Y)))
-    for name, fields in one.items():
+    for name, fields in reference.items():
         for field in FIELDS[:-1]:
             expected = (given if name == "uncounted" else alone)[field]
             torch.testing.assert_close(fields[field], expected, rtol=1e-8, atol=1e-14, msg=f"{name} {field}")

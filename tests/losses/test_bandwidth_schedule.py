@@ -1,4 +1,4 @@
-"""The schedule from the sharp initial loss to Welsch's of the selected bandwidth: arithmetic on a counter."""
+"""The schedule from the sharp initial loss to Welsch's at the selected bandwidth: arithmetic on a counter."""
 
 import copy
 import math
@@ -31,7 +31,7 @@ def followed(residual, prediction=None):
 
 
 def selecting(monkeypatch, bandwidth, better):
-    """Let every selection be this one; ``better`` may be changed in place."""
+    """Replace the selection by a constant; ``better`` may be changed in place."""
     bandwidth, better = torch.tensor(bandwidth, dtype=torch.float64), torch.tensor(better)
 
     def selected(xp, *_):
@@ -53,7 +53,7 @@ def arrays(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("arrays")
-def test_in_the_warm_up_the_initial_loss_is_used_alone_and_then_the_share_grows_at_every_fourth_batch(monkeypatch):
+def test_the_share_is_0_in_the_warm_up_and_then_grows_at_every_fourth_batch(monkeypatch):
     selecting(monkeypatch, [2.0], [True])
     scale, schedule = followed(randn(20, 1)), BandwidthSchedule(1).double()
     for batch in range(3 * WARMUP_STEPS):
@@ -66,7 +66,7 @@ def test_in_the_warm_up_the_initial_loss_is_used_alone_and_then_the_share_grows_
 
 
 @pytest.mark.usefixtures("arrays")
-def test_the_share_falls_where_the_initial_loss_has_the_smaller_risk_and_stays_in_0_and_1(monkeypatch):
+def test_the_share_falls_if_the_initial_loss_has_the_smaller_risk_and_stays_in_0_and_1(monkeypatch):
     better = selecting(monkeypatch, [2.0, 2.0], [True, False])
     scale, schedule = followed(randn(20, 2)), BandwidthSchedule(2, warmup_steps=0, anneal_step=0.1).double()
     shares = []
@@ -82,7 +82,7 @@ def test_the_share_falls_where_the_initial_loss_has_the_smaller_risk_and_stays_i
 
 
 @pytest.mark.parametrize("warmup_steps", [0, 1, 2, 7, 8])
-def test_the_length_of_the_warm_up_may_be_given(warmup_steps, monkeypatch):
+def test_the_length_of_the_warm_up_is_an_argument(warmup_steps, monkeypatch):
     selecting(monkeypatch, [2.0], [True])
     scale, schedule = followed(randn(20, 1)), BandwidthSchedule(1, warmup_steps=warmup_steps)
     batches = 0
@@ -105,7 +105,7 @@ def test_a_channel_without_residuals_is_not_annealed(monkeypatch):
 
 
 @pytest.mark.usefixtures("arrays")
-def test_the_bandwidth_is_a_running_mean_in_its_logarithm_of_every_fourth_batch(monkeypatch):
+def test_the_log_bandwidth_is_a_running_mean_over_every_fourth_batch(monkeypatch):
     scale, schedule, mean = followed(randn(20, 1)), BandwidthSchedule(1).double(), 0.0
     widths = [64.0, 2.0, 2.0, 8.0, 0.5, 1.0] * 3
     for batch in range(SELECTION_INTERVAL * len(widths)):
@@ -113,7 +113,7 @@ def test_the_bandwidth_is_a_running_mean_in_its_logarithm_of_every_fourth_batch(
         selecting(monkeypatch, [width if batch % SELECTION_INTERVAL == 0 else math.nan], [True])
         schedule.update(scale)
         if batch % SELECTION_INTERVAL == 0:
-            # as many batches would have moved it that had a tenth each
+            # the same number of single updates of a tenth
             rate = min(max(SELECTION_INTERVAL / (batch + 1), 1.0 - (1.0 - RATE) ** SELECTION_INTERVAL), 1.0)
             mean += rate * (math.log(width) - mean)
         assert float(schedule.log_bandwidth) == pytest.approx(mean, abs=1e-12)
@@ -147,7 +147,7 @@ def test_the_energy_is_the_mixture_of_both_losses():
     torch.testing.assert_close(schedule.energy(z), expected, rtol=1e-10, atol=1e-12)
 
 
-def test_at_first_far_residuals_pull_like_a_root_and_annealed_they_do_not_pull():
+def test_influence_of_far_residuals_follows_a_root_at_first_and_is_0_when_annealed():
     schedule, z = BandwidthSchedule(1), torch.tensor([[20.0], [80.0]], requires_grad=True)
     (early,) = torch.autograd.grad(schedule.energy(z).sum(), z)
     assert float(early[0] / early[1]) == pytest.approx(2.0, rel=1e-3)
@@ -174,7 +174,7 @@ def test_numpy_and_torch_follow_the_same_schedule(channels, monkeypatch):
     assert float(schedules[0].share.max()) > 0.0
 
 
-def test_channels_are_apart():
+def test_channels_are_independent():
     residual = randn(100, 3) ** 3 * torch.tensor([1.0, 10.0, 1e-3])
     schedules = [BandwidthSchedule(m, warmup_steps=0).double() for m in (3, 1)]
     for _ in range(9):
@@ -184,7 +184,7 @@ def test_channels_are_apart():
         assert value.item() == pytest.approx(schedules[0].state_dict()[name][1].item(), rel=1e-12)
 
 
-def test_an_update_leaves_the_scale_alone_and_has_no_gradient():
+def test_an_update_does_not_change_the_scale_and_has_no_gradient():
     scale, schedule = followed(randn(100, 2)), BandwidthSchedule(2, warmup_steps=0).double()
     before = copy.deepcopy(scale.state_dict())
     schedule.update(scale)
@@ -194,7 +194,7 @@ def test_an_update_leaves_the_scale_alone_and_has_no_gradient():
 
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 121])
-def test_a_state_dict_continues_to_the_bit_wherever_it_was_taken(at):
+def test_a_schedule_resumed_from_a_state_dict_is_bitwise_equal(at):
     scales = [followed(randn(100, 1, seed=seed) ** 3) for seed in range(6)]
     schedule, resumed = (BandwidthSchedule(1, warmup_steps=3) for _ in range(2))
     for batch in range(at):

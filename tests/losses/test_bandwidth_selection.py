@@ -1,4 +1,4 @@
-"""Which bandwidth residuals support: a wide one for Gaussian noise, none that shrinks predictions for wrong targets."""
+"""The selected bandwidth: wide for Gaussian noise, narrow for wrong targets if a wide one shrinks predictions."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def generator(seed=0):
 
 
 def selection(z, prediction, weight):
-    """The selection by torch, which NumPy must confirm."""
+    """The selection by torch, checked against NumPy."""
     found = select_bandwidth(torch, z, prediction, weight)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         other = select_bandwidth(np, z.numpy(), prediction.numpy(), weight.numpy())
@@ -29,7 +29,7 @@ def selection(z, prediction, weight):
 
 
 def fitted(share, shrunk, seed=0, noise=0.2):
-    """Residuals over their scale, and predictions, of a fit that shrinks so far; a share of targets is permuted."""
+    """Standardised residuals and predictions of a fit with the given shrinkage; a share of targets is permuted."""
     g = generator(seed)
     truth = torch.randn(N, generator=g)
     target = truth + noise * torch.randn(N, generator=g)
@@ -65,7 +65,7 @@ def test_right_targets_support_a_wide_bandwidth(seed, shrunk):
     assert found.bandwidth >= 2.8
 
 
-def test_without_shrinkage_the_widest_bandwidth_of_nearly_the_least_variance_is_selected():
+def test_without_shrinkage_the_widest_bandwidth_of_nearly_the_smallest_variance_is_selected():
     """The variance of an M-estimate, written out for each candidate."""
     z = torch.randn(3, N, generator=generator(), dtype=torch.float64)
     z[1, ::4] *= 6.0
@@ -89,14 +89,14 @@ def test_without_shrinkage_the_widest_bandwidth_of_nearly_the_least_variance_is_
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_predictions_in_another_unit_and_with_an_offset_change_nothing(dtype):
+def test_selection_does_not_depend_on_unit_and_offset_of_predictions(dtype):
     z, prediction, weight = (values.to(dtype) for values in fitted(0.5, 0.5))
     units = [(1.0, 0.0), (1e-6, 1e-6), (1e6, -3e6)]
     found = [selection(z, unit * prediction + shift, weight) for unit, shift in units]
     assert {(float(f.bandwidth), bool(f.better)) for f in found} == {(float(found[0].bandwidth), bool(found[0].better))}
 
 
-def test_residuals_of_weight_0_have_no_part():
+def test_residuals_of_weight_0_are_ignored():
     z, prediction, weight = fitted(0.5, 0.5)
     weight[:, ::2] = 0.0
     expected = selection(z[:, 1::2], prediction[:, 1::2], weight[:, 1::2])
@@ -105,7 +105,7 @@ def test_residuals_of_weight_0_have_no_part():
     assert (found.bandwidth, found.better) == (expected.bandwidth, expected.better)
 
 
-def test_a_weight_counts_as_that_many_residuals_but_for_chance():
+def test_a_weight_equals_repetition_except_for_chance():
     z, _, weight = (values.double() for values in fitted(0.5, 1.0))
     times = torch.randint(1, 4, (N,), generator=generator(2))
     repeated = [values.repeat_interleave(times, 1) for values in (z, torch.zeros_like(z), weight)]
@@ -113,14 +113,14 @@ def test_a_weight_counts_as_that_many_residuals_but_for_chance():
     assert (found.bandwidth, found.better) == (expected.bandwidth, expected.better)
 
 
-def test_channels_are_judged_apart():
+def test_channels_are_selected_independently():
     parts = [fitted(0.5, 0.5), fitted(0.0, 1.0)]
     both = selection(*(torch.cat(values) for values in zip(*parts, strict=True)))
     assert both.better.tolist() == [False, True]
     assert both.bandwidth.tolist() == [float(selection(*part).bandwidth) for part in parts]
 
 
-def test_a_constant_prediction_is_finite():
+def test_a_constant_prediction_gives_a_finite_selection():
     z, _, weight = fitted(0.0, 1.0)
     assert selection(z, torch.full_like(z, 7.0), weight).better
 
@@ -133,7 +133,7 @@ def test_a_constant_prediction_is_finite():
     far=st.floats(0.0, 30.0),
 )
 @settings(max_examples=60, deadline=None)
-def test_numpy_and_torch_select_alike_and_a_candidate(seed, channels, length, share, far):
+def test_numpy_and_torch_select_the_same_candidate(seed, channels, length, share, far):
     g = generator(seed)
     z, prediction = torch.randn(2, channels, length, generator=g, dtype=torch.float64)
     z[:, ::3] *= 10.0**far

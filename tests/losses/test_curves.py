@@ -1,4 +1,4 @@
-"""Value, pull and weight of a residual, a label, and an error among others."""
+"""Value, influence and weight of a residual, a label, and an error among others."""
 
 import math
 
@@ -15,7 +15,7 @@ def errors():
     return torch.linspace(-20.0, 20.0, 81, dtype=torch.float64).unsqueeze(-1).expand(81, 2).clone()
 
 
-def test_the_pull_is_the_derivative_of_the_value_and_the_weight_its_ratio_to_least_squares():
+def test_influence_is_the_derivative_of_the_value_and_weight_its_ratio_to_least_squares():
     error = errors().requires_grad_()
     (slope,) = torch.autograd.grad(LOSS.rho(error).sum(), error)
     torch.testing.assert_close(LOSS.influence(error), slope)
@@ -24,7 +24,7 @@ def test_the_pull_is_the_derivative_of_the_value_and_the_weight_its_ratio_to_lea
     torch.testing.assert_close(LOSS.weight(error)[inside], ratio)
 
 
-def test_far_away_the_value_is_the_square_of_the_bandwidth_and_nothing_pulls():
+def test_far_away_the_value_is_the_squared_bandwidth_and_influence_is_0():
     far = torch.full((1, 2), 1e6, dtype=torch.float64)
     torch.testing.assert_close(LOSS.rho(far), LOSS.sigma.square().unsqueeze(0))
     assert LOSS.influence(far).abs().max().item() == 0.0
@@ -54,7 +54,7 @@ def test_a_picture_shows_the_three_curves_of_a_channel():
             LOSS.plot(channel)
 
 
-def test_a_gaussian_is_drawn_as_it_is_on_axes_of_ones_own():
+def test_a_gaussian_is_drawn_undivided_on_given_axes():
     figure = pytest.importorskip("matplotlib.figure")
     axes = figure.Figure().add_subplot()
     gaussian = MKCLoss(1, sigma=math.inf, d=1.0, learn_sigma=False)
@@ -81,9 +81,9 @@ def slope_of(rho, x: torch.Tensor) -> torch.Tensor:
 def test_each_sample_has_its_own_curves():
     error = torch.linspace(-9.0, 9.0, 40).double()
     sigma, d = torch.linspace(0.5, 5.0, 40).double(), torch.linspace(2.0, 0.1, 40).double()
-    pull = SAMPLES.influence(error, sigma, d)
-    torch.testing.assert_close(pull, slope_of(lambda e: SAMPLES.rho(e, sigma, d), error))
-    torch.testing.assert_close(SAMPLES.weight(error, sigma, d), pull * d.square() / error)
+    influence = SAMPLES.influence(error, sigma, d)
+    torch.testing.assert_close(influence, slope_of(lambda e: SAMPLES.rho(e, sigma, d), error))
+    torch.testing.assert_close(SAMPLES.weight(error, sigma, d), influence * d.square() / error)
     alike = MKCLoss(1, sigma=2.0, d=0.5, bound=50.0, learn_sigma=False, learn_d=False).double()
     for name in ("rho", "influence", "weight"):
         expected = getattr(alike, name)(error.unsqueeze(-1)).squeeze(-1).detach()
@@ -110,7 +110,7 @@ def test_the_picture_of_a_sample():
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 1.2, 3.0, math.inf])
-def test_the_curves_of_a_label_are_those_of_its_probability(sigma):
+def test_the_curves_of_a_label_are_functions_of_its_probability(sigma):
     loss = GeneralizedCrossEntropyLoss(sigma=sigma, reduction="none").double()
     p = torch.linspace(0.001, 0.999, 60, dtype=torch.float64)
     logits = torch.stack([p.log(), (1.0 - p).log()], -1)
@@ -121,7 +121,7 @@ def test_the_curves_of_a_label_are_those_of_its_probability(sigma):
     torch.testing.assert_close(loss.weight_at(p), loss.inlier_weight(logits, labels))
 
 
-def test_a_label_of_probability_0_and_of_1():
+def test_curves_of_a_label_at_probability_0_and_1():
     ends = torch.tensor([0.0, 1.0])
     loss = GeneralizedCrossEntropyLoss(sigma=2.0)
     assert loss.rho(ends).tolist() == [4.0, 0.0]
@@ -139,15 +139,15 @@ def test_the_picture_of_a_label(sigma):
     loss = GeneralizedCrossEntropyLoss(sigma=sigma).double()
     curves = drawn(loss.plot())
     assert set(curves) == {"value", "influence on the logit", "influence of cross-entropy", "weight"}
-    p, pull = curves["influence on the logit"]
+    p, influence = curves["influence on the logit"]
     # by autograd through two logits
     logit = torch.logit(p[1:-1]).requires_grad_()
     (slope,) = torch.autograd.grad(loss.rho(logit.sigmoid()).sum(), logit)
-    torch.testing.assert_close(pull[1:-1], -slope)
+    torch.testing.assert_close(influence[1:-1], -slope)
     assert all(bool(torch.isfinite(y).all()) for _, y in curves.values())
 
 
-def test_the_entropy_has_the_curve_of_an_error_that_joins_a_batch():
+def test_curves_of_the_entropy_for_an_error_added_to_a_batch():
     generator = torch.Generator().manual_seed(0)
     batch = torch.randn(60, generator=generator, dtype=torch.float64)
     error = torch.linspace(-30.0, 30.0, 40, dtype=torch.float64)
@@ -155,13 +155,13 @@ def test_the_entropy_has_the_curve_of_an_error_that_joins_a_batch():
     torch.testing.assert_close(ENTROPY.rho(error, batch), joined)
     torch.testing.assert_close(ENTROPY.influence(error, batch), slope_of(lambda e: ENTROPY.rho(e, batch), error))
     torch.testing.assert_close(ENTROPY.weight(error, batch), ENTROPY.influence(error, batch) / error)
-    # it does not know the unit
+    # the entropy does not depend on the unit
     torch.testing.assert_close(ENTROPY.rho(1e6 * error, 1e6 * batch), joined)
     assert ENTROPY.influence(torch.zeros(1), batch).tolist() == [0.0]
     assert ENTROPY.weight(torch.zeros(1), batch).tolist() == [math.inf]
 
 
-def test_the_picture_of_an_error_that_joins_a_batch():
+def test_the_picture_of_an_error_added_to_a_batch():
     pytest.importorskip("matplotlib")
     batch = torch.linspace(-2.0, 3.0, 50, dtype=torch.float64)
     curves = drawn(ENTROPY.plot(batch))
@@ -183,9 +183,9 @@ def test_the_picture_of_an_error_that_joins_a_batch():
     ],
 )
 def test_a_batch_without_errors_is_refused(batch, error, message):
-    for asked in (lambda: ENTROPY.rho(torch.ones(1), batch), lambda: ENTROPY.plot(batch)):
+    for call in (lambda: ENTROPY.rho(torch.ones(1), batch), lambda: ENTROPY.plot(batch)):
         with pytest.raises(error, match=message):
-            asked()
+            call()
 
 
 def test_a_batch_of_mostly_zeros_has_no_picture():

@@ -1,4 +1,4 @@
-"""H of residuals: its definition, its derivatives, where they could break, and its minima over any model."""
+"""H of residuals: definition, derivatives, edge cases, and minima over any model."""
 
 import math
 
@@ -40,7 +40,7 @@ def slope(r: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_definition(seed):
+def test_the_value_follows_the_definition(seed):
     r = sample(seed, 5, 7)
     assert float(entropy_like(r)) == pytest.approx(by_definition(r.numpy()), rel=1e-13)
     torch.testing.assert_close(
@@ -50,7 +50,7 @@ def test_the_definition(seed):
     torch.testing.assert_close(entropy_like(r, -1), entropy_like(r.T, 0), rtol=1e-14, atol=0)
 
 
-def test_the_bounds_and_when_they_are_reached():
+def test_the_value_reaches_its_bounds_0_and_1():
     assert float(entropy_like(torch.tensor([3.0, -3.0, 3.0, 3.0]))) == pytest.approx(1.0)
     assert float(entropy_like(torch.tensor([0.0, 7.0, 0.0]))) == 0.0
     assert float(entropy_like(torch.zeros(4))) == 0.0
@@ -61,7 +61,7 @@ def test_the_bounds_and_when_they_are_reached():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [-1.0, 1e-30, 1e-36, 1e30, 1e37])
-def test_the_scale_changes_nothing(scale, dtype):
+def test_the_value_does_not_depend_on_the_scale(scale, dtype):
     r = sample(1, 50, dtype=dtype).clamp(-4, 4).requires_grad_()
     scaled = (r.detach() * scale).requires_grad_()
     h, same = entropy_like(r), entropy_like(scaled)
@@ -70,7 +70,7 @@ def test_the_scale_changes_nothing(scale, dtype):
     torch.testing.assert_close(gs.double() * scale, g.double(), rtol=2e-4, atol=1e-7)
 
 
-def test_numbers_below_the_smallest_normal_one_count_as_zero():
+def test_subnormal_residuals_count_as_zero():
     r = torch.tensor([1e-41, 2e-41, -1e-41], requires_grad=True)
     h = entropy_like(r)
     assert h == 0.0
@@ -87,7 +87,7 @@ def test_float32_is_accurate_over_a_million_residuals():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_gradient_is_that_of_the_paper(seed):
+def test_the_gradient_equals_the_papers_formula(seed):
     r = sample(seed, 12).requires_grad_()
     (gradient,) = torch.autograd.grad(entropy_like(r), r)
     np.testing.assert_allclose(gradient.numpy(), slope(r.detach().numpy()), rtol=1e-10, atol=1e-13)
@@ -114,7 +114,7 @@ def test_derivatives_where_residuals_are_zero():
     torch.testing.assert_close(second[1:3, 1:3], nearby[1:3, 1:3], rtol=1e-6, atol=1e-6)
 
 
-def test_all_zero_residuals_and_a_single_one_have_gradient_zero():
+def test_gradient_is_zero_for_all_zero_residuals_and_for_a_single_residual():
     for r in (torch.zeros(5, 2), torch.tensor([[3.0, 0.0]]), torch.tensor([4.0])):
         r = r.double().requires_grad_()
         assert entropy_like(r) == 0.0
@@ -145,7 +145,7 @@ def test_compiled_loss_equals_eager():
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
-def test_compiled_without_weights_it_is_one_graph():
+def test_without_weights_the_loss_compiles_to_a_single_graph():
     torch.compiler.reset()
     x, y = sample(0, 20, 1), sample(1, 20, 1)
     torch.testing.assert_close(torch.compile(LELoss(), fullgraph=True, backend="eager")(x, y), LELoss()(x, y))
@@ -155,7 +155,7 @@ def test_compiled_without_weights_it_is_one_graph():
 # weights
 
 
-def test_a_weight_is_a_number_of_repetitions():
+def test_a_weight_equals_repetition():
     r = sample(8, 6)
     counts = torch.tensor([1, 3, 0, 2, 1, 5])
     r_seen = r.clone()
@@ -165,7 +165,7 @@ def test_a_weight_is_a_number_of_repetitions():
         assert float(entropy_like(r_seen, weight=w)) == pytest.approx(float(entropy_like(again)), rel=1e-13)
 
 
-def test_what_a_mask_leaves_out_has_no_influence():
+def test_masked_residuals_have_no_influence():
     r = sample(9, 6).requires_grad_()
     bad = torch.cat([r, torch.tensor([math.nan, math.inf, 1e300]).double()])
     mask = torch.arange(9) < 6
@@ -181,7 +181,7 @@ def test_weights_that_total_one_are_refused():
         entropy_like(sample(0, 4), weight=torch.full((4,), 0.25))
 
 
-def test_residuals_that_count_and_are_not_finite_are_refused():
+def test_unmasked_residuals_that_are_not_finite_are_refused():
     for bad in (math.nan, math.inf):
         with pytest.raises(
             ValueError, match=r"`residual` to be finite but got 1 .* \(1,\)\. Leave them out by a weight"
@@ -227,7 +227,7 @@ def test_autocast_changes_nothing():
         assert LELoss()(layer(torch.ones(4, 2)), torch.zeros(4, 3)).dtype == torch.float32
 
 
-def test_the_loss_refuses_what_it_cannot_answer():
+def test_bad_arguments_of_the_loss_are_refused():
     x = torch.ones(3)
     for given, error, match in (
         ((x, torch.ones(4)), ValueError, "one shape"),
@@ -262,7 +262,7 @@ def test_the_loss_refuses_what_it_cannot_answer():
     assert bool(torch.isfinite(masked))
 
 
-def test_a_network_trained_on_it_ignores_outliers():
+def test_a_network_trained_with_the_loss_ignores_outliers():
     x = sample(16, 200, 2)
     y = x @ torch.tensor([1.0, -2.0]).double() + 0.05 * sample(17, 200)
     y[:30] = 20.0 + sample(18, 30)
@@ -286,7 +286,7 @@ def test_a_network_trained_on_it_ignores_outliers():
 
 
 @pytest.mark.parametrize("theta", [(62.92, 2.03, 11.02, -29.03), (0.0, 0.0, 5.0), (-3.0,), (1.0, 1.0), (0.0, 0.0)])
-def test_starts_are_orthogonal_and_of_one_length(theta):
+def test_starts_are_orthogonal_and_of_equal_length(theta):
     theta = torch.tensor(theta, dtype=torch.float64)
     starts = orthogonal_starts(theta)
     assert torch.equal(starts[0], theta)
@@ -294,14 +294,14 @@ def test_starts_are_orthogonal_and_of_one_length(theta):
     torch.testing.assert_close(starts @ starts.T, expected, rtol=1e-12, atol=1e-11)
 
 
-def test_starts_of_a_batch_are_those_of_each():
+def test_batched_starts_equal_single_starts():
     theta = sample(19, 4, 3, 5)
     starts = orthogonal_starts(theta)
     assert starts.shape == (4, 3, 5, 5)
     torch.testing.assert_close(starts[2, 1], orthogonal_starts(theta[2, 1]), rtol=1e-12, atol=1e-12)
 
 
-def test_on_a_linear_residual_it_is_the_linear_estimator():
+def test_minima_on_a_linear_residual_equal_the_linear_estimator():
     X, y = hbk()
     X = X[:, 1:]
     fit = LeastEntropyLike().fit(X, y)
@@ -382,7 +382,7 @@ def test_an_exact_fit_has_entropy_zero():
     assert bool(found.converged)
 
 
-def test_weights_of_any_residual():
+def test_weights_apply_to_any_residual():
     X, y = hbk()
     mask = torch.arange(75) >= 14
     found = least_entropy_like(lambda t: y - X @ t, torch.linalg.lstsq(X, y).solution, weight=mask)
@@ -391,7 +391,7 @@ def test_weights_of_any_residual():
     torch.testing.assert_close(found.entropy, without.entropy, rtol=1e-12, atol=0)
 
 
-def test_starts_that_make_no_sense_are_refused():
+def test_bad_starts_are_refused():
     def residual(t: Tensor) -> Tensor:
         return torch.log(t) * torch.arange(1.0, 5.0)
 
@@ -405,20 +405,20 @@ def test_starts_that_make_no_sense_are_refused():
             least_entropy_like(residual, starts)
 
 
-def test_arguments_that_make_no_sense_are_refused():
+def test_bad_arguments_are_refused():
     x = torch.arange(1.0, 5.0)
-    one = torch.ones(1, 1)
+    start = torch.ones(1, 1)
 
     def residual(t: Tensor) -> Tensor:
         return x - t[0]
 
     for arguments, options, error, match in (
-        ((3, one), {}, TypeError, "`residual` to be a function of the parameters but got int; write lambda"),
-        ((residual, one), {"tol": "a"}, TypeError, "`tol` to be a number"),
-        ((residual, one), {"tol": -1.0}, ValueError, "`tol` to be >= 0"),
-        ((residual, one), {"max_iter": 0}, ValueError, "`max_iter` to be a whole number of at least 1 but got 0"),
-        ((residual, one), {"weight": -torch.ones(4)}, ValueError, "`weight` to be >= 0"),
-        ((residual, one), {"weight": [1.0] * 4}, TypeError, "`weight` to be a tensor"),
+        ((3, start), {}, TypeError, "`residual` to be a function of the parameters but got int; write lambda"),
+        ((residual, start), {"tol": "a"}, TypeError, "`tol` to be a number"),
+        ((residual, start), {"tol": -1.0}, ValueError, "`tol` to be >= 0"),
+        ((residual, start), {"max_iter": 0}, ValueError, "`max_iter` to be a whole number of at least 1 but got 0"),
+        ((residual, start), {"weight": -torch.ones(4)}, ValueError, "`weight` to be >= 0"),
+        ((residual, start), {"weight": [1.0] * 4}, TypeError, "`weight` to be a tensor"),
     ):
         with pytest.raises(error, match=match):
             least_entropy_like(*arguments, **options)

@@ -23,7 +23,7 @@ def randn(*size, seed=0, dtype=torch.float64):
 
 
 def numbers(mode, m=4, dtype=torch.float64, reduction="mean"):
-    """Raw parameters, and what a loss of that mode computes with beside them."""
+    """Raw parameters and settings of a loss of that mode."""
     kappa, raw_kappa, d, raw_d = (value.to(dtype).repeat(-(-m // 4))[:m] for value in (KAPPA, RAW_KAPPA, D, RAW_D))
     ramp = torch.linspace(0.0, 1.0, m, dtype=dtype)
     state = ChannelState(
@@ -95,7 +95,7 @@ def arithmetic(request, monkeypatch):
 @each_mode
 @pytest.mark.parametrize("shape", [(4,), (7, 4), (4, 7), (3, 5, 4), (2, 4, 6)])
 @pytest.mark.parametrize(("weighted", "reduction"), [(False, "mean"), (True, "mean"), (True, "sum")])
-def test_value_and_gradients_are_those_of_the_formulas(mode, shape, weighted, reduction):
+def test_value_and_gradients_equal_the_formulas(mode, shape, weighted, reduction):
     raw_kappa, raw_d, settings = numbers(mode, reduction=reduction)
     weight = None
     if weighted:
@@ -107,21 +107,21 @@ def test_value_and_gradients_are_those_of_the_formulas(mode, shape, weighted, re
 
 @pytest.mark.usefixtures("arithmetic")
 @each_mode
-def test_what_does_not_count_is_nowhere(mode):
+def test_masked_elements_affect_neither_value_nor_gradient(mode):
     raw_kappa, raw_d, settings = numbers(mode)
     input, target, weight = randn(9, 4), randn(9, 4, seed=1), torch.ones(9, 4, dtype=torch.float64)
     weight[::2, 1] = weight[3] = 0.0
     found = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings, weight)
     input[::2, 1], target[3] = math.nan, math.inf
-    spoilt = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings, weight)
-    torch.testing.assert_close(found, spoilt, rtol=0.0, atol=0.0)
-    assert (spoilt[1][weight == 0] == 0).all()
+    contaminated = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings, weight)
+    torch.testing.assert_close(found, contaminated, rtol=0.0, atol=0.0)
+    assert (contaminated[1][weight == 0] == 0).all()
     nothing = differentiated(fused_loss, input, target, raw_kappa, raw_d, settings, torch.zeros_like(weight))
     assert all((value == 0).all() for value in nothing)
 
 
 @each_mode
-def test_strided_and_expanded_batches_are_their_copies(mode):
+def test_strided_and_expanded_batches_equal_their_copies(mode):
     raw_kappa, raw_d, settings = numbers(mode)
     for input in (randn(4, 9).mT, randn(18, 8)[::2, ::2], randn(4).expand(9, 4), randn(9, 1).expand(9, 4)):
         target = randn(4, 9, seed=1).mT
@@ -132,7 +132,7 @@ def test_strided_and_expanded_batches_are_their_copies(mode):
 
 @each_mode
 @pytest.mark.parametrize("rows", [SMALL_BATCH // 4, SMALL_BATCH // 4 + 1])
-def test_a_batch_too_large_for_numpy_is_computed_alike(mode, rows):
+def test_torch_on_large_batches_equals_the_formulas(mode, rows):
     raw_kappa, raw_d, settings = numbers(mode)
     assert_as_formulas(2.0 * randn(rows, 4), randn(rows, 4, seed=1), raw_kappa, raw_d, settings)
 
@@ -140,7 +140,7 @@ def test_a_batch_too_large_for_numpy_is_computed_alike(mode, rows):
 @pytest.mark.parametrize("channels", [1, 3, 4, 700])
 @pytest.mark.parametrize("mode", ["fixed", "learned", "robust", "robust of given d"])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_large_batches_in_pieces_are_those_in_one(channels, mode, weighted, monkeypatch):
+def test_large_batches_in_pieces_equal_whole_batches(channels, mode, weighted, monkeypatch):
     # not a whole number of pieces, nor, but for the first, of long rows
     rows = LARGE_BATCH // channels + (256 if channels == 1 else 5)
     raw_kappa, raw_d, settings = numbers(mode, channels)
@@ -172,7 +172,7 @@ def test_without_a_gradient_the_value_is_the_same():
 @pytest.mark.usefixtures("arithmetic")
 @pytest.mark.parametrize("sigma", [1.0, 10.0, 100.0, 1e3, 1e4])
 def test_single_precision_keeps_the_gradient_of_large_bandwidths(sigma):
-    """A difference of exponentials would lose it: of 1 - exp(-x) (1 + x) nothing is left at x = 1e-7."""
+    """A difference of exponentials would lose it: 1 - exp(-x) (1 + x) cancels to 0 at x = 1e-7."""
     rows = 20_000 if module.SMALL_STATE else 2000
     raw = torch.logit(torch.tensor([sigma**-2.0 / 400.0], dtype=torch.float64)).float()
     state = ChannelState(bound=torch.tensor([100.0]), floor=torch.tensor([0.001]))
@@ -194,7 +194,7 @@ def gaussian(m=1, reduction="sum", d=1.0):
 
 
 @pytest.mark.usefixtures("arithmetic")
-def test_a_gaussian_channel_is_half_the_squared_error_to_the_bit():
+def test_a_gaussian_channel_is_bitwise_half_the_squared_error():
     error = randn(1000, 1, dtype=torch.float32)
     found = differentiated(fused_loss, error, torch.zeros_like(error), None, None, gaussian())
     assert torch.equal(found[1], error)
@@ -211,16 +211,16 @@ def test_a_gaussian_in_pieces_is_half_the_squares():
 @pytest.mark.parametrize("size", [1e8, 1e14, 1.8e19])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("rows", [1, SMALL_BATCH, LARGE_BATCH // 2 + 1])
-def test_a_gaussian_channel_is_so_as_far_as_single_precision_holds_the_square(size, weighted, rows):
+def test_a_gaussian_channel_is_exact_up_to_the_overflow_of_the_square(size, weighted, rows):
     error = torch.zeros(rows, 2)
     error[0] = torch.tensor([size, 3.0])
     weight = torch.ones_like(error) if weighted else None
     settings = gaussian(2)
     settings.fixed_kappa[1] = 1.0
     for kept in (0, 1):
-        one = error.clone()
-        one[0, 1 - kept] = 0.0
-        value, slope, _ = differentiated(fused_loss, one, torch.zeros_like(one), None, None, settings, weight)
+        errors = error.clone()
+        errors[0, 1 - kept] = 0.0
+        value, slope, _ = differentiated(fused_loss, errors, torch.zeros_like(errors), None, None, settings, weight)
         assert value.item() == pytest.approx((0.5 * size**2, 1.0 - math.exp(-4.5))[kept], rel=1e-6)
         assert slope[0, kept].item() == pytest.approx((size, 3.0 * math.exp(-4.5))[kept], rel=1e-6)
 
@@ -228,7 +228,7 @@ def test_a_gaussian_channel_is_so_as_far_as_single_precision_holds_the_square(si
 @pytest.mark.usefixtures("arithmetic")
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("learned", [False, True])
-def test_a_square_that_overflows_is_infinite_and_pulls_as_it_should(weighted, learned):
+def test_a_square_that_overflows_has_infinite_value_and_the_right_gradient(weighted, learned):
     settings = gaussian()
     raw_d = torch.zeros(1) if learned else None
     settings = LossSettings(
@@ -244,7 +244,7 @@ def test_a_square_that_overflows_is_infinite_and_pulls_as_it_should(weighted, le
 
 @pytest.mark.usefixtures("arithmetic")
 @pytest.mark.parametrize("size", [1e10, 1e19, 1e30])
-def test_an_error_whose_square_overflows_does_not_pull_and_leaves_gradients_finite(size):
+def test_an_error_whose_square_overflows_has_zero_influence_and_finite_gradients(size):
     error = torch.tensor([[0.5], [size]])
     state = ChannelState(torch.tensor([2.0]), torch.tensor([0.0]))
     settings = LossSettings(None, None, state, False, False, "sum")
@@ -256,7 +256,7 @@ def test_an_error_whose_square_overflows_does_not_pull_and_leaves_gradients_fini
 
 
 @pytest.mark.parametrize("rows", [100, LARGE_BATCH + 256])
-def test_sums_of_single_precision_are_as_exact_as_one_rounding_of_each_element_allows(rows):
+def test_sums_of_single_precision_are_accurate_to_a_rounding_per_element(rows):
     raw_kappa, raw_d, settings = numbers("robust", 1, torch.float32)
     wide = numbers("robust", 1)
     input, target = randn(rows, 1, dtype=torch.float32), randn(rows, 1, seed=1, dtype=torch.float32)
@@ -271,7 +271,7 @@ def test_sums_of_single_precision_are_as_exact_as_one_rounding_of_each_element_a
 
 @pytest.mark.usefixtures("arithmetic")
 @each_mode
-def test_two_backward_passes_of_one_graph_give_the_same_gradients_to_the_bit(mode):
+def test_two_backward_passes_give_bitwise_equal_gradients(mode):
     raw_kappa, raw_d, settings = numbers(mode)
     given = leaves(randn(9, 4), randn(9, 4, seed=1), raw_kappa, raw_d)
     value = fused_loss(batch_of(*given[:2]), *given[2:], settings)
@@ -282,7 +282,7 @@ def test_two_backward_passes_of_one_graph_give_the_same_gradients_to_the_bit(mod
         if upstream == 1.0:
             expected = [entry.clone() for entry in found]
             for entry in found:
-                entry.mul_(7.0)  # what a caller does with its gradients changes no later pass
+                entry.mul_(7.0)  # changing returned gradients must not affect a later pass
             found = torch.autograd.grad(value, wanted, grad, retain_graph=True)
             torch.testing.assert_close(list(found), expected, rtol=0.0, atol=0.0)
         else:
@@ -300,7 +300,7 @@ def test_gradients_accumulate_in_leaves_as_twice_the_gradient():
 
 
 @each_mode
-def test_the_gradient_by_the_target_is_minus_that_by_the_input(mode):
+def test_the_gradient_by_the_target_is_the_negative_gradient_by_the_input(mode):
     _, by_input, by_target, *_ = differentiated(fused_loss, randn(9, 4), randn(9, 4, seed=1), *numbers(mode))
     assert torch.equal(by_target, -by_input)
     given = leaves(randn(9, 4, seed=1))
@@ -310,7 +310,7 @@ def test_the_gradient_by_the_target_is_minus_that_by_the_input(mode):
 
 
 @each_mode
-def test_only_gradients_that_are_wanted_are_made(mode, monkeypatch):
+def test_only_required_gradients_are_computed(mode, monkeypatch):
     raw_kappa, raw_d, settings = numbers(mode)
     input, target = randn(9, 4), randn(9, 4, seed=1)
     made, reduced = [], module.reduced_loss
@@ -330,7 +330,7 @@ def test_only_gradients_that_are_wanted_are_made(mode, monkeypatch):
 @pytest.mark.usefixtures("arithmetic")
 @pytest.mark.parametrize("mode", [mode for mode in MODES if not mode.startswith("robust")])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_first_and_second_derivatives_are_those_of_finite_differences(mode, weighted):
+def test_first_and_second_derivatives_equal_finite_differences(mode, weighted):
     """Of the likelihood; the gradient of a robust loss is that of a sum of two terms with constants in each."""
     raw_kappa, raw_d, settings = numbers(mode)
     given = leaves(randn(3, 4), randn(3, 4, seed=1), raw_kappa, raw_d)
@@ -347,7 +347,7 @@ def test_first_and_second_derivatives_are_those_of_finite_differences(mode, weig
 
 
 @each_mode
-def test_second_derivatives_are_those_of_the_formulas(mode):
+def test_second_derivatives_equal_the_formulas(mode):
     raw_kappa, raw_d, settings = numbers(mode)
     found = []
     for function in (fused_loss, loss_value):

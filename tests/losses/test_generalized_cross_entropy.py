@@ -35,12 +35,12 @@ def reduced(t, reduction):
     return {"none": t, "mean": t.mean(), "sum": t.sum()}[reduction]
 
 
-# --- what it computes
+# --- value and gradient
 
 
 @each_sigma
 @each_shape
-def test_it_is_the_mkc_energy_of_the_deviance_residual(sigma, shape):
+def test_the_loss_is_the_mkc_energy_of_the_deviance_residual(sigma, shape):
     logits, labels, _ = data(*shape)
     deviance = cross_entropy(logits, labels, reduction="none")
     residual = torch.sqrt(2.0 * deviance)
@@ -52,7 +52,7 @@ def test_it_is_the_mkc_energy_of_the_deviance_residual(sigma, shape):
 
 @each_sigma
 @each_reduction
-def test_it_is_generalized_cross_entropy_with_q_one_over_sigma_squared(sigma, reduction):
+def test_the_loss_is_generalized_cross_entropy_with_q_the_inverse_square_of_sigma(sigma, reduction):
     logits, labels, _ = data(7, 4)
     q = sigma**-2
     probability = logits.softmax(1).gather(1, labels.unsqueeze(1)).squeeze(1)
@@ -117,7 +117,7 @@ def test_the_gradient_is_the_inlier_weight_times_that_of_cross_entropy():
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 1.2, 10.0, 1e4, INF])
 @pytest.mark.parametrize("size", [1e-4, 1.0, 20.0, 100.0, 1e4, 1e38])
 @pytest.mark.parametrize("right", [True, False])
-def test_single_precision_is_that_of_double_however_large_the_logits(sigma, size, right):
+def test_single_precision_equals_double_for_any_size_of_logits(sigma, size, right):
     logits = torch.zeros(1, 3, dtype=torch.float64)
     logits[0, 0], logits[0, 1] = size, -size
     labels = torch.tensor([0 if right else 1])
@@ -144,7 +144,7 @@ def test_the_gradient_is_bounded_and_fades_with_the_probability(sigma, size):
 
 @pytest.mark.parametrize("sigma", [1.2, INF])
 @pytest.mark.parametrize("soft", [False, True])
-def test_a_class_ruled_out_by_an_infinite_logit_leaves_finite_gradients(sigma, soft):
+def test_an_impossible_class_leaves_finite_gradients(sigma, soft):
     logits = torch.tensor([[1.0, 0.0, -INF]], requires_grad=True)
     target = torch.tensor([[0.75, 0.25, 0.0]]) if soft else torch.tensor([1])
     value = generalized_cross_entropy(logits, target, sigma=sigma)
@@ -155,7 +155,7 @@ def test_a_class_ruled_out_by_an_infinite_logit_leaves_finite_gradients(sigma, s
 
 @each_reduction
 @pytest.mark.parametrize("poison", [NAN, INF, -INF])
-def test_what_is_ignored_reaches_neither_value_nor_gradient(reduction, poison):
+def test_ignored_labels_affect_neither_value_nor_gradient(reduction, poison):
     logits, labels, _ = data(5, 4, 3)
     labels[1, 2] = labels[4, 0] = -1
     loss = GeneralizedCrossEntropyLoss(ignore_index=-1, reduction=reduction)
@@ -177,7 +177,7 @@ def test_what_is_ignored_reaches_neither_value_nor_gradient(reduction, poison):
 @each_reduction
 @pytest.mark.parametrize("sigma", [1.2, INF])
 @pytest.mark.parametrize("by", ["ignore_index", "weight"])
-def test_where_no_label_counts_value_and_gradient_are_zero(reduction, sigma, by):
+def test_without_counted_labels_value_and_gradient_are_zero(reduction, sigma, by):
     logits, _, _ = data(5, 4)
     logits.requires_grad_()
     loss = GeneralizedCrossEntropyLoss(sigma, weight=torch.tensor([1.0, 0.0, 1.0, 1.0]), reduction=reduction)
@@ -205,7 +205,7 @@ def test_half_precision_is_computed_in_float32_and_autocast_changes_nothing(dtyp
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int32])
-def test_labels_of_any_integer_type_are_labels(dtype):
+def test_labels_may_have_any_integer_type(dtype):
     logits, labels, _ = data(5, 4)
     loss = GeneralizedCrossEntropyLoss()
     assert torch.equal(loss(logits, labels.to(dtype)), loss(logits, labels))
@@ -228,7 +228,7 @@ def test_gradcheck_in_logits_and_probabilities(sigma, reduction):
 
 
 @pytest.mark.parametrize("soft", [False, True])
-def test_vmap_of_the_loss_and_its_gradient_equals_each_alone(soft):
+def test_vmap_of_the_loss_and_its_gradient_equals_a_loop(soft):
     loss = GeneralizedCrossEntropyLoss()
     singles = [data(6, 4, seed=seed) for seed in range(5)]
     pairs = [(logits, probabilities if soft else labels) for logits, labels, probabilities in singles]
@@ -237,7 +237,7 @@ def test_vmap_of_the_loss_and_its_gradient_equals_each_alone(soft):
     torch.testing.assert_close(vmap(grad(loss))(*together), torch.stack([grad(loss)(*pair) for pair in pairs]))
 
 
-def test_vmap_over_sigma_is_each_sigma_alone():
+def test_vmap_over_sigma_equals_a_loop():
     logits, labels, _ = data(6, 4)
     sigmas = torch.tensor([0.8, 1.2, INF], dtype=torch.float64)
     found = vmap(lambda s: generalized_cross_entropy(logits, labels, sigma=s))(sigmas)
@@ -286,7 +286,7 @@ def test_graduated_sigma_goes_from_start_to_end_and_stays():
 
 
 def clusters(classes, seed):
-    """Inputs, labels and their number to learn from; as many again to test on."""
+    """Inputs, labels and the size of the training set; a test set of the same size follows."""
     generator = torch.Generator().manual_seed(seed)
     labels = torch.arange(classes).repeat(2 * 40)
     centres = torch.randn(classes, 16, generator=generator)
@@ -294,7 +294,7 @@ def clusters(classes, seed):
 
 
 def error(loss, share, *, graduated=False, classes=20, epochs=40, seed=0):
-    """Error on right labels of a network that has learned from wrong ones; how its labels are weighted."""
+    """Error on right labels of a network trained with wrong labels; and the weights of its labels."""
     x, y = clusters(classes, seed)
     count = len(y) // 2
     generator = torch.Generator().manual_seed(seed)
@@ -325,7 +325,7 @@ def test_with_two_in_five_labels_wrong_the_error_is_a_fraction_of_that_of_cross_
     assert reference > 0.3
     assert fixed < 0.4 * reference
     assert graduated < 0.3 * reference
-    # the weights name the wrong labels
+    # the weights identify the wrong labels
     assert low[wrong].double().mean() > 0.8
     assert low[~wrong].double().mean() < 0.02
 
@@ -337,11 +337,11 @@ def test_right_labels_are_learned_as_well_as_with_cross_entropy():
     assert error(GeneralizedCrossEntropyLoss(), 0.0, graduated=True)[0] < reference + 0.01
 
 
-# --- what is refused, and why
+# --- bad arguments
 
 
 @pytest.mark.parametrize("sigma", [0.0, -1.0, 0.49, NAN, -INF])
-def test_sigma_out_of_range_is_refused_wherever_it_is_given(sigma):
+def test_sigma_out_of_range_is_refused_in_every_argument(sigma):
     message = r"`sigma` in \[0\.5, inf\] but got"
     loss = GeneralizedCrossEntropyLoss()
     logits, labels, _ = data(5, 4)
@@ -357,11 +357,11 @@ def test_sigma_out_of_range_is_refused_wherever_it_is_given(sigma):
     assert loss.sigma.item() == pytest.approx(1.2)
 
 
-def test_a_sigma_to_be_learned_and_one_for_each_class_are_refused():
+def test_a_learned_sigma_and_a_sigma_per_class_are_refused():
     logits, labels, _ = data(5, 4)
     with pytest.raises(ValueError, match="`sigma` without a gradient"):
         generalized_cross_entropy(logits, labels, sigma=torch.tensor(1.2, requires_grad=True))
-    with pytest.raises(ValueError, match=r"`sigma` to be one number but got shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"`sigma` to be a single number but got shape \(4,\)"):
         GeneralizedCrossEntropyLoss(torch.full((4,), 1.2))
 
 
@@ -381,7 +381,7 @@ def test_progress_beyond_the_training_is_refused(progress, until):
         (1.0, r"of shape \(C,\), one for each class, but got \(\)"),
     ],
 )
-def test_class_weights_that_are_none_are_refused(weight, message):
+def test_bad_class_weights_are_refused(weight, message):
     with pytest.raises(ValueError, match=message):
         GeneralizedCrossEntropyLoss(weight=torch.tensor(weight))
 
@@ -403,17 +403,17 @@ def refused(logits, target, message, kind=ValueError, **options):
 
 
 @pytest.mark.parametrize("shape", [(4,), (5, 1), (5, 4), (1, 5), ()])
-def test_labels_of_another_shape_are_refused_with_where_the_classes_are(shape):
+def test_labels_of_another_shape_are_refused_with_the_class_dimension(shape):
     refused(torch.zeros(5, 4), torch.zeros(shape, dtype=torch.int64), r"labels `target` of shape \(5,\) for `input`")
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 3), (4, 5), (5, 1)])
-def test_probabilities_of_another_shape_are_refused_with_how_to_pass_labels(shape):
+def test_probabilities_of_another_shape_are_refused_with_a_hint_for_labels(shape):
     refused(torch.zeros(5, 4), torch.ones(shape), r"`target` of the shape of `input`, \(5, 4\).*target.long\(\)")
 
 
 @pytest.mark.parametrize("label", [4, -1, 255])
-def test_a_label_out_of_range_is_refused_by_its_index(label):
+def test_a_label_out_of_range_is_refused_with_its_index(label):
     target = torch.zeros(2, 3, dtype=torch.int64)
     target[1, 2] = label
     refused(torch.zeros(2, 4, 3), target, rf"`target` in \[0, 4\).* but got {label} at index \(1, 2\) and 0 more")
@@ -421,7 +421,7 @@ def test_a_label_out_of_range_is_refused_by_its_index(label):
 
 @pytest.mark.parametrize("value", [NAN, INF])
 @pytest.mark.parametrize("soft", [False, True])
-def test_a_logit_that_is_no_number_is_refused_by_its_index(value, soft):
+def test_a_nan_or_infinite_logit_is_refused_with_its_index(value, soft):
     logits, labels, probabilities = data(5, 4)
     logits[3, 1] = value
     refused(logits, probabilities if soft else labels, rf"`input` without NaN.* but got {value} at index \(3, 1\)")
@@ -434,7 +434,7 @@ def test_a_sample_without_any_possible_class_is_refused():
 
 
 @pytest.mark.parametrize("row", [[0.5, 0.6, 0.0, 0.0], [1.5, -0.5, 0.0, 0.0], [NAN, 1.0, 0.0, 0.0], [0.0] * 4])
-def test_numbers_that_are_no_probabilities_are_refused_by_their_index(row):
+def test_targets_that_are_not_probabilities_are_refused_with_their_index(row):
     target = torch.full((5, 4), 0.25)
     target[3] = torch.tensor(row)
     refused(torch.zeros(5, 4), target, r"`target` to be non-negative with the sum 1 .* at index \(3,\); divide")
@@ -451,7 +451,7 @@ def test_weights_of_another_number_of_classes_are_refused():
     refused(logits, labels, r"`weight` of the 4 classes of `input` but got shape \(3,\)", weight=torch.ones(3))
 
 
-def test_other_kinds_are_refused():
+def test_arguments_of_another_type_are_refused():
     logits, labels, _ = data(5, 4)
     refused(logits.long(), labels, "`input` to be floating-point logits but got torch.int64", TypeError)
     refused(logits, labels.bool(), "`target` to be integer labels or .* but got torch.bool", TypeError)
@@ -466,7 +466,7 @@ def test_other_kinds_are_refused():
     )
 
 
-def test_arguments_that_are_no_numbers_are_refused_by_name():
+def test_arguments_that_are_not_numbers_are_refused_by_name():
     logits, labels, _ = data(5, 4)
     with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got 'a'"):
         GeneralizedCrossEntropyLoss("a")
@@ -481,7 +481,7 @@ def test_arguments_that_are_no_numbers_are_refused_by_name():
             graduated_sigma(**options)
 
 
-def test_labels_of_eight_bits_are_not_taken_for_the_one_that_does_not_count():
+def test_labels_of_eight_bits_are_not_confused_with_ignore_index():
     logits = torch.randn(2, 200, generator=torch.Generator().manual_seed(0))
     label = torch.tensor([156, 3])
     loss = GeneralizedCrossEntropyLoss(math.inf, reduction="none")

@@ -21,7 +21,7 @@ MODES = {
 each_mode = pytest.mark.parametrize("options", MODES.values(), ids=MODES)
 
 UPSTREAM = 65536.0
-"""What a gradient scaler multiplies the loss by at first."""
+"""Initial factor of a gradient scaler."""
 
 LEAST_HALF = 2.0**-24
 """The smallest number of float16."""
@@ -51,7 +51,7 @@ def exact(loss, x, y, rows):
 
 
 def assert_rounded(found, expected):
-    """Equal up to one rounding to float16, and one of float32 before it."""
+    """Equal up to a rounding to float16 after a rounding to float32."""
     spacing = torch.clamp(2.0 ** (expected.abs().log2().floor() - 10), min=LEAST_HALF)
     assert bool(((found.double() - expected).abs() <= 0.51 * spacing + 2e-6 * expected.abs()).all())
 
@@ -110,7 +110,7 @@ def test_half_precision_is_computed_in_single(options, dtype, reduction):
 @each_mode
 @pytest.mark.parametrize("reduction", ["none", "mean"])
 @pytest.mark.parametrize("bad", [math.inf, -math.inf, math.nan])
-def test_a_prediction_that_overflows_is_in_the_gradients_and_not_in_the_running_state(options, reduction, bad):
+def test_an_overflowing_prediction_reaches_the_gradients_but_not_the_running_state(options, reduction, bad):
     loss = MKCLoss(2, reduction=reduction, **options)
     for seed in range(3):
         loss(*(values.half() for values in torch.randn(2, 40, 2, generator=generator(seed))))
@@ -131,7 +131,7 @@ def test_a_prediction_that_overflows_is_in_the_gradients_and_not_in_the_running_
 
 
 @pytest.mark.parametrize("options", [{}, {"d": 1.0, "objective": "robust"}, {"objective": "likelihood"}], ids=str)
-def test_a_batch_that_overflows_throughout_leaves_the_running_scale_as_it_was(options):
+def test_a_batch_that_overflows_throughout_does_not_change_the_running_scale(options):
     loss = MKCLoss(2, **options)
     for seed in range(3):
         loss(*(values.half() for values in (1.0 + seed) * torch.randn(2, 40, 2, generator=generator(seed))))
@@ -144,7 +144,7 @@ def test_a_batch_that_overflows_throughout_leaves_the_running_scale_as_it_was(op
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_in_other_dtypes_it_is_refused(dtype):
+def test_an_infinite_prediction_of_another_dtype_is_refused(dtype):
     with pytest.raises(ValueError, match="`input` to be finite"):
         MKCLoss(1)(torch.full((3, 1), math.inf, dtype=dtype), torch.zeros(3, 1))
     with pytest.raises(ValueError, match="`target` to be finite"):
@@ -152,7 +152,7 @@ def test_in_other_dtypes_it_is_refused(dtype):
 
 
 @each_mode
-def test_a_gradient_scaler_skips_the_step_of_a_batch_that_overflows_and_goes_on(options):
+def test_a_gradient_scaler_skips_the_step_of_an_overflowing_batch_and_continues(options):
     torch.manual_seed(0)
     model, loss = nn.Linear(3, 2), MKCLoss(2, **options)
     optimiser = torch.optim.SGD([*model.parameters(), *loss.parameters()], lr=1e-3)

@@ -21,7 +21,7 @@ def values(*shape, low, high, seed=0, dtype=torch.float64):
 
 
 def data(*shape, dtype=torch.float64):
-    """Input, target, sigma and d of one shape."""
+    """Input, target, sigma and d of the same shape."""
     ranges = ((-6, 6), (-6, 6), (0.3, 5), (0.2, 2))
     return [values(*shape, low=a, high=b, seed=i, dtype=dtype) for i, (a, b) in enumerate(ranges)]
 
@@ -34,13 +34,13 @@ def reduced(t, reduction):
     return {"none": t, "mean": t.mean(), "sum": t.sum()}[reduction]
 
 
-# --- what it computes
+# --- value and gradient
 
 
 @each_reduction
 @pytest.mark.parametrize(("shape", "channel_dim"), [((5, 3), -1), ((3, 5), 0), ((5, 3, 4), 1), ((3,), 0)])
 @pytest.mark.parametrize("full", [False, True], ids=["broadcast", "full"])
-def test_constant_sigma_and_d_are_the_loss_of_channels(shape, channel_dim, reduction, full):
+def test_constant_sigma_and_d_equal_the_mkc_loss(shape, channel_dim, reduction, full):
     sigma, d, bound = (torch.tensor(v, dtype=torch.float64) for v in (SIGMA, D, BOUND))
     reference = MKCLoss(3, sigma=sigma, d=d, bound=bound, channel_dim=channel_dim, reduction=reduction)
     loss = HeteroscedasticMKCLoss(bound, channel_dim=channel_dim, reduction=reduction)
@@ -87,7 +87,7 @@ def test_infinite_sigma_is_the_gaussian_nll_of_each_element():
     assert gradients(found, sigma)[0].item() == 0
 
 
-def test_the_normaliser_in_chunks_is_the_normaliser(monkeypatch):
+def test_the_normaliser_in_chunks_equals_the_whole(monkeypatch):
     x, y, sigma, d = data(7, 3)
     loss = HeteroscedasticMKCLoss(30.0)
     sigma.requires_grad_()
@@ -106,7 +106,7 @@ def test_the_normaliser_in_chunks_is_the_normaliser(monkeypatch):
 @pytest.mark.parametrize("where", [(0,), (1,), (2,), (3,), (0, 1, 2, 3)], ids=["input", "target", "sigma", "d", "all"])
 @pytest.mark.parametrize("kind", ["mask", "zero weight"])
 @pytest.mark.parametrize("bound", [30.0, 2.5])
-def test_what_is_masked_reaches_neither_value_nor_gradient(reduction, poison, where, kind, bound):
+def test_masked_elements_affect_neither_value_nor_gradient(reduction, poison, where, kind, bound):
     loss = HeteroscedasticMKCLoss(bound, reduction=reduction)
     mask = torch.ones(5, 3, dtype=torch.bool)
     mask[1, 2] = mask[4, 0] = False
@@ -127,7 +127,7 @@ def test_what_is_masked_reaches_neither_value_nor_gradient(reduction, poison, wh
     assert all((t[~mask] == 0).all() for t in found[1:])
 
 
-def test_a_shared_sigma_and_d_matter_not_where_the_whole_sample_is_masked():
+def test_sigma_and_d_of_a_fully_masked_sample_are_ignored():
     loss = HeteroscedasticMKCLoss(0.5)  # narrower than 1
     x, y, *_ = data(4, 3)
     sigma, d = torch.full((4, 1), 2.0, dtype=torch.float64), torch.full((4, 1), 0.2, dtype=torch.float64)
@@ -186,7 +186,7 @@ def test_gradcheck_in_input_target_sigma_and_d():
         assert gradgradcheck(lambda *t: loss(*t, weight), leaves)  # noqa: B023
 
 
-def test_vmap_of_the_loss_and_its_gradient_equals_each_alone():
+def test_vmap_of_the_loss_and_its_gradient_equals_a_loop():
     loss = HeteroscedasticMKCLoss(30.0)
     tensors = data(4, 6, 3)
     alone = torch.stack([loss(*(t[i] for t in tensors)) for i in range(4)])
@@ -224,7 +224,7 @@ def test_sigma_and_d_start_as_given_whatever_the_features(shape):
 
 
 @pytest.mark.parametrize("raw", [-1e4, -100.0, -15.0, 0.0, 15.0, 100.0, 1e4])
-def test_bounds_hold_with_finite_gradients_wherever_the_raw_values_go(raw):
+def test_bounds_hold_with_finite_gradients_for_all_raw_values(raw):
     head, loss = MKCHead(3, 2, bound=50.0, d_min=1e-3), HeteroscedasticMKCLoss(50.0)
     with torch.no_grad():
         head.scales.bias.fill_(raw)
@@ -259,7 +259,7 @@ def test_state_dict_carries_the_bounds():
     assert all(map(torch.equal, other(features), head(features)))
 
 
-def test_noise_that_grows_and_outliers_are_told_apart():
+def test_heteroscedastic_noise_is_distinguished_from_outliers():
     generator = torch.Generator().manual_seed(0)
     x = torch.linspace(0, 1, 400).unsqueeze(-1)
     d = 0.2 + 0.8 * x
@@ -281,7 +281,7 @@ def test_noise_that_grows_and_outliers_are_told_apart():
     assert (location - torch.sin(3 * x)).abs().max() < 0.5
 
 
-# --- what is refused, and why
+# --- bad arguments
 
 
 @pytest.mark.parametrize("name", ["sigma", "d"])
@@ -323,12 +323,12 @@ def test_sigma_and_d_out_of_range_are_refused_by_index_with_a_remedy(sigma, d, m
         HeteroscedasticMKCLoss(30.0)(x, x, s, e)
 
 
-def test_what_the_loss_of_channels_refuses_is_refused():
-    loss, one = HeteroscedasticMKCLoss(torch.tensor([9.0, 40.0])), torch.ones(1, 1)
+def test_arguments_that_mkc_loss_refuses_are_refused():
+    loss, scale = HeteroscedasticMKCLoss(torch.tensor([9.0, 40.0])), torch.ones(1, 1)
     x, bad = torch.zeros(4, 2), torch.zeros(4, 2)
     bad[1, 0] = NAN
     for arguments, message in (
-        ((x, torch.zeros(4, 1)), "Expected `input` and `target` of one shape"),
+        ((x, torch.zeros(4, 1)), "`input` and `target` of the same shape"),
         ((torch.zeros(4, 3), torch.zeros(4, 3)), "Expected 2 channels, as `bound` has, in dimension -1"),
         ((x[:0], x[:0]), "at least one element"),
         ((torch.zeros(()), torch.zeros(())), "for the channels"),
@@ -336,12 +336,12 @@ def test_what_the_loss_of_channels_refuses_is_refused():
         ((bad, x), r"`input` to be finite but got 1 values that are not, the first at index \(1, 0\)"),
     ):
         with pytest.raises(ValueError, match=message):
-            loss(*arguments, one, one)
+            loss(*arguments, scale, scale)
     with pytest.raises(ValueError, match="Expected argument `weight` of shape"):
-        loss(x, x, one, one, torch.ones(3))
+        loss(x, x, scale, scale, torch.ones(3))
     with pytest.raises(ValueError, match="`weight` to be >= 0 and finite but got -1 at index"):
-        loss(x, x, one, one, -torch.ones(4))
-    assert bool(loss(bad, x, one, one, bad.isfinite()).isfinite())
+        loss(x, x, scale, scale, -torch.ones(4))
+    assert bool(loss(bad, x, scale, scale, bad.isfinite()).isfinite())
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, INF, NAN, torch.ones(2, 2)])
@@ -364,8 +364,8 @@ def test_bad_bounds_and_reductions_are_refused(bound):
         ({"bound": INF}, "`bound` to be positive and finite"),
         ({"bound": torch.ones(3)}, r"`bound` to be a number or of shape \(2,\) but got \(3,\)"),
         ({"d_min": 0.0}, "`d_min` to be positive and finite"),
-        ({"d_min": 1.0}, "`d_init` input_hold `d_min`"),
-        ({"d_init": 50.0}, "`d_init` input_hold `d_min`"),
+        ({"d_min": 1.0}, "`d_init` between `d_min`"),
+        ({"d_init": 50.0}, "`d_init` between `d_min`"),
         ({"sigma_init": 0.049}, r"`sigma_init` in \(0\.05, 1000\) but got 0\.049"),
         ({"sigma_init": 1e3 + 1}, r"`sigma_init` in \(0\.05, 1000\)"),
         ({"sigma_init": INF}, "`sigma_init` to be positive and finite"),
@@ -385,7 +385,7 @@ def test_another_number_of_features_is_refused():
         MKCHead(5, 2, bound=50.0, d_min="small")
 
 
-def test_a_head_of_images_is_the_head_at_every_place():
+def test_a_head_of_images_equals_the_head_at_every_place():
     torch.manual_seed(0)
     head = MKCConvHead(5, 2, bound=50.0, d_min=1e-3)
     nn.init.normal_(head.scales.weight)

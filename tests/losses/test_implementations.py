@@ -1,4 +1,4 @@
-"""One algorithm, whatever computes it: NumPy, torch, torch's compiler, and tensors that have no values to look at."""
+"""The same algorithm in NumPy, in torch, in torch's compiler, and on tensors without values."""
 
 import copy
 import math
@@ -28,7 +28,7 @@ compiler = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's c
 
 
 def batch(step, *shape):
-    """Predictions and targets without ties, whose noise changes, and of which up to half are wrong for a while."""
+    """Predictions and targets without ties, of changing noise, up to half of them wrong for a time."""
     g = torch.Generator().manual_seed(step)
     x, y = torch.randn(2, *shape, generator=g, dtype=torch.float64)
     y *= 1.0 + 0.5 * math.sin(0.1 * step)
@@ -51,23 +51,23 @@ def stepped(loss, call, x, y, *weight):
     return [value.detach(), *torch.autograd.grad(value.sum(), [x, *loss.parameters()])]
 
 
-def assert_same_steps(one, other, call, steps, *, rtol, shape=(64, 2), prepare=lambda _: None):
+def assert_same_steps(reference, other, call, steps, *, rtol, shape=(64, 2), prepare=lambda _: None):
     """Values, gradients and states of two losses agree batch after batch; counters and shares to the bit."""
     shares = []
     for step in range(steps):
         x, y = batch(step, *shape)
         prepare(0)
-        expected = stepped(one, one, x, y)
+        expected = stepped(reference, reference, x, y)
         prepare(1)
         found = stepped(other, call, x, y)
         for a, b in zip(found, expected, strict=True):
             torch.testing.assert_close(a, b, rtol=rtol, atol=rtol * float(b.abs().max()))
-        for name, value in one.state_dict().items():
+        for name, value in reference.state_dict().items():
             exact = name.endswith(("share", "steps", "batches", "position"))
             tolerance = 0.0 if exact else rtol
             torch.testing.assert_close(other.state_dict()[name], value, rtol=tolerance, atol=tolerance)
-        if one.schedule is not None:
-            shares.append(one.schedule.share.clone())
+        if reference.schedule is not None:
+            shares.append(reference.schedule.share.clone())
     if shares and steps >= 300:  # up and down, in between and at the end
         change = torch.stack(shares).diff(dim=0)
         assert bool((change > 0).any())
@@ -150,13 +150,13 @@ def test_a_compiled_loss_takes_weights_and_batches_of_any_size(options, weighted
 
 @pytest.mark.e2e
 @compiler
-def test_impl_compile_is_impl_eager(monkeypatch):
+def test_impl_compile_equals_impl_eager(monkeypatch):
     torch.compiler.reset()
     compiled = torch.compile(mkc.MKCLoss._computed, backend="aot_eager")
     calls = []
     monkeypatch.setattr(mkc, "_compiled", lambda: lambda *args: calls.append(1) or compiled(*args))
-    one, other = made({"impl": "eager"}, 0), made({"impl": "compile"}, 0)
-    assert_same_steps(one, other, other, 12, rtol=1e-10)
+    reference, other = made({"impl": "eager"}, 0), made({"impl": "compile"}, 0)
+    assert_same_steps(reference, other, other, 12, rtol=1e-10)
     assert len(calls) == 12
 
 
@@ -200,7 +200,7 @@ def test_single_precision_is_the_same_algorithm_in_numpy_and_torch(monkeypatch):
 
 
 class OneDevice(TorchDispatchMode):
-    """Fails where an operation looks at a value, or has a tensor of the CPU among its arguments or results."""
+    """Fails if an operation reads a value, or has a tensor of the CPU among its arguments or results."""
 
     looks = frozenset(
         getattr(torch.ops.aten, name)
@@ -208,7 +208,7 @@ class OneDevice(TorchDispatchMode):
     )
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        assert func.overloadpacket not in self.looks, f"{func} looks at a value"
+        assert func.overloadpacket not in self.looks, f"{func} reads a value"
         result = func(*args, **(kwargs or {}))
         tensors = [value for value in tree_leaves((args, kwargs, result)) if isinstance(value, torch.Tensor)]
         assert {tensor.device.type for tensor in tensors} <= {"meta"}, f"{func} mixes devices"
@@ -216,7 +216,7 @@ class OneDevice(TorchDispatchMode):
 
 
 class NoHostCopy(TorchFunctionMode):
-    """Fails where a tensor is made of Python's or NumPy's numbers, or read into them: torch copies out of our sight."""
+    """Fails if a tensor is made of Python's or NumPy's numbers, or read into them: a hidden copy of torch."""
 
     made = (torch.tensor, torch.as_tensor, torch.asarray, torch.from_numpy, torch.Tensor.new_tensor)
     read = (torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu, torch.Tensor.__bool__)
@@ -252,7 +252,7 @@ def meta_step(loss, shape, dtype, weight):
     ],
     ids=str,
 )
-def test_a_training_step_looks_at_no_value_and_copies_nothing_from_the_host(
+def test_a_training_step_reads_no_value_and_copies_nothing_from_the_host(
     options, reduction, weighted, channel_dim, dtype
 ):
     loss = MKCLoss(3, reduction=reduction, channel_dim=channel_dim, **options).to("meta")
@@ -269,7 +269,7 @@ def test_a_training_step_looks_at_no_value_and_copies_nothing_from_the_host(
 
 
 @each_mode
-def test_evaluation_and_a_second_derivative_look_at_no_value(options):
+def test_evaluation_and_a_second_derivative_read_no_value(options):
     loss = MKCLoss(3, **options).to("meta")
 
     def steps():
@@ -286,13 +286,13 @@ def test_evaluation_and_a_second_derivative_look_at_no_value(options):
         steps()
 
 
-def test_these_modes_see_what_they_should():
-    one = torch.ones(3, device="meta")
+def test_the_checking_modes_detect_reads_and_copies():
+    reference = torch.ones(3, device="meta")
     for bad in (
-        lambda: one.new_tensor([1.0, 2.0]),
+        lambda: reference.new_tensor([1.0, 2.0]),
         lambda: torch.tensor([1.0], device="meta"),
         lambda: torch.ones(3).to("meta"),
-        lambda: one + torch.ones(()),
+        lambda: reference + torch.ones(()),
         lambda: torch.ones(3).sum().item(),
     ):
         with pytest.raises(AssertionError), NoHostCopy(), OneDevice():

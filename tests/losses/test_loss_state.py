@@ -1,4 +1,4 @@
-"""The running state of a loss: what counts as a batch, resumed training, ensembles and processes."""
+"""The running state of a loss: batches, resumed training, ensembles and processes."""
 
 import copy
 import io
@@ -49,7 +49,7 @@ def after(*sizes, **options):
     return loss
 
 
-# --- what it holds
+# --- content
 
 
 def test_the_state_dict_is_small():
@@ -62,7 +62,7 @@ def test_the_state_dict_is_small():
     assert len(MKCLoss(2, d=1.0).state_dict()) == 4
 
 
-def test_half_precision_keeps_the_state_in_single_and_its_counters_whole():
+def test_half_precision_keeps_the_state_in_float32_and_its_counters_integer():
     loss = after(1.0, 2.0)
     before = state(loss)
     for half in (loss.half(), loss.bfloat16(), loss.float()):
@@ -74,7 +74,7 @@ def test_half_precision_keeps_the_state_in_single_and_its_counters_whole():
 
 @given(exponent=st.floats(-6.0, 6.0), seed=st.integers(0, 99))
 @settings(max_examples=20, deadline=None)
-def test_scale_domain_and_pull_have_the_unit_of_the_target(exponent, seed):
+def test_scale_bound_and_gradient_have_the_unit_of_the_target(exponent, seed):
     scale = 10.0**exponent
     x, y = torch.randn(2, 30, 1, generator=generator(seed), dtype=torch.float64)
     found = []
@@ -115,7 +115,7 @@ def test_d_follows_the_residuals_and_learns_a_factor_on_them():
 
 @pytest.mark.parametrize("batch", [torch.zeros(5, 1), torch.ones(1, 1), torch.full((3, 1), 1e-30)])
 @pytest.mark.parametrize("options", [{}, {"d": 1.5, "objective": "robust"}, {"objective": "likelihood"}])
-def test_batches_of_one_or_without_errors_stay_finite(batch, options):
+def test_single_element_and_zero_error_batches_stay_finite(batch, options):
     loss = MKCLoss(1, **options)
     for _ in range(3):
         leaf = batch.clone().requires_grad_()
@@ -126,7 +126,7 @@ def test_batches_of_one_or_without_errors_stay_finite(batch, options):
         assert all(p.grad.isfinite().all() for p in loss.parameters())
 
 
-# --- what counts as a batch
+# --- updates by batches
 
 
 def test_each_forward_pass_in_training_is_a_batch():
@@ -167,11 +167,13 @@ def test_training_without_a_gradient_is_a_batch():
     loss(x.requires_grad_(), y).backward()
 
 
-def test_a_batch_that_is_masked_throughout_changes_no_scale():
+def test_a_fully_masked_batch_changes_no_scale():
     loss = after(1.0, 3.0)
     before = loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches.clone()
     assert loss(*data(50), torch.zeros(50, 2)).item() == 0.0
-    for value, other in zip(before, (loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches), strict=True):
+    for value, other in zip(
+        before, (loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches), strict=True
+    ):
         assert torch.equal(value, other)
 
 
@@ -198,7 +200,7 @@ def test_activation_checkpointing_counts_a_batch_once(options, use_reentrant):
 
 
 @each_robust
-def test_transforms_of_functions_leave_the_state_alone(options):
+def test_function_transforms_do_not_change_the_state(options):
     loss = after(1.0, 3.0, **options)
     x, y = data(20, seed=9)
     before = state(loss)
@@ -235,7 +237,7 @@ def test_a_fresh_loss_under_a_transform_takes_its_scale_from_the_data(unit, opti
 
 
 @each_robust
-def test_a_functional_call_computes_with_and_changes_the_state_that_it_is_given(options):
+def test_a_functional_call_uses_and_updates_the_given_state(options):
     loss, other = after(1.0, 3.0, **options), MKCLoss(2, **options)
     given = state(loss)
     untouched = state(other)
@@ -248,7 +250,7 @@ def test_a_functional_call_computes_with_and_changes_the_state_that_it_is_given(
 
 @each_robust
 @pytest.mark.parametrize("fresh", [False, True])
-def test_an_ensemble_under_vmap_is_each_loss_alone(options, fresh):
+def test_an_ensemble_under_vmap_equals_a_loop(options, fresh):
     losses = [MKCLoss(2, **options) if fresh else after(size, 2.0 * size, **options) for size in (0.5, 1.0, 30.0)]
     parameters, buffers = stack_module_state(losses)
     kept = copy.deepcopy(buffers)
@@ -295,7 +297,7 @@ def trained(model, loss, optimiser, steps, found):
 @pytest.mark.e2e
 @pytest.mark.parametrize("at", [1, 121, 122, 123, 124])
 @pytest.mark.parametrize("options", [*ROBUST.values(), {"objective": "likelihood"}], ids=[*ROBUST, "likelihood"])
-def test_training_that_is_saved_and_loaded_goes_on_to_the_bit(options, at):
+def test_resumed_training_is_bitwise_equal(options, at):
     runs = []
     for resumed in (False, True):
         torch.manual_seed(0)
@@ -318,7 +320,7 @@ def test_training_that_is_saved_and_loaded_goes_on_to_the_bit(options, at):
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_sigma": False}, {"learn_d": False}], ids=str)
 @pytest.mark.parametrize("kind", [*ROBUST.values(), {"objective": "likelihood"}], ids=[*ROBUST, "likelihood"])
-def test_a_state_dict_carries_everything_into_a_loss_made_alike(options, kind):
+def test_a_state_dict_restores_everything_in_an_equal_loss(options, kind):
     loss, other = after(1.0, 7.0, 3.0, **options, **kind), MKCLoss(2, **options, **kind)
     (stored,) = saved(loss)
     other.load_state_dict(stored)
@@ -335,7 +337,7 @@ def test_a_state_dict_carries_everything_into_a_loss_made_alike(options, kind):
     [({}, "likelihood"), ({"objective": "likelihood"}, "likelihood"), ({"bound": 60.0}, "likelihood"), ({}, "robust")],
     ids=str,
 )
-def test_a_loss_that_follows_loads_into_a_loss_of_given_numbers(options, kind, objective):
+def test_a_loss_with_auto_d_loads_into_a_loss_with_given_d(options, kind, objective):
     loss = after(1.0, 7.0, **kind)
     other = MKCLoss(2, sigma=1.0, d=1.0, bound=9.0, objective=objective, **options)
     other.load_state_dict(state(loss))
@@ -347,7 +349,7 @@ def test_a_loss_that_follows_loads_into_a_loss_of_given_numbers(options, kind, o
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=str)
 @pytest.mark.parametrize("kind", [{}, {"objective": "likelihood"}], ids=str)
-def test_a_frozen_loss_loads_into_one_that_follows_and_freezes_it(options, kind):
+def test_a_frozen_loss_loads_into_a_loss_with_auto_d_and_freezes_it(options, kind):
     loss = after(1.0, 7.0, **options, **kind)
     loss.freeze_scale()
     other = MKCLoss(2, **options, **kind)
@@ -359,7 +361,7 @@ def test_a_frozen_loss_loads_into_one_that_follows_and_freezes_it(options, kind)
 
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=str)
-def test_a_robust_loss_of_a_given_d_loads_into_one_of_the_likelihood(options):
+def test_a_robust_loss_with_given_d_loads_into_a_likelihood_loss(options):
     given = {"d": torch.tensor([0.7, 1.5]), "bound": 60.0, **options}
     loss = after(1.0, 7.0, **given, objective="robust")
     other = MKCLoss(2, d=1.0, **options)
@@ -370,7 +372,7 @@ def test_a_robust_loss_of_a_given_d_loads_into_one_of_the_likelihood(options):
     assert other.eval()(x, y).item() == loss.eval()(x, y).item()
 
 
-def test_a_copy_is_equal_and_apart():
+def test_a_copy_is_equal_and_independent():
     loss = after(1.0, 7.0)
     twin = copy.deepcopy(loss)
     x, y = data(50, seed=9)
@@ -384,7 +386,7 @@ def test_a_copy_is_equal_and_apart():
 
 
 class Training(nn.Module):
-    """A network with its loss, as it is wrapped where sigma and d are to be averaged as well."""
+    """A network with its loss in a module, so that wrapping it averages sigma and d too."""
 
     def __init__(self, loss):
         super().__init__()
@@ -438,7 +440,7 @@ def _process(rank, port, queue):
 
 @pytest.fixture(scope="module")
 def processes():
-    """What two processes that train together end with."""
+    """Final states of two processes that train together."""
     context = torch.multiprocessing.get_context("spawn")
     queue = context.SimpleQueue()
     with socket.socket() as free:
@@ -449,7 +451,7 @@ def processes():
 
 
 @pytest.mark.process
-def test_a_scale_is_the_geometric_mean_of_those_of_processes_that_have_had_residuals_and_the_range_the_widest(
+def test_processes_share_the_geometric_mean_scale_and_the_widest_range(
     processes,
 ):
     """Of three channels: with residuals in both processes, in the second alone, in none."""
@@ -477,7 +479,7 @@ def test_processes_have_the_same_scale_and_schedule(processes, kind, place):
 
 
 @pytest.mark.parametrize("kind", ROBUST)
-def test_sigma_and_d_are_averaged_where_the_loss_is_inside_of_the_wrapped_module_alone(processes, kind):
+def test_sigma_and_d_are_averaged_only_if_the_loss_is_inside_the_wrapped_module(processes, kind):
     for name in ("raw_kappa", "raw_d"):
         inside, outside = ([found[f"{kind}, {place}"][name] for found in processes] for place in ("inside", "outside"))
         assert inside[0] == inside[1]

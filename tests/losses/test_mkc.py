@@ -45,7 +45,7 @@ def gradients(value, *leaves):
     return torch.autograd.grad(value.sum(), leaves, retain_graph=True)
 
 
-# --- what it computes
+# --- value and gradient
 
 
 @each_reduction
@@ -74,7 +74,7 @@ def test_infinite_sigma_with_learned_d_is_the_gaussian_nll_in_value_and_gradient
     torch.testing.assert_close(by_raw / chain, gradients(expected, d)[0], rtol=1e-9, atol=1e-12)
 
 
-def test_fixed_sigma_and_d_are_the_energy_of_the_paper_over_the_channels():
+def test_fixed_sigma_and_d_give_the_papers_energy_over_the_channels():
     loss = made(**FIXED)
     assert not loss.normalize
     x, y = data(7, 3)
@@ -107,7 +107,7 @@ def test_normalize_adds_the_normalizer_to_a_fixed_loss_and_leaves_its_gradient()
 
 
 @each_reduction
-def test_an_outlier_pulls_with_its_weight(reduction):
+def test_the_gradient_of_an_outlier_is_scaled_by_its_weight(reduction):
     loss = made(reduction=reduction, **FIXED)
     x, y = data(4, 3)
     y[2, 1] += 1e6
@@ -178,7 +178,7 @@ def test_equal_weights_change_nothing_but_the_sum(reduction):
 @pytest.mark.parametrize("poison", [NAN, INF, -INF, 1e300])
 @pytest.mark.parametrize("where", ["input", "target", "both"])
 @pytest.mark.parametrize("kind", ["mask", "zero weight"])
-def test_what_is_masked_reaches_neither_value_nor_gradient(reduction, poison, where, kind):
+def test_masked_elements_affect_neither_value_nor_gradient(reduction, poison, where, kind):
     loss = made(reduction=reduction)
     x, y = data(5, 3)
     mask = torch.ones(5, 3, dtype=torch.bool)
@@ -203,7 +203,7 @@ def test_what_is_masked_reaches_neither_value_nor_gradient(reduction, poison, wh
         assert (found[0][~mask] == 0).all()
 
 
-def test_masked_mean_is_the_mean_over_what_counts():
+def test_masked_mean_is_the_mean_over_unmasked_elements():
     loss = made()
     x, y = data(6, 3)
     mask = torch.tensor([True, False, True, True, False, True])
@@ -306,7 +306,7 @@ def test_to_float64_converts_everything_and_keeps_the_values():
 
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=["learned", "fixed", "half"])
-def test_copies_and_pickles_are_equal_and_apart(options):
+def test_copies_and_pickles_are_equal_and_independent(options):
     loss = made(**options)
     x, y = data(5, 3)
     for twin in (copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
@@ -339,7 +339,7 @@ def test_state_dict_of_another_number_of_channels_is_refused():
 
 
 @pytest.mark.parametrize("learned", [{}, {"learn_d": False}, {"learn_sigma": False}], ids=["both", "sigma", "d"])
-def test_a_learned_loss_loads_into_a_fixed_one_and_back(learned):
+def test_a_learned_loss_loads_into_a_fixed_loss_and_back(learned):
     loss, fixed, again = made(**learned), made(sigma=9.0, d=0.3, **FIXED), made(sigma=9.0, d=0.3, **learned)
     fixed.load_state_dict(loss.state_dict())
     again.load_state_dict(fixed.state_dict())
@@ -349,7 +349,7 @@ def test_a_learned_loss_loads_into_a_fixed_one_and_back(learned):
             torch.testing.assert_close(found, getattr(loss, name).double(), rtol=1e-5, atol=0.0)
 
 
-def test_a_fixed_gaussian_cannot_be_learned_on():
+def test_a_fixed_gaussian_does_not_load_into_a_learned_loss():
     with pytest.raises(RuntimeError, match="raw_kappa"):
         made().load_state_dict(made(sigma=INF, **FIXED).state_dict())
 
@@ -359,7 +359,7 @@ def test_a_fixed_gaussian_cannot_be_learned_on():
 
 @pytest.mark.parametrize("options", [{}, FIXED], ids=["learned", "fixed"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sigma_and_d_are_what_was_given_and_what_is_set(options, dtype):
+def test_sigma_and_d_are_the_given_and_the_assigned_values(options, dtype):
     loss = made(dtype=dtype, **options)
     tolerance = {"rtol": 2e-6 if dtype == torch.float32 else 1e-12, "atol": 0}
     torch.testing.assert_close(loss.sigma, torch.tensor(SIGMA, dtype=dtype), **tolerance)
@@ -393,14 +393,14 @@ def test_a_fixed_sigma_can_be_set_to_infinity_and_back():
     assert loss.sigma.tolist() == pytest.approx([3.0] * 3)
 
 
-def test_a_learned_sigma_is_not_set_to_infinity_where_it_would_stay_for_ever():
+def test_a_learned_sigma_cannot_be_set_to_infinity():
     loss = made()
     with pytest.raises(ValueError, match="finite `sigma`"):
         loss.sigma = INF
     assert all(p.isfinite().all() for p in loss.parameters())
 
 
-def test_setters_keep_the_parameter_objects_so_that_an_optimiser_keeps_its_hold():
+def test_setters_keep_the_parameter_objects_of_an_optimiser():
     loss = made()
     before = list(loss.parameters())
     loss.sigma, loss.d = 1.0, 1.0
@@ -409,7 +409,7 @@ def test_setters_keep_the_parameter_objects_so_that_an_optimiser_keeps_its_hold(
 
 
 @pytest.mark.parametrize("value", [0.049, 0.0, -1.0, NAN])
-def test_sigma_setter_refuses_what_is_out_of_range(value):
+def test_sigma_setter_refuses_values_out_of_range(value):
     for loss in (made(), made(**FIXED)):
         with pytest.raises(ValueError, match="Expected argument `sigma` in"):
             loss.sigma = value
@@ -418,7 +418,7 @@ def test_sigma_setter_refuses_what_is_out_of_range(value):
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, NAN, INF])
-def test_d_setter_refuses_what_is_no_scale(value):
+def test_d_setter_refuses_values_that_are_not_positive_and_finite(value):
     for loss in (made(), made(**FIXED)):
         with pytest.raises(ValueError, match="`d` to be positive and finite"):
             loss.d = value
@@ -427,9 +427,9 @@ def test_d_setter_refuses_what_is_no_scale(value):
 
 
 @pytest.mark.parametrize("value", [0.01, 0.005, 40.0, 50.0])
-def test_d_setter_refuses_what_is_not_between_its_bounds(value):
+def test_d_setter_refuses_values_not_between_its_bounds(value):
     loss = made(bound=40.0, d_min=0.01)
-    with pytest.raises(ValueError, match="Expected `d` input_hold `d_min`"):
+    with pytest.raises(ValueError, match="`d` between `d_min`"):
         loss.d = value
     torch.testing.assert_close(loss.d, torch.tensor(D, dtype=torch.float64))
 
@@ -450,7 +450,7 @@ def test_bounds_hold_after_violent_steps():
         assert (loss.sigma >= 0.0499).all()
 
 
-def test_getters_show_what_optimisation_has_found():
+def test_getters_return_the_optimised_values():
     torch.manual_seed(0)
     loss = MKCLoss(2, sigma=5.0, d=1.0, bound=100.0)
     y = torch.randn(2000, 2) * torch.tensor([0.3, 4.0])
@@ -546,7 +546,7 @@ def test_parameters_of_the_density_are_recovered_from_samples():
     assert (errors < 0.02).all()
 
 
-# --- what is refused, and why
+# --- bad arguments
 
 
 @pytest.mark.parametrize(
@@ -589,7 +589,7 @@ def test_bad_arguments_are_refused_with_a_reason(options, error, message):
 def test_shapes_that_torch_would_broadcast_are_refused(shapes):
     x, y = (torch.zeros(s) for s in shapes)
     for first, second in ((x, y), (y, x)):
-        with pytest.raises(ValueError, match="Expected `input` and `target` of one shape"):
+        with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
             MKCLoss(2)(first, second)
 
 
@@ -624,7 +624,7 @@ def test_an_empty_batch_is_refused(reduction):
 
 @pytest.mark.parametrize("shape", [(2,), (3, 2), (4, 1, 1), (3,), ()])
 def test_weights_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\), with 1 where .*, or \(4,\) but got"):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\), .* or \(4,\) but got"):
         MKCLoss(2)(torch.zeros(4, 2), torch.zeros(4, 2), torch.ones(shape))
 
 
@@ -637,7 +637,7 @@ def test_weights_of_an_image_are_those_of_all_its_elements(shape):
     torch.testing.assert_close(loss(x, y, weight), loss(x, y, whole))
 
 
-def test_channels_in_the_second_dimension_are_asked_for():
+def test_ambiguous_channel_dimension_is_refused():
     x = torch.zeros(2, 3, 4, 5)
     with pytest.raises(ValueError, match=r"3 channels in dimension -1 but got \(2, 3, 4, 5\); .*`channel_dim=1`"):
         MKCLoss(3)(x, x)
@@ -661,7 +661,7 @@ def test_integer_weights_count(dtype):
     ("options", "learned"),
     [({}, "['sigma', 'd']"), ({"learn_d": False}, "['sigma']"), ({"learn_sigma": False}, "['d']"), (FIXED, "[]")],
 )
-def test_repr_says_what_is_learned(options, learned):
+def test_repr_names_the_learned_parameters(options, learned):
     text = repr(MKCLoss(3, d=2.0, channel_dim=1, reduction="sum", **options))
     normalize = options != FIXED
     assert text == (
@@ -670,7 +670,7 @@ def test_repr_says_what_is_learned(options, learned):
     )
 
 
-def test_repr_shows_the_numbers_of_each_channel_and_which_are_followed():
+def test_repr_shows_the_numbers_of_each_channel_and_marks_auto_values():
     assert "sigma=[0.7, 3, 20], d=[0.5, 1, 2], bound=[9, 40, 1000]" in repr(made())
     assert "d=auto: 1, bound=auto: 10, objective='robust'" in repr(MKCLoss(2))
     assert "d=auto: 1, bound=50, objective='likelihood'" in repr(MKCLoss(2, bound=50.0, objective="likelihood"))
@@ -694,7 +694,7 @@ def test_compiled_loss_equals_eager_over_two_batch_sizes():
         torch.testing.assert_close(found, gradients(loss(x, y), *leaves), rtol=1e-9, atol=1e-12)
 
 
-def test_an_ensemble_of_losses_under_vmap_equals_each_alone():
+def test_an_ensemble_of_losses_under_vmap_equals_a_loop():
     losses = [made(sigma=s, d=d) for s, d in ((0.5, 0.4), (2.0, 1.0), (9.0, 3.0))]
     parameters, buffers = stack_module_state(losses)
     x, y = data(3, 6, 3)
@@ -734,7 +734,7 @@ def test_a_bandwidth_at_the_end_of_its_range_can_still_move():
 
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
-def test_a_target_that_is_not_finite_is_refused_with_the_remedy(reduction, value):
+def test_a_target_that_is_not_finite_is_refused_with_a_remedy(reduction, value):
     loss = MKCLoss(2, reduction=reduction)
     target = torch.zeros(3, 2)
     target[1, 0] = value
@@ -744,19 +744,21 @@ def test_a_target_that_is_not_finite_is_refused_with_the_remedy(reduction, value
     assert bool(torch.isfinite(masked).all())
 
 
-def test_targets_whose_sum_overflows_are_no_reason_to_refuse():
+def test_targets_whose_sum_overflows_are_accepted():
     loss = MKCLoss(1, bound=3e38, d=1e37)
     assert math.isfinite(loss(torch.zeros(4, 1), torch.full((4, 1), 2e38)).item())
 
 
-def test_per_sample_gradients_are_not_stopped_by_the_look_at_targets():
+def test_per_sample_gradients_work_with_the_check_of_targets():
     loss, target = MKCLoss(1), torch.arange(4.0).unsqueeze(-1)
     parameters = dict(loss.named_parameters())
 
-    def one(p, x, y):
+    def loss_of_sample(p, x, y):
         return torch.func.functional_call(loss, p, (x, y))
 
-    slopes = torch.func.vmap(torch.func.grad(one), in_dims=(None, 0, 0))(parameters, torch.zeros(4, 1), target)
+    slopes = torch.func.vmap(torch.func.grad(loss_of_sample), in_dims=(None, 0, 0))(
+        parameters, torch.zeros(4, 1), target
+    )
     assert slopes["raw_d"].shape == (4, 1)
 
 
@@ -771,7 +773,7 @@ def test_d_learns_the_size_of_the_noise():
     assert 0.7 < float(loss.d.detach()) < 1.3
 
 
-# --- values that are refused, and where
+# --- checks of values
 
 
 @each_reduction
@@ -785,7 +787,7 @@ def test_weights_that_are_negative_or_not_finite_are_refused(reduction, bad, sha
         loss(x, x, weight)
 
 
-def test_weights_that_are_no_tensor_or_complex_are_refused():
+def test_weights_that_are_not_tensors_or_complex_are_refused():
     loss, x = MKCLoss(2), torch.zeros(4, 2)
     for weight in ([1.0] * 4, np.ones(4), 1.0):
         with pytest.raises(TypeError, match=r"`weight` to be a tensor of weights or a boolean mask but got"):
@@ -797,7 +799,7 @@ def test_weights_that_are_no_tensor_or_complex_are_refused():
 @each_reduction
 @pytest.mark.parametrize("bad", [NAN, INF, -INF])
 @pytest.mark.parametrize("learned", [True, False])
-def test_a_prediction_that_counts_and_is_not_finite_is_refused(reduction, bad, learned):
+def test_an_unmasked_prediction_that_is_not_finite_is_refused(reduction, bad, learned):
     loss = MKCLoss(2, reduction=reduction, **({} if learned else FIXED))
     x, y = torch.zeros(3, 2), torch.zeros(3, 2)
     x[1, 0] = bad
@@ -809,13 +811,13 @@ def test_a_prediction_that_counts_and_is_not_finite_is_refused(reduction, bad, l
     assert bool(loss(x, y, x.isfinite()).isfinite().all())
 
 
-def test_a_prediction_and_a_target_that_are_infinite_alike_do_not_cancel():
+def test_infinite_prediction_and_target_do_not_cancel():
     x = torch.full((2, 1), INF)
     with pytest.raises(ValueError, match="`target` to be finite but got 2 values"):
         MKCLoss(1)(x, x)
 
 
-def test_what_is_refused_goes_through_under_vmap():
+def test_values_are_not_checked_under_vmap():
     loss, x = made(reduction="sum"), data(4, 3)[0]
     bad = x.clone()
     bad[1] = NAN
@@ -828,7 +830,7 @@ def test_what_is_refused_goes_through_under_vmap():
 
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
-def test_what_is_refused_goes_through_a_compiled_loss():
+def test_values_are_not_checked_in_a_compiled_loss():
     loss = made(reduction="none", **FIXED)
     compiled = torch.compile(loss, fullgraph=True)
     x, y = data(5, 3)
@@ -841,7 +843,7 @@ def test_what_is_refused_goes_through_a_compiled_loss():
 
 @pytest.mark.parametrize("name", ["input", "target"])
 @pytest.mark.parametrize("value", [np.zeros((4, 2)), [[0.0, 0.0]] * 4, None, 3.0])
-def test_data_that_are_no_tensors_are_refused_by_name(name, value):
+def test_data_that_are_not_tensors_are_refused_by_name(name, value):
     arguments = {"input": torch.zeros(4, 2), "target": torch.zeros(4, 2), name: value}
     with pytest.raises(
         TypeError, match=f"`{name}` to be a real floating-point tensor but got {type(value).__name__}; "
@@ -849,7 +851,7 @@ def test_data_that_are_no_tensors_are_refused_by_name(name, value):
         MKCLoss(2)(**arguments)
 
 
-def test_a_channel_that_has_no_dimension_is_told_how_to_get_one():
+def test_a_missing_channel_dimension_is_refused_with_a_remedy():
     flat, column = torch.zeros(1000), torch.zeros(1000, 1)
     with pytest.raises(ValueError, match=r"Expected 1 channels .* got \(1000,\); .* unsqueeze\(-1\)"):
         MKCLoss(1)(flat, flat)
@@ -860,7 +862,7 @@ def test_a_channel_that_has_no_dimension_is_told_how_to_get_one():
 
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
-def test_parameters_that_are_no_numbers_are_refused_by_name(name):
+def test_parameters_that_are_not_numbers_are_refused_by_name(name):
     for value in ("a", [[1.0], [1.0, 2.0]], 1j):
         with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got"):
             MKCLoss(2, **{name: value})
@@ -871,7 +873,7 @@ def test_parameters_that_are_no_numbers_are_refused_by_name(name):
 
 
 @pytest.mark.parametrize("value", ["last", 1.0, True])
-def test_a_channel_dim_that_is_no_whole_number_is_refused(value):
+def test_a_channel_dim_that_is_not_an_integer_is_refused(value):
     with pytest.raises(ValueError, match="`channel_dim` to be a whole number but got"):
         MKCLoss(2, channel_dim=value)
 

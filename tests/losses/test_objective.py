@@ -1,4 +1,4 @@
-"""By what a network learns: the likelihood, or a robust term beside the likelihood of detached residuals."""
+"""The training objective: the likelihood, or a robust term plus the likelihood of detached residuals."""
 
 import copy
 import math
@@ -48,10 +48,10 @@ def leaf(x):
     return x.clone().requires_grad_()
 
 
-# --- which objective
+# --- choice of the objective
 
 
-def test_the_objective_is_robust_where_d_is_taken_from_the_residuals():
+def test_the_objective_is_robust_if_d_is_auto():
     assert MKCLoss(1).objective == "robust"
     assert MKCLoss(1, **NOT_LEARNED).objective == "robust"
     assert MKCLoss(1, d=1.0).objective == "likelihood"
@@ -98,7 +98,7 @@ def test_in_training_the_value_is_the_sum_of_the_terms_and_so_are_its_gradients(
 
 
 @each_robust
-def test_the_network_term_reaches_no_parameter_and_the_density_term_no_prediction(options):
+def test_the_network_term_has_no_gradient_by_parameters_and_the_density_term_none_by_predictions(options):
     loss, (x, y) = annealing(**options), (leaf(value) for value in data(30, 2, seed=7))
     network, density = loss.terms(x, y)
     assert torch.autograd.grad(network, list(loss.parameters()), allow_unused=True, retain_graph=True) == (None, None)
@@ -149,7 +149,7 @@ def test_the_density_term_is_the_likelihood():
     torch.testing.assert_close(loss.terms(x, y).density, expected, rtol=1e-10, atol=0.0)
 
 
-def test_of_a_given_d_the_annealed_term_is_the_energy_at_a_bandwidth_no_wider_than_the_selected():
+def test_with_a_given_d_the_annealed_bandwidth_is_no_wider_than_the_selected():
     loss, (x, y) = annealing(share=1.0, **ROBUST["given d"]), data(30, 2, seed=7)
     with torch.no_grad():
         loss.d = torch.tensor([2.0, 0.4])
@@ -164,7 +164,7 @@ def test_of_a_given_d_the_annealed_term_is_the_energy_at_a_bandwidth_no_wider_th
     torch.testing.assert_close(loss.terms(x, y).network, unlimited, rtol=1e-10, atol=0.0)
 
 
-def test_a_bandwidth_near_the_widest_limits_no_gaussian():
+def test_a_bandwidth_near_the_widest_does_not_limit_a_gaussian():
     loss, (x, y) = MKCLoss(2, sigma=math.inf, d=1.5, objective="robust", **NOT_LEARNED).double(), data(30, 2, seed=7)
     loss(x, y)
     loss.schedule.share.fill_(1.0)
@@ -217,8 +217,8 @@ def test_under_the_likelihood_value_and_gradients_are_the_same_in_training_and_e
 
 
 @pytest.mark.parametrize("options", [{}, {"d": 1.5, "objective": "robust"}, {"objective": "likelihood"}, {"d": 1.5}])
-def test_what_moves_the_network_does_not_depend_on_what_is_learned(options):
-    """At errors of a half and of twenty scales, where it did by a factor of 1e7."""
+def test_the_network_gradient_does_not_depend_on_which_parameters_are_learned(options):
+    """At errors of half a scale and of twenty scales, where it once differed by a factor of 1e7."""
     error = torch.randn(200, 1, generator=generator(), dtype=torch.float64)
     error[0], error[1] = 0.5, 20.0
     pulls = []
@@ -232,7 +232,7 @@ def test_what_moves_the_network_does_not_depend_on_what_is_learned(options):
         torch.testing.assert_close(pull, pulls[0], rtol=1e-5, atol=1e-12)  # sigma and d are stored in float32
 
 
-def test_the_pull_of_the_initial_loss_is_its_influence():
+def test_the_gradient_of_the_initial_loss_is_its_influence():
     error = torch.randn(200, 1, generator=generator(), dtype=torch.float64)
     loss, x = MKCLoss(1, reduction="sum").double(), leaf(error)
     loss(x, torch.zeros_like(x)).backward()
@@ -242,20 +242,20 @@ def test_the_pull_of_the_initial_loss_is_its_influence():
 
 @each_robust
 @pytest.mark.parametrize("reduction", ["none", "sum"])
-def test_elements_and_sums_pull_like_the_mean_times_the_weight(reduction, options):
+def test_gradients_of_elements_and_sums_equal_the_mean_times_the_weight(reduction, options):
     x, y = data(40, 2)
     weight = torch.rand(40, 2, generator=generator(1), dtype=torch.float64)
     slopes = []
     for kind in (reduction, "mean"):
-        one = leaf(x)
+        inputs = leaf(x)
         value = annealing(reduction=kind, **options)(one, y, weight)
-        slopes.append(torch.autograd.grad(value.sum() * (1.0 if kind != "mean" else weight.sum()), one)[0])
+        slopes.append(torch.autograd.grad(value.sum() * (1.0 if kind != "mean" else weight.sum()), inputs)[0])
     torch.testing.assert_close(*slopes, rtol=1e-10, atol=1e-12)
 
 
 @each_reduction
 @each_robust
-def test_the_gradient_by_the_target_is_minus_that_by_the_prediction(reduction, options):
+def test_the_gradient_by_the_target_is_the_negative_gradient_by_the_prediction(reduction, options):
     loss, (x, y) = annealing(reduction=reduction, **options), (leaf(value) for value in data(40, 2))
     by_input, by_target = torch.autograd.grad(loss(x, y).sum(), (x, y))
     torch.testing.assert_close(by_input, -by_target, rtol=0.0, atol=0.0)
@@ -278,7 +278,7 @@ def test_the_gradient_by_a_weight_is_the_value_of_its_element(options):
 
 @each_robust
 @pytest.mark.parametrize("options_too", [{}, NOT_LEARNED], ids=["learned", "fixed"])
-def test_backward_passes_of_one_graph_agree_to_the_bit_and_scale_with_the_upstream_gradient(options, options_too):
+def test_repeated_backward_passes_are_bitwise_equal_and_scale_with_the_upstream_gradient(options, options_too):
     loss, (x, y) = annealing(**options, **options_too), (leaf(entry) for entry in data(40, 2))
     wanted = [x, y, *loss.parameters()]
     value = loss(x, y)
@@ -318,7 +318,7 @@ def test_hessians_by_forward_over_reverse_and_reverse_over_reverse():
     torch.testing.assert_close(forward, forward.mT)
 
 
-# --- the likelihood of what was followed
+# --- the likelihood after freezing
 
 
 def test_freezing_the_scale_keeps_the_numbers_and_ends_the_robust_objective():
@@ -339,12 +339,12 @@ def test_freezing_the_scale_keeps_the_numbers_and_ends_the_robust_objective():
         torch.testing.assert_close(loss.d.detach(), torch.full((2,), 2.0, dtype=torch.float64))
 
 
-def test_d_is_not_set_while_it_follows_the_residuals():
-    with pytest.raises(ValueError, match=r"a given `d` to set it but got one that takes d from the residuals.*freeze_"):
+def test_d_cannot_be_set_while_it_follows_the_residuals():
+    with pytest.raises(ValueError, match=r"`d` but got d=.* takes d from the residuals.*freeze_"):
         MKCLoss(1).d = 2.0
 
 
-def test_a_loss_that_is_frozen_on_its_floor_can_be_learned_on():
+def test_a_loss_frozen_at_its_floor_can_still_learn():
     loss = MKCLoss(1)
     noise = torch.randn(50, 1, generator=generator())
     for size in [1.0, *[1e-9] * 50]:
@@ -357,7 +357,7 @@ def test_a_loss_that_is_frozen_on_its_floor_can_be_learned_on():
 
 
 def minimised(loss, steps):
-    """A line fitted to points with wrong targets by L-BFGS with a line search: its slope, and the values found."""
+    """Slope and loss values of a line fitted by L-BFGS with a line search to points with wrong targets."""
     g = generator(3)
     x = torch.randn(200, 1, generator=g, dtype=torch.float64)
     y = 2.0 * x + 0.1 * torch.randn(200, 1, generator=g, dtype=torch.float64)
@@ -400,7 +400,7 @@ def test_with_a_frozen_scale_a_line_search_converges():
 
 
 @pytest.mark.parametrize(("options", "names"), [({}, True), (ROBUST["given d"], True), (LIKELIHOOD["given d"], False)])
-def test_a_prediction_that_is_not_finite_is_refused_with_the_remedy_of_a_line_search(options, names):
+def test_a_prediction_that_is_not_finite_is_refused_with_a_remedy_for_line_searches(options, names):
     loss, x = MKCLoss(1, **options), torch.tensor([[math.nan], [0.0]])
     with pytest.raises(ValueError, match="`input` to be finite but got 1 values") as refused:
         loss(x, torch.zeros(2, 1))
@@ -412,10 +412,10 @@ def test_a_prediction_that_is_not_finite_is_refused_with_the_remedy_of_a_line_se
         assert "freeze_scale" not in str(refused.value)
 
 
-# --- a schedule that belongs to a trainer
+# --- a guide: a schedule of a trainer
 
 
-def test_a_guide_gives_a_loss_of_given_numbers_the_robust_objective_in_training():
+def test_a_guide_gives_a_loss_with_given_d_the_robust_objective_in_training():
     x, y = data(60, 1)
     plain, loss = MKCLoss(1, d=1.0).double(), MKCLoss(1, d=1.0).double()
     scale, schedule = ResidualScale(1).double(), BandwidthSchedule(1).double()
@@ -423,9 +423,9 @@ def test_a_guide_gives_a_loss_of_given_numbers_the_robust_objective_in_training(
     loss.guide(scale, schedule)
 
     def looked_at(loss):
-        one = leaf(x)
-        value = loss(one, y)
-        return value.detach(), torch.autograd.grad(value, one)[0]
+        inputs = leaf(x)
+        value = loss(inputs, y)
+        return value.detach(), torch.autograd.grad(value, inputs)[0]
 
     value, pull = looked_at(loss)
     own = MKCLoss(1, d=1.0, objective="robust").double()

@@ -1,4 +1,4 @@
-"""Losses and heads in ONNX, run by another runtime on batches of other sizes."""
+"""Losses and heads exported to ONNX, run by another runtime on batches of other sizes."""
 
 import math
 
@@ -52,7 +52,7 @@ def batch(count, labels=False):
 
 
 def refuse_other(module, make, sizes=(1, 3, 17)):
-    """Fail where the exported module gives something else than the module, on batches of other sizes."""
+    """Fail if the exported module and the module differ, on batches of other sizes."""
     module.eval()
     size = torch.export.Dim("samples", min=1)
     given = make(4)
@@ -79,7 +79,7 @@ def trained(loss):
 def test_a_head_and_its_likelihood():
     torch.manual_seed(0)
     module = Predicted()
-    # widths of which a sigmoid with seven digits behind the point has none
+    # widths that a sigmoid with seven decimals rounds to 0
     assert float(module(*batch(17))[1].max()) > 500.0
     refuse_other(module, batch)
 
@@ -101,14 +101,14 @@ def test_a_head_at_every_place_of_an_image():
     ],
     ids=["learned", "fixed"],
 )
-def test_a_loss_of_given_numbers(options):
+def test_a_loss_with_given_d(options):
     torch.manual_seed(0)
     refuse_other(Criterion(MKCLoss(2, **options)), batch)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("settled", [False, True])
-def test_a_loss_that_follows_its_residuals_before_and_after_it_has_settled(settled):
+def test_a_loss_with_auto_d_before_and_after_freezing(settled):
     module = trained(MKCLoss(2))
     if settled:
         module.loss.freeze_scale()

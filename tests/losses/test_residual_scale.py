@@ -1,4 +1,4 @@
-"""The running scale of residuals: robust, in the unit of the target, each channel alone, equal in NumPy and torch."""
+"""The running scale of residuals: robust, in the unit of the target, per channel, equal in NumPy and torch."""
 
 import copy
 import math
@@ -52,12 +52,12 @@ def assert_same_numbers(one, other, **tolerance):
 
 
 def quantile(residual):
-    """The least of the absolute values up to which a share of them lies."""
+    """The smallest absolute value up to which a share of them lies."""
     ordered = sorted(abs(float(r)) for r in residual)
     return ordered[math.ceil(QUANTILE * len(ordered)) - 1]
 
 
-# --- what it is
+# --- definition
 
 
 def test_the_scale_is_the_quantile_of_absolute_residuals_over_that_of_a_normal_variable():
@@ -101,20 +101,20 @@ def test_the_floor_is_a_thousandth_of_the_spread_of_the_first_residuals_about_th
     assert float(updated(residual, 1e-3 * residual).floor) == pytest.approx(1e-3 * float(spread), rel=1e-6)
 
 
-def test_residuals_that_are_wrong_by_far_do_not_lift_the_floor_above_a_thousandth_of_the_scale():
+def test_far_outliers_do_not_lift_the_floor_above_a_thousandth_of_the_scale():
     residual = randn(500, 1)
     residual[:100] = 1e9
     scale = updated(residual)
     assert float(scale.floor) == pytest.approx(1e-3 * float(scale.scale))
 
 
-def test_where_most_residuals_are_0_their_mean_size_gives_the_scale():
+def test_if_most_residuals_are_0_their_mean_size_gives_the_scale():
     residual = torch.zeros(100, 1, dtype=torch.float64)
     residual[:5] = torch.tensor([1.0, -2.0, 3.0, -4.0, 5.0]).unsqueeze(-1)
     assert float(updated(residual).scale) == pytest.approx(0.15, rel=1e-12)
 
 
-def test_the_scale_is_averaged_in_its_logarithm_over_the_first_batches_and_later_by_a_tenth():
+def test_the_log_scale_is_the_mean_of_the_first_batches_and_later_updated_by_a_tenth():
     sizes = torch.tensor([1.0, 4.0, 16.0, 2.0] * 5).tolist()
     scale, mean = ResidualScale(1).double(), 0.0
     for n, size in enumerate(sizes):
@@ -137,20 +137,20 @@ def test_the_half_range_widens_at_once_and_shrinks_slowly():
     assert float(scale.half_range) == pytest.approx(20.0 * RANGE_DECAY**2)
 
 
-# --- which residuals count
+# --- masks and weights
 
 
-def test_residuals_of_weight_0_and_residuals_that_are_not_finite_do_not_count():
+def test_residuals_that_are_not_finite_or_of_weight_0_are_ignored():
     residual = randn(200, 1)
-    spoilt = residual.clone()
-    spoilt[::4], spoilt[2::4], spoilt[4] = math.nan, math.inf, -math.inf
+    contaminated = residual.clone()
+    contaminated[::4], contaminated[2::4], contaminated[4] = math.nan, math.inf, -math.inf
     mask = torch.ones(200, 1, dtype=torch.bool)
     mask[::2] = False
     expected = updated(residual[1::2])
     for weight in (mask, mask.double(), None):
-        assert_same_numbers(updated((spoilt, weight)), expected, rtol=1e-12, atol=0.0)
+        assert_same_numbers(updated((contaminated, weight)), expected, rtol=1e-12, atol=0.0)
         scale = ResidualScale(1).double()
-        scale.update(torch.zeros_like(residual), spoilt, weight)
+        scale.update(torch.zeros_like(residual), contaminated, weight)
         assert_same_numbers(scale, expected, rtol=1e-12, atol=0.0)
 
 
@@ -161,7 +161,7 @@ def test_residuals_of_weight_0_and_residuals_that_are_not_finite_do_not_count():
     weighted=st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_masked_residuals_might_as_well_be_missing(seed, count, offset, weighted):
+def test_masked_residuals_equal_missing_residuals(seed, count, offset, weighted):
     residual = offset + randn(count, 1, seed=seed)
     weight = torch.rand(count, 1, generator=generator(seed), dtype=torch.float64) if weighted else torch.ones(count, 1)
     mask = torch.rand(count, 1, generator=generator(seed + 1)) < 0.6
@@ -174,7 +174,7 @@ def test_masked_residuals_might_as_well_be_missing(seed, count, offset, weighted
 
 @pytest.mark.parametrize("kind", ["masked", "weight 0", "not finite"])
 @pytest.mark.parametrize("rows", [16, 600])
-def test_a_batch_without_a_residual_that_counts_changes_no_number(kind, rows):
+def test_a_batch_without_usable_residuals_changes_no_number(kind, rows):
     scale = updated(randn(50, 2), 3.0 * randn(50, 2, seed=1))
     before = copy.deepcopy(numbers(scale))
     residual = torch.full((rows, 2), math.inf if kind == "not finite" else 1e3, dtype=torch.float64)
@@ -184,7 +184,7 @@ def test_a_batch_without_a_residual_that_counts_changes_no_number(kind, rows):
     torch.testing.assert_close(numbers(scale), before, rtol=0.0, atol=0.0)
 
 
-def test_a_channel_that_is_masked_throughout_waits_while_others_go_on():
+def test_a_fully_masked_channel_keeps_its_state_while_others_update():
     mask = torch.tensor([True, False]).expand(50, 2)
     scale = updated((randn(50, 2), mask), (randn(50, 2, seed=1), mask))
     assert scale.batches.tolist() == [2, 0]
@@ -196,13 +196,13 @@ def test_a_channel_that_is_masked_throughout_waits_while_others_go_on():
     assert float(scale.half_range[1]) == float(expected.half_range)
 
 
-def test_weights_are_repeated_residuals():
+def test_a_weight_equals_repetition():
     residual, times = randn(40, 1), torch.randint(1, 4, (40, 1), generator=generator())
     repeated = residual.repeat_interleave(times.flatten(), 0)
     assert_same_numbers(updated((residual, times)), updated(repeated), rtol=1e-12, atol=1e-12)
 
 
-def test_channels_are_apart():
+def test_channels_are_independent():
     residual = randn(70, 3) * torch.tensor([1.0, 10.0, 1e-3])
     together = numbers(updated(residual, 2.0 * residual))
     for channel in range(3):
@@ -213,7 +213,7 @@ def test_channels_are_apart():
 
 @given(values=st.lists(st.tuples(st.integers(0, 20), st.integers(0, 3)), min_size=1, max_size=12))
 @settings(max_examples=200, deadline=None)
-def test_a_weighted_quantile_is_the_least_value_up_to_which_the_share_of_the_weight_lies(values):
+def test_a_weighted_quantile_is_the_smallest_value_with_the_share_of_the_weight(values):
     numbers, weights = (torch.tensor([value], dtype=torch.float64) for value in zip(*values, strict=True))
     total = sum(weight for _, weight in values)
     reached = [
@@ -221,7 +221,7 @@ def test_a_weighted_quantile_is_the_least_value_up_to_which_the_share_of_the_wei
         for number, _ in values
         if sum(weight for other, weight in values if other <= number) >= Fraction(2, 5) * total and total > 0
     ]
-    # of residuals of weight 0 alone nothing is asked but a number
+    # with weights of 0 alone, any finite number is accepted
     expected = min((n for n in reached if any(w > 0 for m, w in values if m <= n)), default=None)
     for found in (
         float(weighted_quantile(torch, numbers, weights, 0.4)[0]),
@@ -251,7 +251,7 @@ def test_the_most_recent_residuals_are_kept_with_predictions_and_weights():
 
 
 @pytest.mark.parametrize("rows", [MOST_RECENT - 1, MOST_RECENT, MOST_RECENT + 1, 1000, 5000])
-def test_of_a_large_batch_evenly_spaced_residuals_are_kept(rows):
+def test_evenly_spaced_residuals_of_a_large_batch_are_kept(rows):
     scale = updated(torch.arange(1.0, rows + 1.0, dtype=torch.float64).unsqueeze(-1))
     kept = scale.recent[0, 0].sort().values
     kept = kept[kept > 0]
@@ -263,7 +263,7 @@ def test_of_a_large_batch_evenly_spaced_residuals_are_kept(rows):
 
 
 @pytest.mark.parametrize("channels", [1, 128, 129, 500, 1024, 5000])
-def test_what_is_kept_of_many_channels_stays_small(channels):
+def test_the_buffer_of_many_channels_stays_small(channels):
     kept = ResidualScale(channels).recent.shape
     assert kept == (3, channels, min(MOST_RECENT, max(FEWEST_RECENT, RECENT_IN_ALL // channels)))
     assert kept[-1] == {1: 512, 128: 512, 129: 508, 500: 131, 1024: 64, 5000: 64}[channels]
@@ -295,7 +295,7 @@ def test_spaced_rows_are_rows_of_the_batch_whatever_its_layout(shape, axis, most
 
 
 @pytest.mark.parametrize("shape", [(40, 3, 5), (40, 3, 30, 20), (40, 3)])
-def test_channels_in_the_second_dimension_give_what_channels_last_give(shape):
+def test_channels_in_the_second_dimension_equal_channels_last(shape):
     prediction, target = randn(*shape), randn(*shape, seed=1)
     weight = torch.rand(shape, generator=generator(), dtype=torch.float64)
     one, other = ResidualScale(3).double(), ResidualScale(3).double()
@@ -328,7 +328,7 @@ def test_numpy_and_torch_compute_the_same_state(dtype, weighted, monkeypatch):
         torch.testing.assert_close(scales[0].state_dict(), scales[1].state_dict(), rtol=rtol, atol=rtol)
 
 
-def test_more_channels_than_numpy_takes_are_each_what_they_are_alone():
+def test_many_channels_in_torch_equal_single_channels():
     channels = module.SMALL_STATE + 1
     residual = randn(300, channels)
     many = numbers(updated(residual, residual**3))
@@ -358,7 +358,7 @@ def test_update_is_the_only_method_that_changes_the_state():
     torch.testing.assert_close(scale.state_dict(), before, rtol=0.0, atol=0.0)
 
 
-def test_a_look_ahead_gives_channels_without_a_batch_what_an_update_would():
+def test_with_batch_equals_an_update_for_channels_without_a_batch():
     scale = updated((randn(30, 2), torch.tensor([True, False]).expand(30, 2)))
     x, y, weight = 5.0 * randn(40, 2, seed=5), randn(40, 2, seed=6), torch.rand(40, 2, generator=generator())
     seen = scale.with_batch(x, y, weight, -1)
@@ -369,7 +369,7 @@ def test_a_look_ahead_gives_channels_without_a_batch_what_an_update_would():
         assert float(getattr(seen, name)[1]) == pytest.approx(float(getattr(scale, name)[1]), rel=1e-12)
 
 
-def test_a_state_dict_continues_to_the_bit():
+def test_a_scale_resumed_from_a_state_dict_is_bitwise_equal():
     batches = [randn(90, 2, seed=n) * 1.1**n for n in range(20)]
     scale, resumed = updated(*batches[:13]), ResidualScale(2).double()
     resumed.load_state_dict(copy.deepcopy(scale.state_dict()))

@@ -1,4 +1,4 @@
-"""Networks trained by the loss as it comes: targets of any unit, up to half of them wrong, and clean ones."""
+"""Networks trained with the default loss: targets of any unit, up to half of them wrong, and clean targets."""
 
 import pytest
 import torch
@@ -36,7 +36,7 @@ def wrong(target, share, kind, seed=1):
 
 
 class Scaled(nn.Module):
-    """A network whose last step is the target's unit, as a model of a physical quantity has it."""
+    """A network whose last step multiplies by the target's unit, as in a model of a physical quantity."""
 
     def __init__(self, scale=1.0, offset=0.0):
         super().__init__()
@@ -69,7 +69,7 @@ def rmse(model, x, truth):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1e-3, 0.1), (200.0, 1000.0)])
-def test_a_target_of_any_unit_and_offset_is_learned_as_a_standardised_one(scale, offset):
+def test_targets_of_any_unit_and_offset_are_learned_like_standardised_targets(scale, offset):
     x, truth, y = sampled()
     y = wrong(y, 0.2, "uniform")
     plain = rmse(trained(MKCLoss(1), x, y), x, truth)
@@ -79,7 +79,7 @@ def test_a_target_of_any_unit_and_offset_is_learned_as_a_standardised_one(scale,
 
 
 @pytest.mark.e2e
-def test_a_plain_network_learns_targets_that_nobody_scaled():
+def test_a_plain_network_learns_unscaled_targets():
     x, truth, y = sampled()
     truth, y = 1000.0 + 200.0 * truth, wrong(1000.0 + 200.0 * y, 0.2, "factor 1000")
     torch.manual_seed(0)
@@ -98,7 +98,7 @@ def test_a_plain_network_learns_targets_that_nobody_scaled():
 
 
 @pytest.mark.e2e
-def test_on_clean_targets_it_is_as_good_as_least_squares():
+def test_on_clean_targets_the_loss_is_as_good_as_least_squares():
     errors = []
     for seed in range(3):
         x, truth, y = sampled(seed)
@@ -117,7 +117,7 @@ def test_half_of_the_targets_may_be_wrong(kind):
     assert error < absolute
 
 
-def test_half_of_the_targets_may_be_wrong_where_d_is_given():
+def test_half_of_the_targets_may_be_wrong_with_a_given_d():
     x, truth, y = sampled()
     loss = MKCLoss(1, d=0.3, bound=40.0, objective="robust")
     assert rmse(trained(loss, x, wrong(y, 0.5, "one-sided")), x, truth) < 0.15
@@ -150,8 +150,8 @@ def test_sigma_and_d_describe_the_noise():
 
 
 @pytest.mark.e2e
-def test_what_is_watched_after_the_schedule_falls_while_the_network_gets_better():
-    """The network term in training and the value in evaluation, by which a scheduler or early stopping goes."""
+def test_monitored_values_fall_after_the_schedule_as_the_network_improves():
+    """The network term in training and the value in evaluation, which a scheduler or early stopping monitors."""
     x, truth, y = sampled()
     y, loss = wrong(y, 0.3, "one-sided"), MKCLoss(1)
     model = trained(loss, x, y, steps=400)

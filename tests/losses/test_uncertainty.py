@@ -46,7 +46,7 @@ def test_inlier_weights_are_those_of_the_fixed_point(shape, channel_dim, options
     assert ((found >= 0) & (found <= 1)).all()
 
 
-def test_inlier_weight_is_the_share_of_the_least_squares_pull():
+def test_inlier_weight_is_the_gradient_relative_to_least_squares():
     loss = made(reduction="sum")
     x, y = data(6, 3)
     x.requires_grad_()
@@ -54,14 +54,14 @@ def test_inlier_weight_is_the_share_of_the_least_squares_pull():
     torch.testing.assert_close(inlier_weight(loss, x, y), (slope * loss.d**2 / (x - y)).detach())
 
 
-def test_infinite_sigma_believes_everything():
+def test_infinite_sigma_gives_weight_1_everywhere():
     loss = made(sigma=INF, **FIXED)
     x, y = data(4, 3)
     assert (inlier_weight(loss, x, 1e30 * y) == 1).all()
     assert not outliers(loss, x, 1e30 * y).any()
 
 
-def test_half_precision_is_weighed_in_float32():
+def test_weights_of_half_precision_are_computed_in_float32():
     loss = made(dtype=torch.float32)
     x, y = data(4, 3, dtype=torch.bfloat16)
     found = inlier_weight(loss, x, y)
@@ -102,7 +102,7 @@ def test_planted_outliers_are_found_and_few_others():
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0, -0.1, NAN])
-def test_a_limit_that_separates_nothing_is_refused(limit):
+def test_a_limit_outside_0_and_1_is_refused(limit):
     with pytest.raises(ValueError, match=r"`weight_below` to be in \(0, 1\) but got"):
         outliers(made(), *data(4, 3), weight_below=limit)
 
@@ -120,7 +120,7 @@ def test_elements_beyond_the_bound_are_counted_per_channel():
     assert found.count.dtype == torch.int64
 
 
-def test_weights_and_masks_change_the_share_and_leave_out_what_does_not_count():
+def test_weights_and_masks_change_the_share_and_exclude_masked_elements():
     loss = made(2, bound=10.0)
     x, y = torch.zeros(4, 2), torch.tensor([[20.0, 0.0], [0.0, 20.0], [20.0, 0.0], [NAN, INF]])
     found = beyond_bound(loss, x, y, torch.tensor([3.0, 0.5, 0.0, 0.0]))
@@ -195,14 +195,14 @@ def test_interval_is_the_quantiles_about_each_prediction(shape, channel_dim):
     assert not low.requires_grad
 
 
-def test_interval_at_infinite_sigma_is_the_gaussian_one_and_grows_with_the_level():
+def test_interval_at_infinite_sigma_is_gaussian_and_grows_with_the_level():
     loss = MKCLoss(1, sigma=INF, d=2.0, bound=200.0, **FIXED)
     ends = [predictive_interval(loss, torch.zeros(1, 1), level).high.item() for level in (0.682689492, 0.95, 0.9973)]
     assert ends == pytest.approx([2.0, 2 * 1.959964, 2 * 2.99998], rel=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-def test_interval_of_the_least_sigma_in_float32_and_half_precision(dtype):
+def test_interval_of_the_smallest_sigma_in_float32_and_half_precision(dtype):
     loss = MKCLoss(1, sigma=0.05, d=1.0, bound=10.0)
     low, high = predictive_interval(loss, torch.zeros(2, 1, dtype=dtype), 0.9)
     assert low.dtype == torch.float32
@@ -211,15 +211,15 @@ def test_interval_of_the_least_sigma_in_float32_and_half_precision(dtype):
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 90, NAN])
-def test_a_level_that_is_no_probability_is_refused(level):
+def test_a_level_that_is_not_a_probability_is_refused(level):
     with pytest.raises(ValueError, match=r"`level` to be in \(0, 1\) but got"):
         predictive_interval(made(), torch.zeros(4, 3), level)
 
 
 @pytest.mark.parametrize("function", [inlier_weight, outliers, beyond_bound])
-def test_what_the_loss_refuses_is_refused(function):
+def test_arguments_that_the_loss_refuses_are_refused(function):
     loss, x = made(), torch.zeros(4, 3)
-    with pytest.raises(ValueError, match="Expected `input` and `target` of one shape"):
+    with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         function(loss, x, torch.zeros(4, 1))
     with pytest.raises(ValueError, match="Expected 3 channels"):
         function(loss, x[:, :2], x[:, :2])
@@ -240,7 +240,7 @@ def fields(function, loss, x):
 @pytest.mark.parametrize(
     "function", [inlier_weight, outliers, beyond_bound, lambda loss, x, _: predictive_interval(loss, x)]
 )
-def test_what_is_no_mkc_loss_is_refused_and_a_compiled_one_is_taken(function):
+def test_another_loss_is_refused_and_a_compiled_loss_accepted(function):
     x = torch.zeros(4, 3)
     for other, got in (
         (nn.MSELoss(), "MSELoss"),
@@ -257,7 +257,7 @@ def test_what_is_no_mkc_loss_is_refused_and_a_compiled_one_is_taken(function):
         assert torch.equal(found, expected)
 
 
-def test_predictions_that_are_not_finite_have_no_interval_and_are_not_within_the_bound():
+def test_predictions_that_are_not_finite_are_refused():
     loss, x = made(), torch.zeros(4, 3)
     bad = x.clone()
     bad[2, 1] = NAN
@@ -268,7 +268,7 @@ def test_predictions_that_are_not_finite_have_no_interval_and_are_not_within_the
         beyond_bound(loss, x, x, -torch.ones(4))
 
 
-def test_limits_that_are_no_numbers_are_refused():
+def test_limits_that_are_not_numbers_are_refused():
     x = torch.zeros(4, 3)
     with pytest.raises(TypeError, match=r"`weight_below` to be a number in \(0, 1\) but got 'a'"):
         outliers(made(), x, x, "a")

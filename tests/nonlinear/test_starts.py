@@ -29,7 +29,7 @@ def off(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
     return (data["y"] - torch.sin(theta * data["x"])).unsqueeze(-1)
 
 
-def one(seed: int):
+def residual_of(seed: int):
     return lambda theta: off(theta, {"x": X[seed], "y": Y[seed]})
 
 
@@ -74,28 +74,28 @@ def test_the_result_is_that_of_a_fit_from_the_best_end(many):
 @pytest.mark.e2e
 def test_a_batch_is_a_loop_and_a_seed_gives_the_same(many):
     for seed in (2, 7):
-        alone = fit(one(seed), START[seed], lower=LOW, upper=HIGH, starts=32)
-        torch.testing.assert_close(alone.theta, many.theta[seed], rtol=1e-6, atol=0)
-        assert alone.agreeing.dim() == 0
+        separate = fit(residual_of(seed), START[seed], lower=LOW, upper=HIGH, starts=32)
+        torch.testing.assert_close(separate.theta, many.theta[seed], rtol=1e-6, atol=0)
+        assert separate.agreeing.dim() == 0
 
 
 def test_a_domain_and_a_density_that_are_given_are_kept():
-    found = fit(one(3), START[3], lower=LOW, upper=HIGH, starts=32, bound=12.0, sigma=2.0, d=0.1)
+    found = fit(residual_of(3), START[3], lower=LOW, upper=HIGH, starts=32, bound=12.0, sigma=2.0, d=0.1)
     assert float((found.theta - K[3]).abs()) < 0.05
     assert (float(found.bound), float(found.sigma), float(found.d)) == pytest.approx((12.0, 2.0, 0.1))
 
 
 def test_starts_without_bounds_are_drawn_from_the_prior():
     prior = GaussianPrior(torch.tensor([4.5]), torch.tensor([0.2]))
-    found = fit(one(3), START[3], prior=prior, starts=32)
+    found = fit(residual_of(3), START[3], prior=prior, starts=32)
     assert float((found.theta - K[3]).abs()) < 0.05
 
 
 def test_weights_enter_the_choice_of_the_best_result():
     weight = torch.ones(60).double()
     weight[:6] = 0.0
-    spoiled = {"x": X[4], "y": torch.where(weight > 0, Y[4], math.nan)}
-    found = fit(lambda k: off(k, spoiled), START[4], weight=weight, lower=LOW, upper=HIGH, starts=32)
+    contaminated = {"x": X[4], "y": torch.where(weight > 0, Y[4], math.nan)}
+    found = fit(lambda k: off(k, contaminated), START[4], weight=weight, lower=LOW, upper=HIGH, starts=32)
     assert float((found.theta - K[4]).abs()) < 0.05
 
 
@@ -130,7 +130,7 @@ def test_one_minimum_is_where_every_start_ends():
 )
 def test_bad_starts_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        fit(one(0), START[0], **options)
+        fit(residual_of(0), START[0], **options)
 
 
 @pytest.mark.parametrize(
@@ -143,6 +143,6 @@ def test_bad_starts_are_refused(options, message):
     ],
 )
 def test_invalid_targets_are_refused(target, error, message):
-    found = fit(one(0), K[0], covariance=None)
+    found = fit(residual_of(0), K[0], covariance=None)
     with pytest.raises(error, match=message):
         found.explained(target)

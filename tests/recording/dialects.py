@@ -1,4 +1,4 @@
-"""The same samples as people write them: every dialect of text that is read with certainty."""
+"""The same samples in every dialect of text that is read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 SAMPLES = 60
 UNITS = {"uT": 0, "µT": 0, "nT": 3, "mT": -3, "T": -6, "gauss": -2, "Ga": -2, "mG": 1, "mGauss": 1}
-"""Powers of ten of a number in the unit over one in µT."""
+"""Power of ten of the ratio of a number in the unit to the number in µT."""
 TIMES = {
     "s": 0, "ms": 3, "us": 6, "ns": 9,
     "epoch s": 0, "epoch ms": 3, "epoch us": 6, "epoch ns": 9, "iso": None, "iso zone": None, "iso blank": None,
@@ -81,8 +81,8 @@ class Dialect:
         return self.text().encode(self.encoding) + b"\0" * self.zeros
 
     def _line(self, cells: list[str]) -> str:
-        told = [f'"{cell}"' for cell in cells] if self.quoted else cells
-        return self.separator.join(told) + (self.separator if self.trailing else "")
+        written = [f'"{cell}"' for cell in cells] if self.quoted else cells
+        return self.separator.join(written) + (self.separator if self.trailing else "")
 
     def _header(self) -> tuple[str, list[str]]:
         axes = [self.names.format(axis) for axis in NAMES[self.names]]

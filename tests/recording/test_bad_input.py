@@ -1,4 +1,4 @@
-"""Text that is no recording: each kind is refused in a sentence that names the file and says what to do."""
+"""Text that is not a recording: each kind is rejected with a message that names the file and the remedy."""
 
 import re
 
@@ -44,13 +44,13 @@ BAD = {
     "binary": (bytes(range(256)) * 16, "not text|not UTF-8"),
     "an archive": (
         b"PK\x03\x04\x14\x00\x06\x00\x08\x00" + bytes(range(64)) * 9,
-        "begins as a ZIP archive does; unpack it first",
+        "begins like a ZIP archive; unpack it first",
     ),
     "an encoding that is not known": (
         b"time,mag_x\n0,\x81one\x94\n",
         "line 2 holds the byte 0x81; export it as CSV in UTF-8",
     ),
-    "broken UTF-16": (b"\xff\xfe" + "time\n".encode("utf-16-le") + b"\x00\xdc" * 4, "begins as UTF-16 does.*UTF-8"),
+    "broken UTF-16": (b"\xff\xfe" + "time\n".encode("utf-16-le") + b"\x00\xdc" * 4, "begins as UTF-16.*byte 10.*UTF-8"),
     # the header
     "no header": (ROWS, "the first line holds numbers; it must hold the column names"),
     "names of nothing": (",,,\n" + ROWS, "no column has a name"),
@@ -73,13 +73,13 @@ BAD = {
     "underscores": (changed(9, "0.14,1,2_000,3"), 'column `mag_y` holds text at line 9, "2_000"'),
     "hexadecimal": (changed(9, "0.14,1,0x1F,3"), 'column `mag_y` holds text at line 9, "0x1F"'),
     "a unit in a cell": (changed(9, "0.14,1,2 uT,3"), 'column `mag_y` holds text at line 9, "2 uT"'),
-    "a quotation that does not end": (changed(9, '0.14,1,"2,3'), "line 9 has a quotation mark that does not end"),
+    "a quotation that does not end": (changed(9, '0.14,1,"2,3'), "line 9 has an unclosed quotation mark"),
     "another header": (changed(9, "time,gyro_x,gyro_y,gyro_z"), "line 9 holds words and no numbers.*split the file"),
     "decimals both ways": ("time;mag_x;mag_y;mag_z\n0.5;1,5;2;3\n1.5;2;2;3\n", '"1,5"; write decimals with a point'),
     "decimal commas between commas": (HEAD + "0,0,1,5,2,5,3,5\n" * 5, "has 8 values.*export the table with semicolons"),
     "thousands or decimals": (
         "time;mag_x;mag_y;mag_z\n" + "".join(f"{i};1,{200 + i};2,{300 + i};3,400\n" for i in range(9)),
-        "may be decimals or thousands; write decimals with a point",
+        "may mark decimals or thousands; write decimals with a point",
     ),
     # time
     "a day as people write it": (changed(2, "3 May,1,2,3"), 'column `time` holds text at line 2, "3 May"'),
@@ -90,7 +90,7 @@ BAD = {
     "an hour that is none": (HEAD + "2024-02-03T31:00:00,1,2,3\n", "write times as seconds, or as 2024-05-03T10"),
     "zones and none": (
         HEAD + "2024-02-03T10:00:00Z,1,2,3\n2024-02-03T10:00:01,1,2,3\n",
-        "line 3.*write all stamps with a zone, or none",
+        "line 3.*write all stamps with a zone",
     ),
     "stamps and numbers": (HEAD + "2024-02-03T10:00:00,1,2,3\n1.0,1,2,3\n", 'holds text at line 3, "1.0"'),
     "a time of day that is none": (HEAD + "10:00:00,1,2,3\n10:99:00,1,2,3\n", "line 3.*or as 10:00:00.25"),
@@ -105,7 +105,7 @@ BAD = {
     ),
     "two that may be it": (
         "mag_raw_x,mag_raw_y,mag_raw_z,mag_cal_x,mag_cal_y,mag_cal_z\n1,2,3,4,5,6\n",
-        "say which: `--columns mag_x=mag_raw_x,.*` or `--columns mag_x=mag_cal_x,",
+        "choose: `--columns mag_x=mag_raw_x,.*` or `--columns mag_x=mag_cal_x,",
     ),
     "two sensors": ("mag0_x,mag0_y,mag0_z,mag1_x,mag1_y,mag1_z\n1,2,3,4,5,6\n", "`mag0`, `mag1`; choose one with"),
     "a field in gauss": (
@@ -150,7 +150,7 @@ def test_the_commands_say_it_in_a_line_and_write_nothing(tmp_path, kind, command
     if command == "calibrate":
         assert result.exit_code == 1
         assert not list(tmp_path.rglob("calibration.json"))
-    assert [one.name for one in tmp_path.iterdir() if one.name != "out"] == ["bad.csv"]
+    assert [found_file.name for found_file in tmp_path.iterdir() if found_file.name != "out"] == ["bad.csv"]
 
 
 SOURCES = (
@@ -181,7 +181,7 @@ def test_damaged_text_is_read_or_refused_and_nothing_else(tmp_path_factory, sour
 
 
 def _refusal(look, path):
-    """What is said where a file is refused; its name where it is read."""
+    """The error message if a file is rejected; its name if it is read."""
     try:
         look(path)
     except RecordingError as error:

@@ -1,4 +1,4 @@
-"""The same samples in every dialect of text are the same recording, to the last digit."""
+"""The same samples in every dialect of text give the same recording, to the last digit."""
 
 import numpy as np
 import pytest
@@ -29,8 +29,8 @@ def assert_same(recording):
 def dialects(draw):
     separator = draw(st.sampled_from([",", ";", "\t", "|", " "]))
     unit_in = draw(st.sampled_from(["none", "brackets", "parentheses", "suffix", "row"]))
-    time = draw(st.sampled_from([one for one in TIMES if separator != " " or one != "iso blank"]))
-    names = draw(st.sampled_from([one for one in NAMES if separator != " " or " " not in one]))
+    time = draw(st.sampled_from([choice for choice in TIMES if separator != " " or choice != "iso blank"]))
+    names = draw(st.sampled_from([choice for choice in NAMES if separator != " " or " " not in choice]))
     if names == "magnetometer[{}]" and unit_in == "suffix":
         unit_in = "brackets"
     encoding = draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"]))
@@ -98,18 +98,18 @@ def test_a_clean_table_is_read_without_a_word(tmp_path):
     assert read(tmp_path, PLAIN).warnings == ()
 
 
-def test_a_unit_that_is_asked_for_wins_over_the_name(tmp_path):
+def test_a_requested_unit_overrides_the_name(tmp_path):
     recording = read(tmp_path, Dialect(unit="gauss", unit_in="brackets"), units={"mag": "uT"})
     assert np.array_equal(recording.magnetometer().numpy(), FIELD / 1e6)
 
 
-def test_every_skipped_line_is_told_with_its_number(tmp_path):
-    told = " ".join(read(tmp_path, Dialect(comments=2, above=1, among=True, header_again=True, cut=True)).warnings)
+def test_every_skipped_line_is_reported_with_its_number(tmp_path):
+    warnings = " ".join(read(tmp_path, Dialect(comments=2, above=1, among=True, header_again=True, cut=True)).warnings)
     for words in (
         '3 comment lines skipped, the first line 1, "# recorded by a logger, 0"',
         '1 line above the first row skipped, the first line 3, "Logger v1.3"',
-        "The header stands again in line",
+        "The header is repeated in line",
         '1 line of text before it skipped, the first line 56, "Logger v1.3"',
         "The last line is cut short and left out, line 68",
     ):
-        assert words in told, told
+        assert words in warnings, warnings

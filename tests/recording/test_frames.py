@@ -21,9 +21,9 @@ def columns_of(recording):
     return {name: values.numpy() for name, values in recording.columns.items()}
 
 
-def same(one, other):
-    return one.names == other.names and all(
-        torch.equal(one[name].nan_to_num(-9.0), other[name].nan_to_num(-9.0)) for name in one.names
+def same(recording, other):
+    return recording.names == other.names and all(
+        torch.equal(recording[name].nan_to_num(-9.0), other[name].nan_to_num(-9.0)) for name in recording.names
     )
 
 
@@ -112,7 +112,7 @@ def test_an_index_with_a_name_is_a_column():
         ),
         (pd.DataFrame({"x": [1.0, "a"]}, dtype=object), "column `x` to hold real numbers"),
         (pd.DataFrame({"x": ["a"]}), "no column of the frame holds numbers; it has `x`"),
-        (pd.DataFrame([[1.0]]), "need names of text but one is 0; rename it"),
+        (pd.DataFrame([[1.0]]), "names of a frame must be text but got 0; rename"),
         (pd.DataFrame([[1.0, 2.0]], columns=["a", "a"]), "names `a` more than once"),
         (pd.DataFrame({"a": np.empty(0)}), "the columns hold no samples"),
         (pl.DataFrame(), "no column"),

@@ -1,4 +1,4 @@
-"""What `mkc apply` writes beside its own columns is what stood in the file."""
+"""`mkc apply` writes the columns of the file unchanged, in addition to its own columns."""
 
 import csv
 import datetime
@@ -102,7 +102,7 @@ def test_text_becomes_numbers_in_parquet_where_none_is_lost(tmp_path):
 
 
 def test_columns_without_a_name_are_kept_without_one(tmp_path):
-    """As pandas writes its index, and as a separator at the end of each line makes one."""
+    """Such as the index column of pandas, or the empty column after a trailing separator."""
     source = tmp_path / "in.csv"
     source.write_text(",mag_x,\n0,1.50,\n1,2.50,\n", encoding="utf-8")
     for ending in ("csv", "parquet"):
@@ -122,7 +122,7 @@ def test_a_column_of_that_name_is_replaced_in_its_place(tmp_path):
 
 
 cell = st.text(st.characters(exclude_categories=("Cs", "Cc", "Zl", "Zp")), max_size=8)
-first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";")))  # no line of comments
+first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";")))  # not a comment
 
 
 @settings(max_examples=40)

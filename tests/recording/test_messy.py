@@ -1,4 +1,4 @@
-"""A real recording, written as people have it: each file is calibrated as the whole is, or refused with what to do."""
+"""A real recording in messy files: each gives the calibration of the whole recording, or an error with a remedy."""
 
 import pytest
 
@@ -16,11 +16,11 @@ SAMPLES = {
     "timestamp_in_microseconds": 684, "two_topics": 684, "clipped": 2730,
 }  # fmt: skip
 
-TOLD = {
+EXPECTED_WARNINGS = {
     "comment_lines": ['3 comment lines skipped, the first line 1, "# logger v1.3"'],
     "decimal_comma": ["Decimal commas were read as points", "`magX [uT]`, `magY [uT]`, `magZ [uT]` are taken as"],
-    "header_again": ["The header stands again in line 1367", "starts again at row 1366 (line 1368)", "2 runs"],
-    "iso_timestamps": ["`timestamp` is taken as `time`", "ISO 8601 stamps", "in seconds from the first sample"],
+    "header_again": ["The header is repeated in line 1367", "starts again at row 1366 (line 1368)", "2 runs"],
+    "iso_timestamps": ["`timestamp` is taken as `time`", "ISO 8601 stamps", "seconds from the first sample"],
     "last_line_cut": ['The last line is cut short and left out, line 2731, "106.2740,-26.7"'],
     "names_with_units": ["`magX [uT]`, `magY [uT]`, `magZ [uT]` are taken as `mag_x`, `mag_y`, `mag_z`"],
     "time_restarts": ["The time starts again at row 1366 (line 1367)", "2 runs"],
@@ -43,7 +43,7 @@ def read(name, units=None, sensor=None):
 
 
 def assert_centre(found, whole):
-    """Within two standard errors of the part's own centre, or of the whole's."""
+    """Check agreement within two standard errors of either centre."""
     for mine, other, error, other_error in zip(
         found.center, whole.center, found.center_se, whole.center_se, strict=True
     ):
@@ -60,11 +60,11 @@ def test_the_centre_is_that_of_the_whole_recording(name, whole):
     assert_centre(found, whole)
 
 
-@pytest.mark.parametrize("name", sorted(TOLD))
-def test_what_was_done_to_read_it_is_told(name):
-    told = " ".join(read(name).warnings)
-    for words in TOLD[name]:
-        assert words in told, told
+@pytest.mark.parametrize("name", sorted(EXPECTED_WARNINGS))
+def test_warnings_report_what_was_done_to_read_a_file(name):
+    warnings = " ".join(read(name).warnings)
+    for words in EXPECTED_WARNINGS[name]:
+        assert words in warnings, warnings
 
 
 def test_a_field_in_gauss_is_asked_for_and_then_converted(whole):
@@ -94,7 +94,7 @@ def test_a_time_that_starts_again_is_a_second_run(name):
 @pytest.mark.parametrize("name", ["iso_timestamps", "timestamp_in_microseconds", "two_topics"])
 def test_times_are_seconds_from_the_first_sample_without_loss(name):
     expected = read("gauss", {"mag": "gauss"}).time
-    assert (read(name).time - expected).abs().max() <= 1e-6 + 1e-12  # written with one digit less
+    assert (read(name).time - expected).abs().max() <= 1e-6 + 1e-12  # written with a digit less
 
 
 @pytest.mark.parametrize("name", ["clipped", "frozen_sensor"])

@@ -1,4 +1,4 @@
-"""Which columns are what: by their names, by their topic's, by what stands beside them."""
+"""Columns are recognised by their names, their topic's name, and the other columns."""
 
 import numpy as np
 import polars as pl
@@ -94,14 +94,14 @@ def test_the_command_knows_the_same_quantities():
 
 def test_sensors_of_one_kind_are_several_and_forms_of_one_are_a_question():
     several = recognised([names("mag0_x", "mag0_y", "mag0_z", "mag1_x", "mag1_y", "mag1_z")])
-    assert ([one.name for one in several.sensors], several.several) == (["mag0", "mag1"], True)
+    assert ([sensor.name for sensor in several.sensors], several.several) == (["mag0", "mag1"], True)
     forms = recognised([names(*(f"mag_{form}_{axis}" for form in ("raw", "cal") for axis in "xyz"))])
-    assert ([one.name for one in forms.sensors], forms.several) == (["mag_raw", "mag_cal"], False)
+    assert ([sensor.name for sensor in forms.sensors], forms.several) == (["mag_raw", "mag_cal"], False)
 
 
 def test_the_own_name_wins_over_another_form():
     found = recognised([names(*(f"{form}_{axis}" for form in ("mag", "mag_raw") for axis in "xyz"))])
-    assert [one.columns["mag_x"] for one in found.sensors] == ["mag_x"]
+    assert [sensor.columns["mag_x"] for sensor in found.sensors] == ["mag_x"]
 
 
 def test_an_incomplete_triple_is_none():
@@ -111,13 +111,13 @@ def test_an_incomplete_triple_is_none():
 def test_what_stands_beside_goes_by_the_sensors_number():
     columns = [f"{q}{n}_{axis}" for q in ("mag", "gyro") for n in (0, 1) for axis in "xyz"]
     found = recognised([names("time", *columns)])
-    assert [one.columns["gyro_x"] for one in found.sensors] == ["gyro0_x", "gyro1_x"]
+    assert [sensor.columns["gyro_x"] for sensor in found.sensors] == ["gyro0_x", "gyro1_x"]
 
 
 @pytest.mark.parametrize("file", ["Magnetometer", "sensor_mag_0", "imu_mag_log"])
 def test_x_y_z_are_a_magnetometers_where_the_file_says_so(file):
     assert is_about_magnetometer(file) == (file != "imu_gyro")
-    assert [one.columns["mag_x"] for one in recognised([names("time", "x", "y", "z")], file).sensors] == ["x"]
+    assert [sensor.columns["mag_x"] for sensor in recognised([names("time", "x", "y", "z")], file).sensors] == ["x"]
 
 
 @pytest.mark.parametrize("file", ["log", "run_3", "gyroscope", "imu", "mag_and_gyro", "position"])
@@ -142,8 +142,8 @@ def test_a_device_of_px4_says_what_it_is(device, is_one):
 def test_a_message_of_ros_is_in_tesla():
     """sensor_msgs/MagneticField.msg: "Measurements in Teslas"."""
     axes = [f"field.magnetic_field.{axis}" for axis in "xyz"]
-    said = recognised([names("%time", *axes, "field.magnetic_field_covariance0")]).sensors[0]
-    assert said.units["mag_x"] == "tesla"
+    sensor = recognised([names("%time", *axes, "field.magnetic_field_covariance0")]).sensors[0]
+    assert sensor.units["mag_x"] == "tesla"
     assert "mag_x" not in recognised([names("%time", *axes)]).sensors[0].units
 
 
@@ -178,10 +178,10 @@ def test_other_topics_are_interpolated_at_the_magnetometers_times(tmp_path, monk
     assert recording["gyro_x"].isnan().tolist() == [True, False, False, True, True]
     assert recording["gyro_x"][1:3].tolist() == pytest.approx([np.pi / 4, 3 * np.pi / 4])
     assert recording["gyro_y"][1:3].tolist() == pytest.approx([1.5, 2.5])
-    assert recording["q_w"].tolist() == pytest.approx([1.0] * 5)  # q and -q are one rotation
-    told = " ".join(recording.warnings)
-    assert "of topic `sensor_gyro_0`, linear between its samples" in told
-    assert "3 samples outside of its times or in its gaps have none" in told
+    assert recording["q_w"].tolist() == pytest.approx([1.0] * 5)  # q and -q are the same rotation
+    warnings = " ".join(recording.warnings)
+    assert "of topic `sensor_gyro_0`, interpolated linearly" in warnings
+    assert "3 samples outside of its times or in its gaps have no value" in warnings
 
 
 def test_topics_are_sensors_and_what_px4_makes_of_them_is_left_out(tmp_path, monkeypatch):
@@ -194,7 +194,7 @@ def test_topics_are_sensors_and_what_px4_makes_of_them_is_left_out(tmp_path, mon
     voted = mag_topic("vehicle_magnetometer")
     path = log(tmp_path, monkeypatch, voted, mag_topic("sensor_mag"))
     found = recognised(formats.read_topics(path))
-    assert [one.topic for one in found.sensors] == [1]
+    assert [sensor.topic for sensor in found.sensors] == [1]
     assert found.left_out == ("Topic `vehicle_magnetometer` is left out: it is made of `sensor_mag`, which is there.",)
 
 
@@ -257,8 +257,8 @@ def test_units_that_are_asked_for(tmp_path):
     ("units", "message"),
     [
         ({"speed": "m/s"}, "`--convert speed=m/s` names no column of the file and no quantity"),
-        ({"gyro": "furlongs"}, "no unit of gyro that is known; known: rad/s, mrad/s, °/s"),
-        ({"time": "fortnights"}, "no unit of time that is known; known: s, ms, µs, ns"),
+        ({"gyro": "furlongs"}, "gyro=furlongs.* known: rad/s, mrad/s, °/s"),
+        ({"time": "fortnights"}, "time=fortnights.* known: s, ms, µs, ns"),
     ],
 )
 def test_units_that_are_not_known_are_refused(tmp_path, units, message):
@@ -289,7 +289,7 @@ def test_differences_of_times_keep_every_digit(cells, unit, expected):
 
 
 def test_nanoseconds_of_an_uptime_are_no_milliseconds_since_1970():
-    """1.2e12 is 2008 in ms since 1970, and twenty minutes of uptime in ns; the interval tells."""
+    """1.2e12 is 2008 in ms since 1970, or twenty minutes of uptime in ns; the interval distinguishes them."""
     assert clock_of(pl.Series([1_200_000_000_000, 1_200_010_000_000])).format == ""
     assert clock_of(pl.Series([1_200_000_000_000, 1_200_000_000_010])).format == "ms since 1970"
 
@@ -308,9 +308,9 @@ STEADY = np.arange(0.0, 50.0, 0.5)
     [
         (np.concatenate([STEADY, STEADY]), [100]),
         (np.concatenate([STEADY + 20.0, STEADY + 3.0, STEADY + 3.25]), [100, 200]),
-        (np.concatenate([STEADY, STEADY + 25.1]), [100]),  # into the midst, one between the other's samples
+        (np.concatenate([STEADY, STEADY + 25.1]), [100]),  # into the middle of the first run, with interleaved samples
         (np.concatenate([STEADY[:60], STEADY[80:], STEADY[60:80]]), []),  # a block that was written late
-        (np.where(np.arange(100) == 50, STEADY - 0.7, STEADY), []),  # one sample that steps back
+        (np.where(np.arange(100) == 50, STEADY - 0.7, STEADY), []),  # a single sample that steps back
         (np.random.default_rng(0).permutation(STEADY), []),  # rows in no order
         (np.concatenate([STEADY[:99], [np.nan], STEADY]), [100]),
         (STEADY[::-1], []),
@@ -332,5 +332,5 @@ def test_runs_are_counted_from_their_own_first_sample_where_the_time_is_converte
 def test_a_header_that_stands_again_is_a_run_where_there_is_no_time(tmp_path):
     recording = read(tmp_path, "mx,my,mz\n1,2,3\n2,3,4\nmx,my,mz\n3,4,5\n")
     assert recording["experiment"].tolist() == [1.0, 1.0, 2.0]
-    assert "there is no time" in recording.warnings[-1]
+    assert "There is no time" in recording.warnings[-1]
     assert "experiment" not in read(tmp_path, "mx,my,mz\n1.25,2.25,3.25\nmx,my,mz\nmx,my,mz\n3,4\n")

@@ -138,7 +138,7 @@ def test_units_and_labels_of_absent_columns_are_refused(option):
         Recording({"a": column(1)}, **option)
 
 
-def test_stack_puts_columns_side_by_side_in_the_order_asked_for():
+def test_stack_returns_columns_in_the_requested_order():
     recording = Recording({"a": column(1, 2), "b": column(3, 4)})
     assert same(recording.stack("b", "a"), [[3, 1], [4, 2]])
 
@@ -200,7 +200,7 @@ def test_finite_of_no_names_looks_at_every_column():
     assert len(Recording({"a": column(1, NAN, 1), "b": column(INF, 1, 1)}).finite()) == 1
 
 
-def test_finite_says_nothing_where_nothing_is_dropped():
+def test_finite_has_no_warning_if_nothing_is_dropped():
     recording = Recording({"a": column(1, 2), "b": column(NAN, 1)})
     assert recording.finite("a").warnings == ()
     assert len(recording.finite("a")) == 2
@@ -224,14 +224,14 @@ def test_finite_names_a_missing_column():
 # --- sorted_by_time
 
 
-def test_a_regular_recording_is_sorted_without_a_word():
+def test_a_regular_recording_is_sorted_without_a_warning():
     recording = Recording({"time": torch.arange(10) / 10, "a": torch.arange(10)})
     again = recording.sorted_by_time()
     assert again.warnings == ()
     assert same(again.stack("time", "a"), recording.stack("time", "a"))
 
 
-def test_unsorted_times_are_sorted_with_their_rows_and_said():
+def test_unsorted_times_are_sorted_with_a_warning():
     recording = Recording({"time": column(0, 2, 1, 4, 3), "a": column(0, 20, 10, 40, 30)})
     again = recording.sorted_by_time()
     assert same(again["time"], [0, 1, 2, 3, 4])
@@ -247,7 +247,7 @@ def test_of_repeated_times_the_first_in_the_file_is_kept_and_the_others_counted(
     again = recording.sorted_by_time()
     assert same(again.stack("time", "a"), [[0, 0], [1, 1], [2, 5]])
     assert again.warnings[1:] == (
-        "Dropped 3 of 6 samples that repeat the time of an earlier one, 1 of them with other values.",
+        "Dropped 3 of 6 samples that repeat the time of an earlier sample, 1 of them with other values.",
     )
 
 
@@ -294,7 +294,7 @@ def test_each_experiment_has_its_own_clock():
     assert same(again["time"], [0, 1, 1, 2, 3])
     assert same(again["a"], [0, 1, 2, 3, 5])
     assert again.warnings == (
-        "Dropped 1 of 6 samples that repeat the time of an earlier one, 1 of them with other values.",
+        "Dropped 1 of 6 samples that repeat the time of an earlier sample, 1 of them with other values.",
     )
 
 
@@ -331,7 +331,7 @@ def test_experiments_without_labels_are_named_by_their_number():
     assert {label: part["a"].tolist() for label, part in parts.items()} == {"2": [1, 4], "2.5": [2], "nan": [3, 5]}
 
 
-def test_without_experiments_the_whole_is_the_one_part():
+def test_without_experiments_the_whole_table_is_the_only_run():
     recording = Recording({"a": column(1)}, name="run")
     assert recording.experiments() == {"run": recording}
 
@@ -387,13 +387,13 @@ def test_quoted_names_and_values_may_hold_the_separator(tmp_path):
     assert same(recording["b;c;d;e"], [2])
 
 
-def test_a_column_without_a_name_is_left_out_and_said(tmp_path):
+def test_a_column_without_a_name_is_left_out_with_a_warning(tmp_path):
     recording = read(tmp_path, ",a,\n0,1,\n1,2,\n")
     assert recording.names == ("a",)
     assert recording.warnings == ("2 columns without a name left out.",)
 
 
-def test_a_column_of_text_nobody_asked_for_is_left_out_and_said(tmp_path):
+def test_a_text_column_that_is_not_required_is_left_out_with_a_warning(tmp_path):
     recording = read(tmp_path, "time,phase,a\n0,up,1\n1,,2\n2,down,3\n")
     assert recording.names == ("time", "a")
     assert recording.warnings == ("Column `phase` holds no numbers and is left out.",)
@@ -432,7 +432,7 @@ def test_columns_can_be_swapped(tmp_path):
     assert recording.warnings == ()
 
 
-def test_a_renamed_column_takes_the_place_of_the_files_own_and_it_is_said(tmp_path):
+def test_a_renamed_column_replaces_the_files_column_with_a_warning(tmp_path):
     recording = read(tmp_path, "mag_x,mx\n1,2\n", columns={"mag_x": "mx"})
     assert same(recording["mag_x"], [2])
     assert recording.warnings == ("Column `mag_x` of the file is left out: `mx` takes its name.",)
@@ -459,7 +459,7 @@ def test_renaming_an_absent_column_lists_those_present(tmp_path):
         ("time,a\n0,1\n\n1,2,3\n", "line 4 has 3 values but the header names 2 columns"),
         ('time,a\n0,"1,5",2\n', "line 2 has 3 values"),
         ('time,a\n0,"1\n', "a header line but no rows"),
-        ('time,a\n0,"1\n1,2\n', "line 2 has a quotation mark that does not end"),
+        ('time,a\n0,"1\n1,2\n', "line 2 has an unclosed quotation mark"),
         ("time,mag_x\n0,1\n\n1,abc\n2,def\n", 'column `mag_x` holds text at line 4, "abc"'),
         ("time,mag_x\n0,up\n1,down\n", 'column `mag_x` holds text at line 2, "up"'),
         ("time,a\nyesterday,1\n", 'column `time` holds text at line 2, "yesterday"; times are numbers, in seconds'),
@@ -470,7 +470,7 @@ def test_renaming_an_absent_column_lists_those_present(tmp_path):
         (b"time,a\n0,\x80\x81\n", "not UTF-8"),
     ],
 )
-def test_a_file_that_is_no_table_is_an_error_that_says_why(tmp_path, text, message):
+def test_a_file_that_is_not_a_table_is_an_error_with_the_reason(tmp_path, text, message):
     with pytest.raises(RecordingError, match=rf"rec\.csv: .*{message}"):
         read(tmp_path, text)
 
@@ -494,7 +494,7 @@ def test_a_folder_is_refused(tmp_path):
 @pytest.mark.parametrize(("name", "kind"), [("rec.xlsx", "files ending in .xlsx"), ("rec", "files without an ending")])
 def test_an_unknown_ending_lists_what_can_be_read(tmp_path, name, kind):
     with pytest.raises(
-        RecordingError, match=rf"{kind} are not known; .*; known are \.csv, \.tsv, \.txt, \.dat, \.asc, \.parquet"
+        RecordingError, match=rf"{kind} are not known; .*; known endings: \.csv, \.tsv, \.txt, \.dat, \.asc, \.parquet"
     ):
         read(tmp_path, "a\n1\n", name)
 
@@ -552,7 +552,7 @@ def test_a_parquet_table_that_cannot_be_used_says_why(tmp_path, columns, message
 
 
 def test_a_file_that_only_claims_to_be_parquet_is_an_error(tmp_path):
-    with pytest.raises(RecordingError, match=r"rec\.parquet: this is no Parquet file"):
+    with pytest.raises(RecordingError, match=r"rec\.parquet: this is not a valid Parquet file"):
         read(tmp_path, "time,a\n0,1\n", "rec.parquet")
 
 
@@ -629,9 +629,9 @@ def test_a_table_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "columns", "message"),
     [
-        ("a.xlsx", {"a": column(1)}, "known are .csv"),
+        ("a.xlsx", {"a": column(1)}, r"known endings: \.csv"),
         ("a.csv", {"a": column(1), "b": column(1, 2)}, "differ in length"),
-        ("a.csv", {"1": column(1)}, "header of numbers"),
+        ("a.csv", {"1": column(1)}, "column names `1` are all numbers"),
         ("a.csv", {}, "at least one column"),
     ],
 )
@@ -678,7 +678,7 @@ def test_a_real_table_of_several_runs_is_separated_by_its_labels():
 
 
 @pytest.mark.parametrize("word", ["n/a", "NA", " null "])
-def test_words_for_a_missing_value_are_told_of(tmp_path, word):
+def test_words_for_a_missing_value_are_reported(tmp_path, word):
     recording = read(tmp_path, f"time,a\n0,1\n1,{word}\n2,\n3,nan\n4,{word}\n")
     assert same(recording["a"], [1, NAN, NAN, NAN, NAN])
     (warning,) = recording.warnings

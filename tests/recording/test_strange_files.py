@@ -1,4 +1,4 @@
-"""One simulated recording as strangers' loggers, spreadsheets and scripts write it: the same samples, or a sentence."""
+"""A simulated recording in the formats of various loggers, spreadsheets and scripts: equal samples, or an error."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ SAME = {
     ),
     "units in the cells": table(MAG, [f"{t:.3f} s" for t in TIME], *([f"{v:.1f} nT" for v in axis] for axis in NT.T)),
     "typographic minus": PLAIN.replace("-", "\u2212"),
-    "single quotes": "\n".join(",".join(f"'{one}'" for one in line.split(",")) for line in LINES),
+    "single quotes": "\n".join(",".join(f"'{cell}'" for cell in line.split(",")) for line in LINES),
     "Windows-1252": ("# Messung \u2013 \u201eFeld\u201c\n" + PLAIN).encode("cp1252"),
     "micro sign of DOS": table("time,mx [µT],my [µT],mz [µT]", TIME, *XYZ).encode("cp437"),
     "micro sign read as Latin-1": table("time,mx [ÂµT],my [ÂµT],mz [ÂµT]", TIME, *XYZ),
@@ -121,7 +121,7 @@ SAME = {
     "month first": table(MAG, stamps("%m/%d/%Y %H:%M:%S.%f"), *XYZ),
     "twelve hours": table(
         MAG,
-        [f"{one} {half}" for one, half in zip(stamps("%m/%d/%Y %I:%M:%S.%f"), stamps("%p%f", 0), strict=True)],
+        [f"{cell} {half}" for cell, half in zip(stamps("%m/%d/%Y %I:%M:%S.%f"), stamps("%p%f", 0), strict=True)],
         *XYZ,
     ),
     "a month's name": table(MAG, stamps("%d-%b-%Y %H:%M:%S.%f"), *XYZ),
@@ -157,23 +157,23 @@ def test_what_can_mean_one_thing_alone_is_read_as_that(tmp_path, kind):
     assert_same(read_magnetometer(write(tmp_path, SAME[kind]), {}, {}, None)[0])
 
 
-TOLD = {
-    "points between thousands": "Signs between thousands were taken out",
+EXPECTED_WARNINGS = {
+    "points between thousands": "Thousands separators were removed",
     "typographic minus": "Typographic minus signs",
     "Windows-1252": "read as Windows-1252, first in line 1",
-    "date and time": "Columns `date` and `time` are joined into one time",
-    "ROS 2": "Columns `header.stamp.sec` and `header.stamp.nanosec` are joined into one time",
-    "comma before milliseconds": "A comma before the parts of a second was read as a point",
+    "date and time": "Columns `date` and `time` are joined",
+    "ROS 2": "Columns `header.stamp.sec` and `header.stamp.nanosec` are joined",
+    "comma before milliseconds": "A comma before the fraction of a second was read as a point",
     "days of a spreadsheet": "The times are days, as spreadsheets count them",
-    "32 bits of µs": "µs, whose counter turned over at 4294967296 and is counted on",
+    "32 bits of µs": "µs, unwrapped where the counter turned over at 4294967296",
     "over midnight": "turned over at 86400",
-    "a clock of seconds": "The clock stands still over up to 50 samples",
+    "a clock of seconds": "Up to 50 samples share a time stamp",
 }
 
 
-@pytest.mark.parametrize("kind", TOLD)
-def test_what_was_done_is_told(tmp_path, kind):
-    assert TOLD[kind] in " ".join(Recording.read(write(tmp_path, SAME[kind])).warnings)
+@pytest.mark.parametrize("kind", EXPECTED_WARNINGS)
+def test_warnings_report_what_was_done(tmp_path, kind):
+    assert EXPECTED_WARNINGS[kind] in " ".join(Recording.read(write(tmp_path, SAME[kind])).warnings)
 
 
 @pytest.mark.parametrize("kind", ["date and time", "ROS 2", "C's timeval"])
@@ -213,7 +213,7 @@ def test_zero_bytes_at_the_end_of_each_line_cut_nothing(tmp_path):
 
 
 def two(columns):
-    """Rows of two sensors in turn, with what a column says of each."""
+    """Alternating rows of two sensors, with a column that identifies the sensor."""
     rows = [(t, columns[k], *values[i]) for i, t in enumerate(TIME) for k, values in enumerate((FIELD, OTHER))]
     return list(zip(*rows, strict=True))
 
@@ -271,9 +271,11 @@ def test_the_named_sensor_is_read_and_not_the_one_with_the_usual_names(tmp_path)
 
 def test_a_unit_that_the_numbers_contradict_is_told_with_the_one_that_fits(tmp_path):
     path = write(tmp_path, table("time,mx [gauss],my [gauss],mz [gauss]", TIME, *XYZ))
-    told = " ".join(calibrate(Recording.read(path)).warnings)
-    assert "converted from gauss; they may be in another unit than was said; say `--convert mag=uT`" in told
-    assert "Nothing was converted" not in told
+    warnings = " ".join(calibrate(Recording.read(path)).warnings)
+    assert (
+        "converted from gauss; they may be in another unit than stated; if so, give it: `--convert mag=uT`" in warnings
+    )
+    assert "Nothing was converted" not in warnings
 
 
 def test_an_accelerometer_alone_is_told_how_it_is_calibrated(tmp_path):
@@ -286,21 +288,21 @@ def test_an_accelerometer_alone_is_told_how_it_is_calibrated(tmp_path):
 @pytest.mark.parametrize("names", ["mag1,mag2,mag3", "mag_0,mag_1,mag_2", "mag(1),mag(2),mag(3)"])
 def test_numbered_columns_are_asked_for_with_the_option(tmp_path, names):
     path = write(tmp_path, table(f"time,{names}", TIME, *XYZ))
-    one, two, three = names.split(",")
+    x, y, z = names.split(",")
     with pytest.raises(RecordingError) as refusal:
         read_magnetometer(path, {}, {}, None)
-    assert f"mag_x={one},mag_y={two},mag_z={three}" in str(refusal.value)
+    assert f"mag_x={x},mag_y={y},mag_z={z}" in str(refusal.value)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("rec.csv.gz", b"\x1f\x8b", "files ending in .gz are not known; unpack it first"),
-        ("rec.csv", b"\x1f\x8b\x08\x00\x00", "begins as a gzip archive does; unpack it first"),
+        ("rec.csv", b"\x1f\x8b\x08\x00\x00", "begins like a gzip archive; unpack it first"),
         ("rec.xlsx", b"PK", "export the sheet as CSV"),
         ("rec", PLAIN, "if it is text with separators, rename it to end in .csv"),
         ("rec.csv", "\n".join(LINES[1:]), "add a first line such as time,mag_x,mag_y,mag_z"),
-        ("rec.csv", PLAIN.replace("mag_z", "mag_z,a"), "other lines are like it, so correct the header"),
+        ("rec.csv", PLAIN.replace("mag_z", "mag_z,a"), "other lines are the same, so correct the header"),
     ],
 )
 def test_a_refusal_says_what_to_do(tmp_path, name, content, message):
@@ -326,9 +328,9 @@ def test_a_frame_is_recognised_converted_and_told_as_its_file_is():
         given = frame("timestamp,magX [mG],magY [mG],magZ [mG]", [times, *(10.0 * XYZ)])
         recording = Recording.from_frame(given)
         assert_same(recording)
-        told = " ".join(recording.warnings)
-        assert "are taken as `mag_x`, `mag_y`, `mag_z`" in told
-        assert "converted from milligauss" in told
+        warnings = " ".join(recording.warnings)
+        assert "are taken as `mag_x`, `mag_y`, `mag_z`" in warnings
+        assert "converted from milligauss" in warnings
 
 
 def test_a_frame_of_two_columns_of_time_or_of_two_sensors_is_read_too():

@@ -1,4 +1,4 @@
-"""Several recordings joined to one table, whose column `experiment` keeps their runs apart."""
+"""Join several recordings to a table, whose column `experiment` numbers their runs."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ def run(begin, name, count=4, step=0.1, **more):
     return Recording({"time": time, "speed": time * 0.0 + begin, **more}, name=name)
 
 
-def test_runs_are_called_by_their_recordings_and_own_labels():
+def test_runs_are_named_by_recording_and_label():
     table = Recording(
         {
             "experiment": torch.tensor([0.0, 0.0, 1.0]),
@@ -30,18 +30,18 @@ def test_runs_are_called_by_their_recordings_and_own_labels():
     assert both.name == "bench, road"
 
 
-def test_names_that_are_missing_or_alike_are_told_apart():
+def test_missing_and_equal_names_become_unique():
     both = join_recordings([run(0.0, ""), run(0.0, "a"), run(0.0, "a")])
     assert both.labels["experiment"] == ("recording 1", "a", "a (2)")
 
 
-def test_one_recording_without_runs_stays_as_it_is():
+def test_a_single_recording_without_runs_is_unchanged():
     alone = run(5.0, "alone")
     assert join_recordings([alone]) is alone
 
 
 @pytest.mark.parametrize(
-    ("clock", "second", "begins", "told"),
+    ("clock", "second", "begins", "warning"),
     [
         ("own", 7.0, 7.0, ""),
         ("restart", 7.0, 0.0, "b is counted 7 s earlier"),
@@ -51,11 +51,11 @@ def test_one_recording_without_runs_stays_as_it_is():
         ("follow", 0.2, 10.3, "b is counted 10.1 s later"),
     ],
 )
-def test_a_clock_is_moved_where_runs_would_not_stay_apart_and_that_is_told(clock, second, begins, told):
+def test_a_clock_is_shifted_with_a_warning_if_runs_would_overlap(clock, second, begins, warning):
     both = join_recordings([run(0.0, "a"), run(second, "b")], clock)
     assert float(both["time"][4]) == pytest.approx(begins)
-    assert told in " ".join(both.warnings)
-    assert bool(both.warnings) == bool(told)
+    assert warning in " ".join(both.warnings)
+    assert bool(both.warnings) == bool(warning)
     if clock != "own":
         falls = bool(both["time"][4] < both["time"][3])
         assert falls == (clock == "restart")

@@ -1,4 +1,4 @@
-"""Columns whose size gives their unit away."""
+"""Columns whose magnitude reveals their unit."""
 
 import pytest
 import torch
@@ -98,7 +98,7 @@ def test_parts_of_a_vector_are_not_judged():
 
 
 def turned(size, offset, share=1.0):
-    """A field that a sensor with an offset sees from all directions, or from a cone about z."""
+    """A field that a sensor with an offset measures in all directions, or in a cone about z."""
     direction = torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
     direction[:, :2] *= share

@@ -45,7 +45,7 @@ class Pair:
 
 
 PAIRS = (
-    # unseen blocks
+    # held-out blocks
     Pair("surely better", "no change", "row", r"\d % less"),
     Pair("surely better", r"\d % more", "row", r"\d % less"),
     Pair("surely better", "[Nn]ot confirmed", "finding"),
@@ -58,7 +58,7 @@ PAIRS = (
     Pair("do not speak against it", rf"95 %: −{NUMBER} to −", "row", REASON),
     Pair("do not speak against it", "[Nn]ot confirmed", "finding"),
     Pair("differs by more than itself", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
-    Pair("not measured", r"nats a sample", "row"),
+    Pair("not measured", r"nats per sample", "row"),
     # two sizes of the same name: of an output, robust, and of the fit's samples
     Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
     # what is missing
@@ -66,7 +66,7 @@ PAIRS = (
     Pair("Nothing is missing", "[Nn]earest in the catalogue", "report"),
     Pair("Nothing is missing", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
     Pair("Nothing is missing", PUSH, "report"),
-    Pair("Nothing is missing", "[Ss]tructure remains|remains along|does not follow|structure without a name", "report"),
+    Pair("Nothing is missing", "[Ss]tructure remains|remains along|does not follow|unnamed structure", "report"),
     Pair("no physics in the catalogue explains it", CLAIM, "report"),
     Pair("No physics stands out", CLAIM, "report"),
     Pair("Something is there that noise alone rarely makes", r"named +nothing surely", "report"),
@@ -75,12 +75,12 @@ PAIRS = (
     # what is left
     Pair("What is left is the sensor's noise", PUSH, "report"),
     Pair("What is left is the sensor's noise", "[Ss]tructure remains|remains along|Look for what drives", "report"),
-    Pair("anew at each sample", "is not white", "row"),
-    Pair(r"for about \S+ s at a time", "is white: it is new at each sample", "row"),
+    Pair("white", "is not white", "row"),
+    Pair(r"correlation time \S+ s", "is white: it is new at each sample", "row"),
     # what to do
-    Pair("Use the simulation as it is", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
-    Pair("Use the simulation as it is", "does not follow|[Ss]tructure remains|remains along|Do not rely", "report"),
-    Pair("Use the simulation as it is", "The model found here corrects|mkc apply", "report"),
+    Pair("Use the simulation without findings", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
+    Pair("Use the simulation without findings", "does not follow|[Ss]tructure remains|remains along|Do not rely", "report"),
+    Pair("Use the simulation without findings", "The model found here corrects|mkc apply", "report"),
     Pair("Do not rely on this simulation", f"{CLAIM}|mkc apply|Use the simulation", "report"),
     Pair("does not follow the recording", f"{CLAIM}|[Nn]earest in the catalogue|mkc apply", "report"),
     # where
@@ -123,7 +123,7 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
 
 
 def _two_residuals(d: Diagnosis) -> bool:
-    """A page's residuals of the simulation as it is: of unseen blocks in its table, and of the first finding."""
+    """A page's residuals of the simulation without findings: of held-out blocks in its table, and of the first finding."""
     held = d.findings[0].held_out if d.findings else None
     if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
         return False
@@ -171,7 +171,7 @@ RULES: dict[str, Rule] = {
     "not to be told apart from itself": lambda d: any(
         (a.effect, a.drivers, a.port) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
     ),
-    "two residuals of the simulation as it is": _two_residuals,
+    "two residuals of the simulation without findings": _two_residuals,
     "shares of runs that are no shares": lambda d: any(
         f.experiments and not math.isclose(sum(f.experiments), 1.0, abs_tol=0.02) for f in d.findings
     ),

@@ -221,7 +221,7 @@ def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
 @pytest.mark.e2e
 def test_the_noise_is_gaussian_where_the_test_for_heavy_tails_says_so_whatever_sigma_is(calibration, recording):
     heavy = dataclasses.replace(calibration, tails=ChannelTails(31.5, 0.041, 0.006))
-    share = "heavy-tailed: 4.1 ± 0.6 % of the errors beyond three times that (0.27 % if Gaussian)"
+    share = "heavy-tailed: 4.1 ± 0.6 % of the residuals beyond three times that (0.27 % if Gaussian)"
     assert wording.noise(heavy).endswith(share)
     gaussian = dataclasses.replace(calibration, sigma=4.35, tails=ChannelTails(1.3, 0.0027, 0.001))
     assert wording.noise(gaussian).endswith("along the field, Gaussian")

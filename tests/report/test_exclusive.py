@@ -71,7 +71,7 @@ def findings(draw, place):
         ),
         plausible=draw(st.booleans()),
         plausibility="such sizes occur",
-        evidence=(held_out_gain.said(held, "" if held else "One side of it is too short."),),
+        evidence=(held_out_gain.as_result(held, "" if held else "One side of it is too short."),),
     )
     shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
     grade = "nearest" if shape is not None and shape.curve is not None else grade_of(finding)
@@ -182,7 +182,7 @@ SPOILT = {
             "Do not correct for linear_drag yet: blocks that the fit has not seen do not confirm it.",
         )
     },
-    "Use the simulation as it is": {"advice": ("Use the simulation as it is, within what this recording covers.",)},
+    "Use the simulation without findings": {"advice": ("Use the simulation without findings, within what this recording covers.",)},
 }
 
 
@@ -206,12 +206,12 @@ def test_a_report_that_contradicts_itself_is_caught(name):
 @pytest.mark.parametrize(
     "row",
     [
-        "held out  angle 0.300 → 0.300 rad (no change); surely better on unseen blocks; +0.3 nats a sample",
-        "held out  residual 1.00 → 0.06 m (94 % less); not shown to be better on unseen blocks",
+        "held out  angle 0.300 → 0.300 rad (no change); surely better on held-out blocks; +0.3 nats per sample",
+        "held out  residual 1.00 → 0.06 m (94 % less); not shown to be better on held-out blocks",
         "where  throughout the recording, mainly from 1.0 to 2.0 s",
-        "held out  unseen blocks do not speak against it; −0.3 nats a sample (95 %: −0.400 to −0.200)",
-        "Nothing is missing that this recording could show. linear drag: left out of the simulation",
-        "The simulation does not follow the recording. Use the simulation as it is",
+        "held out  held-out blocks do not speak against it; −0.3 nats per sample (95 %: −0.400 to −0.200)",
+        "The recording shows no missing physics. linear drag: left out of the simulation",
+        "The simulation does not fit the recording. Use the simulation without findings",
     ],
 )
 def test_each_kind_of_pair_is_found_in_a_text(row):
@@ -221,9 +221,9 @@ def test_each_kind_of_pair_is_found_in_a_text(row):
 def test_what_is_said_of_one_finding_is_not_held_against_another():
     pair = Pair("surely better", "[Nn]ot confirmed", "finding")
     assert pair in PAIRS
-    rows = ["1 · Drag", "surely better on unseen blocks", "2 · Friction", "not confirmed on unseen blocks"]
+    rows = ["1 · Drag", "surely better on held-out blocks", "2 · Friction", "not confirmed on held-out blocks"]
     assert not list(_in_text(rows, make_diagnosis(2, samples=20)))
-    assert list(_in_text([*rows, "surely better on unseen blocks"], make_diagnosis(2, samples=20)))
+    assert list(_in_text([*rows, "surely better on held-out blocks"], make_diagnosis(2, samples=20)))
 
 
 def test_a_page_and_a_terminal_are_read_row_by_row():

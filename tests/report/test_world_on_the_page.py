@@ -52,10 +52,10 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
     quiet = make_diagnosis(0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=()))
     page = diagnosis_report(quiet)
     box = box_of(page)
-    assert "Nothing is missing that this recording could show." in box
-    assert "angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation" in box
-    assert "rate follows to 0.0310 rad/s; noise floor 0.0200 rad/s (estimated); explains 99.95 %" in box
-    assert "What is left is the sensor's noise. Between samples torque is held." in box
+    assert "The recording shows no missing physics." in box
+    assert "angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance" in box
+    assert "rate: residual 0.0310 rad/s; noise floor 0.0200 rad/s (estimated); explains 99.95 %" in box
+    assert "The residual is the sensor's noise. Input hold: torque is held." in box
     assert "µT" not in box.replace("reaches 0", "").split("For comparison")[0]
     assert '<h1 class="good">' in page
 
@@ -63,20 +63,20 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
 def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
     still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
     (line,) = world.output_lines(make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,))))
-    assert line == ("angle is off by 0.00510 rad; noise floor 0.00500 rad (declared); it hardly varies beyond that")
+    assert line == ("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared); the output hardly varies")
 
 
 def test_of_many_outputs_the_table_has_all():
     many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
     page = diagnosis_report(make_diagnosis(0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())))
-    assert "and 3 more outputs; see the table of all" in box_of(page)
-    assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s not known" in text_of(page)
+    assert "and 3 more outputs; see the table" in box_of(page)
+    assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s unknown" in text_of(page)
 
 
 def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
     page = diagnosis_report(make_unfit())
     box = box_of(page)
-    assert box.startswith("The simulation does not follow the recording.")
+    assert box.startswith("The simulation does not fit the recording.")
     assert (
         "angle: the simulation explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by "
         "0.360 rad; noise floor 0.00500 rad (declared)"
@@ -84,7 +84,7 @@ def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
     assert "Why Another start reaches 0.006 rad: gravity = −9.81 with the other sign. damping ends at its bound" in box
     assert '<h1 class="bad">' in page
     text = text_of(page)
-    for words in ("Use the simulation as it is", "Nothing is missing", "The candidates", "hard-iron", "tell apart"):
+    for words in ("Use the simulation without findings", "Nothing is missing", "The candidates", "hard-iron", "tell apart"):
         assert words not in text
 
 
@@ -100,9 +100,9 @@ def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
     parsed(page)
     assert page.index("Course of the forcing over time") < page.index("Residual over time before and after")
     box = box_of(page)
-    assert box.startswith("Something unrecorded pushes the rate of rate, and no physics in the catalogue explains it.")
-    assert "Something unrecorded pushes the rate of rate: 0.228 ± 0.021 rad/s², for about 0.7 s at a time." in box
-    assert "Noise without what pushes rate is less likely by 311 nats. No physics stands out beside it." in box
+    assert box.startswith("Process noise acts on the rate of rate, and no physics in the catalogue explains it.")
+    assert "Process noise acts on the rate of rate: 0.228 ± 0.021 rad/s², correlation time 0.7 s." in box
+    assert "Noise without what pushes rate is less likely by 311 nats. No physics is significant in addition to it." in box
     text = text_of(page)
     assert "It is not white: it is correlated up to 0.7 s. It goes along with none of the inputs, at no lag." in text
     for name in ("Over angle", "Over rate", "Over torque"):
@@ -132,38 +132,38 @@ def test_runs_are_not_joined_by_a_line():
 def test_something_slow_in_a_sensor_is_told_as_such():
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
     text = text_of(diagnosis_report(pushed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
-    assert "Something slow is added to angle beside the sensor's noise, and no physics" in text
-    assert "Something slow is added to angle beside its noise: 0.0120 ± 0.0020 rad, for about 0.7 s at a time." in text
-    assert "What is added to angle" in text
+    assert "angle beside the sensor's noise, and no physics" in text
+    assert "angle beside its noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
+    assert "Drift of angle" in text
 
 
 def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
     made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), nearest)
     page = diagnosis_report(made)
     assert top.headline(made) == (
-        "Structure remains that no effect in the catalogue accounts for. Nearest in the catalogue: hard-iron step "
+        "The residual has structure that no effect in the catalogue explains. Nearest in the catalogue: hard-iron step "
         "(a free curve of the same variables is likelier by 163 nats)."
     )
     text = text_of(page)
     assert "Left out" not in text
     assert "Nearest in the catalogue: hard-iron step" in text
-    assert "The free curve with its 95 % band, and the named form" in text
+    assert "Free curve with its 95 % band, and the named shape" in text
     assert "The formula nearest to the free curve: 0.0071 |x|^1.52 sign(x) ." in text
-    assert "likelier by 163 nats (p = 0.002 if the name were right)" in text
-    assert page.index("The free curve beside the form of finding 1") < page.index("What finding 1 is, and")
+    assert "likelier by 163 nats (p = 0.002 if the name is right)" in text
+    assert page.index("Free curve and the shape of finding 1") < page.index("Curve of finding 1 is, and")
     parsed(page)
     # of another driver than the named form: the free curve alone
     curve = dataclasses.replace(made.findings[0].curve, driver="difference")
     alone = with_first(made, lambda f: nearest(f, curve=curve, formula=""))
-    assert "The free curve, 95 % band" in text_of(diagnosis_report(alone))
+    assert "Free curve, 95 % band" in text_of(diagnosis_report(alone))
 
 
 @pytest.mark.parametrize(
-    ("grade", "told"),
+    ("grade", "text"),
     [
         ("left_out", "Left out of the simulation: hard-iron step"),
-        ("small", "Real, but small beside the noise: hard-iron step"),
-        ("unconfirmed", "Found, but not confirmed on unseen blocks: hard-iron step"),
+        ("small", "Real, but small compared with the noise: hard-iron step"),
+        ("unconfirmed", "Found, but not confirmed on held-out blocks: hard-iron step"),
     ],
 )
 def test_the_headline_is_by_grade_alone(grade, text):
@@ -173,22 +173,22 @@ def test_the_headline_is_by_grade_alone(grade, text):
 
 def test_what_is_small_beside_an_adequate_simulation_is_said():
     small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "small"))
-    assert top.headline(small).startswith("Nothing is missing that is worth correcting. Real, but small")
+    assert top.headline(small).startswith("No missing physics is worth correcting. Real, but small")
     weak = with_first(small, lambda f: graded(f, "unconfirmed"))
-    assert top.headline(weak) == "Nothing is missing that this recording could show."
+    assert top.headline(weak) == "The recording shows no missing physics."
 
 
 def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_reason():
     diverged = {"diverged_blocks": (DivergedBlock(3, before=True, after=False),), "blocks": 25}
     for held, reason in (
-        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "from block to block the gain differs by more than itself"),
+        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "the gain varies between blocks by more than its mean"),
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", **diverged), "diverges in 1 of 25 blocks without the finding"),
-        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
-        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
-        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on unseen blocks: what is less likely is in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely likelier on held-out blocks: what is likelier is in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely likelier on held-out blocks: what is likelier is in the tail"),
+        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on held-out blocks: what is less likely is in the tail"),
         (
             HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m", decides=False),
-            "not shown to be better on unseen blocks: the free run",
+            "not shown to be better on held-out blocks: the free run",
         ),
         (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not speak against it: the free run is closer"),
     ):
@@ -196,7 +196,7 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
         assert unseen.diverged(held) == ""
     sentence = unseen.diverged(HeldOut(0.3, (0.2, 0.4), 1.0, 0.5, "m", **diverged))
     assert "in 1 of 25 blocks without the finding" in sentence
-    assert unseen.better(HeldOut(0.001, (-0.4, 0.4), 1.0, 0.99, "m")) == "not shown to be better on unseen blocks"
+    assert unseen.better(HeldOut(0.001, (-0.4, 0.4), 1.0, 0.99, "m")) == "not shown to be better on held-out blocks"
 
 
 def test_each_output_has_its_own_sizes_beside_its_floor():
@@ -208,14 +208,14 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
     made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", environment=make_environment(process_noise=(), disturbance=()))
     traces = dataclasses.replace(made.traces, channels=("angle", "rate"), unit="")
     made = dataclasses.replace(made, traces=traces, findings=tuple(
-        with_evidence(f, held_out_gain.said(held, "")) for f in made.findings
+        with_evidence(f, held_out_gain.as_result(held, "")) for f in made.findings
     ))  # fmt: skip
     for item in (made, dataclasses.replace(made, findings=made.findings[:1])):
         text = text_of(diagnosis_report(item))
         assert "angle 0.0200 → 0.00510 rad (74 % less), noise floor 0.00500 rad" in text
         assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
         assert "15671" not in text
-        assert "n 1 of 25 blocks the free run of the simulation alone leaves" in text
+        assert "n 1 of 25 blocks without the finding" in text
     # what is not told for each output has no number of all together
     bare = dataclasses.replace(made, findings=tuple(dataclasses.replace(f, evidence=()) for f in made.findings))
     assert unseen.residual_of_all(bare) == []
@@ -224,11 +224,11 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
 def test_the_box_has_what_where_how_large_and_how_sure_of_each_of_several():
     box = box_of(diagnosis_report(make_diagnosis(3, samples=4500)))
     for words in (
-        "1 · Hard-iron step Left out of the simulation; not to be told from: current field (current).",
+        "1 · Hard-iron step Left out of the simulation; not distinguished from: current field (current).",
         "offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT. From 41.3 s on; acts on mag_x",
-        "p = 0.005; surely better on unseen blocks: residual 0.912 → 0.521 µT (43 % less).",
+        "p = 0.005; surely better on held-out blocks: residual 0.912 → 0.521 µT (43 % less).",
         "2 · Current field (current) Left out of the simulation. k (−0.170 ± 0.012",
-        "3 · An effect outside the catalogue (temperature) Not confirmed on unseen blocks.",
+        "3 · An effect outside the catalogue (temperature) Not confirmed on held-out blocks.",
     ):
         assert words in box
 
@@ -237,15 +237,15 @@ def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
     made = make_diagnosis(1, samples=200, warnings=("A column is empty.", "hard_iron_step may be a door."))
     page = diagnosis_report(made)
     assert top.warned(made) == ["Hard-iron step may be a door.", "A column is empty."]
-    assert page.index("What else it could be") < page.index("may be a door") < page.index("The statistician")
+    assert page.index("Alternatives") < page.index("may be a door") < page.index("The statistician")
 
 
 def test_the_statisticians_numbers_are_one_click_below():
     page = diagnosis_report(pushed(process_noise=(PUSHED,)))
     closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
     assert closed[:4] == [
-        "How the simulation follows", "What pushes it", "On data the fit had not seen",
-        "The noise that structure was tested against",
+        "Goodness of fit", "Process noise and drift", "Scores on held-out data",
+        "Noise model of the tests",
     ]  # fmt: skip
 
 
@@ -283,4 +283,4 @@ def test_names_of_the_world_are_escaped():
 def test_a_contradiction_is_not_called_nothing():
     lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=()))
     assert top.tone(lost) == "open"
-    assert top.headline(lost) == "The simulation does not follow the recording."
+    assert top.headline(lost) == "The simulation does not fit the recording."

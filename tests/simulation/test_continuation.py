@@ -1,4 +1,4 @@
-"""Answers depend on their arguments alone; on the way of a fit each begins with the one before."""
+"""Evaluations depend on their arguments only; in a fit each starts from the previous evaluation."""
 
 from functools import cache
 
@@ -33,17 +33,17 @@ def theta(stiffness, damping=0.2):
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(0.5, 30.0), max_size=3), st.floats(0.5, 30.0))
-def test_an_answer_does_not_depend_on_what_was_asked_before(before, asked):
-    first = prepared().answer(theta(asked), {}).residual
+def test_an_evaluation_does_not_depend_on_previous_evaluations(before, final):
+    first = prepared().answer(theta(final), {}).residual
     for stiffness in before:
         prepared().answer(theta(stiffness), {})
         prepared().signals(theta(stiffness), {})
-    assert torch.equal(prepared().answer(theta(asked), {}).residual, first)
+    assert torch.equal(prepared().answer(theta(final), {}).residual, first)
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1.0, 10.0), st.floats(0.95, 1.05))
-def test_where_an_answer_begins_changes_it_by_rounding_alone(stiffness, factor):
+def test_the_start_of_an_evaluation_changes_it_by_rounding_only(stiffness, factor):
     near = prepared().answer(theta(factor * stiffness), {}).nearby
     alone = prepared().answer(theta(stiffness), {}).residual
     for beginning in (near, near.bare):
@@ -52,7 +52,7 @@ def test_where_an_answer_begins_changes_it_by_rounding_alone(stiffness, factor):
         )
 
 
-def test_derivatives_are_those_of_the_answer_alone():
+def test_derivatives_do_not_depend_on_the_start():
     near = prepared().answer(theta(4.3), {}).nearby
     slopes = [
         torch.func.jacfwd(lambda p, at=at: prepared().answer(p, {}, at).residual)(theta(4.0)) for at in (None, near)
@@ -60,14 +60,14 @@ def test_derivatives_are_those_of_the_answer_alone():
     torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-8)
 
 
-class Noting:
-    """A simulation whose answer is its parameter, and which notes what it was given to begin with."""
+class RecordedStarts:
+    """A simulation whose residual is its parameter, and which records the starts of its evaluations."""
 
     def __init__(self):
-        self.begun = []
+        self.starts = []
 
     def answer(self, theta, changes, near=None):  # noqa: ARG002
-        self.begun.append(near)
+        self.starts.append(near)
         return Answer(theta.unsqueeze(-1), Found(float(theta)))
 
 
@@ -85,21 +85,21 @@ class Found:
     __hash__ = None
 
 
-def test_each_answer_begins_with_the_one_before_and_one_that_is_asked_again_with_its_own():
-    simulation = Noting()
-    way = Continuation(simulation, lambda p: (p, {}), Found(0.0))
+def test_each_evaluation_starts_from_the_previous_and_a_repeated_evaluation_from_itself():
+    simulation = RecordedStarts()
+    continuation = Continuation(simulation, lambda p: (p, {}), Found(0.0))
     for value in (1.0, 2.0, 2.0, 1.0):
-        way(torch.tensor([value]))
-    assert simulation.begun == [Found(0.0), Found(1.0), Found(2.0), Found(1.0, whole=False)]
-    assert way.near(torch.tensor([2.0])) == Found(2.0, whole=False)
-    assert way.near(torch.tensor([3.0])) == Found(1.0, whole=False)
+        continuation(torch.tensor([value]))
+    assert simulation.starts == [Found(0.0), Found(1.0), Found(2.0), Found(1.0, whole=False)]
+    assert continuation.near(torch.tensor([2.0])) == Found(2.0, whole=False)
+    assert continuation.near(torch.tensor([3.0])) == Found(1.0, whole=False)
 
 
-def test_what_is_found_inside_of_a_transform_is_not_kept():
-    simulation = Noting()
-    way = Continuation(simulation, lambda p: (p, {}), Found(0.0))
+def test_evaluations_inside_of_a_transform_are_not_kept():
+    simulation = RecordedStarts()
+    continuation = Continuation(simulation, lambda p: (p, {}), Found(0.0))
     assert prepared().answer(theta(4.0), {}).nearby is not None
     seen = []
     torch.func.jvp(lambda p: seen.append(prepared().answer(p, {})) or seen[0].residual, (theta(4.0),), (theta(1.0),))
     assert seen[0].nearby is None
-    assert way.near(torch.tensor([1.0])) == Found(0.0, whole=False)
+    assert continuation.near(torch.tensor([1.0])) == Found(0.0, whole=False)

@@ -1,4 +1,4 @@
-"""What each of these effects adds to a system of differential equations, against a step-by-step solution of it."""
+"""Effects in systems of differential equations, against Runge-Kutta solutions."""
 
 import math
 
@@ -24,15 +24,15 @@ def table(**columns):
 
 
 class Mass(Dynamics):
-    """On a spring, pushed by a known force."""
+    """A mass on a spring, driven by a known force."""
 
     states = ("height", "speed")
-    inputs = ("push",)
+    inputs = ("drive",)
     parameters = {"damping": 0.3}  # noqa: RUF012
-    units = {"height": "m", "speed": "m/s", "push": "m/s²"}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s", "drive": "m/s²"}  # noqa: RUF012
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
-        return {"height": x.speed, "speed": u.push - 4.0 * x.height - p.damping * x.speed}
+        return {"height": x.speed, "speed": u.drive - 4.0 * x.height - p.damping * x.speed}
 
 
 class Ball(Dynamics):
@@ -44,8 +44,8 @@ class Ball(Dynamics):
         return {"x": x.vx, "y": x.vy, "vx": -p.drag * x.vx, "vy": -9.81 - p.drag * x.vy}
 
 
-def push(t):
-    """Linear between the samples, as the simulation takes it."""
+def drive(t):
+    """A force that is linear between the samples, as in the simulation."""
     return np.interp(t, TIME, np.sin(2.3 * TIME) + np.sin(0.9 * TIME))
 
 
@@ -54,8 +54,8 @@ def spun(t):
 
 
 def played_back(gap):
-    """The push behind play, by its definition."""
-    u = push(TIME)
+    """The drive behind play, by its definition."""
+    u = drive(TIME)
     y = u.copy()
     for k in range(1, len(u)):
         y[k] = max(u[k] - gap, min(u[k] + gap, y[k - 1]))
@@ -64,7 +64,7 @@ def played_back(gap):
 
 def mass(force=lambda *_: 0.0, inertia=1.0):
     def rate(t, y):
-        return [y[1], (push(t) - 4.0 * y[0] - 0.3 * y[1]) / inertia + force(*y)]
+        return [y[1], (drive(t) - 4.0 * y[0] - 0.3 * y[1]) / inertia + force(*y)]
 
     return rate
 
@@ -72,7 +72,7 @@ def mass(force=lambda *_: 0.0, inertia=1.0):
 def hysteretic(gamma, yields):
     def rate(t, y):
         x, v, z = y
-        plain = push(t) - 4.0 * x - 0.3 * v
+        plain = drive(t) - 4.0 * x - 0.3 * v
         return [v, plain - gamma * z, v - (abs(v) * z + v * abs(z)) / (2.0 * yields)]
 
     return rate
@@ -83,19 +83,19 @@ def dragged(gamma, lag):
 
     def rate(t, y):
         x, v, w = y
-        return [v, push(t) - 4.0 * x - 0.3 * v + gamma * (w - v), (v - w) / lag]
+        return [v, drive(t) - 4.0 * x - 0.3 * v + gamma * (w - v), (v - w) / lag]
 
     return rate
 
 
 def sprung(share, period, damping):
-    """A second mass on a spring: its place and its speed are the third and fourth state."""
+    """A second mass on a spring: its position and its speed are the third and fourth state."""
     omega = 2.0 * math.pi / period
 
     def rate(t, y):
         x, v, place, w = y
-        pull = omega**2 * (place - x) + 2.0 * damping * omega * (w - v)
-        return [v, push(t) - 4.0 * x - 0.3 * v + share * pull, w, -pull]
+        force = omega**2 * (place - x) + 2.0 * damping * omega * (w - v)
+        return [v, drive(t) - 4.0 * x - 0.3 * v + share * force, w, -force]
 
     return rate
 
@@ -115,9 +115,9 @@ def dipped(x, _):
 
 def with_play():
     behind = played_back(0.4)
-    # the load's side between the samples is not linear where the gap begins and ends
+    # between the samples the load is not linear where the gap starts and ends
     fine = np.linspace(0.0, TIME[-1], 40 * (len(TIME) - 1) + 1)
-    side = push(fine)
+    side = drive(fine)
     for k in range(1, len(side)):
         side[k] = max(side[k] - 0.4, min(side[k] + 0.4, side[k - 1]))
     assert np.abs(side[::40] - behind).max() < 1e-12
@@ -128,9 +128,9 @@ def with_play():
     return rate
 
 
-# effect, port, shape, γ, the equations with it, their first states, tolerance
+# effect: port, shape, γ, the equations with the effect, their initial states, tolerance
 CASES = {
-    "backlash": ("input push", {"half_gap": 0.4}, [1.0], with_play(), [0.5, 0.0], 2e-3),
+    "backlash": ("input drive", {"half_gap": 0.4}, [1.0], with_play(), [0.5, 0.0], 2e-3),
     "bouc_wen_hysteresis": (
         "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
     ),
@@ -150,12 +150,12 @@ CASES = {
 
 
 def prepared(name, rate, first, **attributes):
-    """The simulation of a recording of the system with the effect, the truth, and parameters that are the true ones."""
+    """The simulation of a recording with the effect, the true states, and the true parameters."""
     system = Ball if name == "magnus_lift" else Mass
     known = list(system.states[:2])
     truth = runge_kutta(rate, first, TIME)
     columns = dict(zip(known, truth.T[:2], strict=True))
-    recording = table(time=TIME, **columns, **({} if system is Ball else {"push": push(TIME)}))
+    recording = table(time=TIME, **columns, **({} if system is Ball else {"drive": drive(TIME)}))
     simulation = type(system.__name__, (system,), {"step": 0.01, **attributes})()
     own = [0.05] if system is Ball else [0.3]
     theta = torch.tensor([*own, *first[: len(system.states)]], dtype=torch.float64)
@@ -170,9 +170,9 @@ def joint(name, simulation, shape, gamma, theta):
 
 @pytest.mark.parametrize("name", CASES)
 class TestAgainstSteps:
-    """The simulation with an effect solves the equations that have it in them."""
+    """The simulation with an effect solves the equations with the effect."""
 
-    def test_it_is_the_solution(self, name):
+    def test_residual_is_zero_at_the_truth(self, name):
         _, shape, gamma, rate, first, tolerance = CASES[name]
         simulation, truth, theta = prepared(name, rate, first)
         model, parameters = joint(name, simulation, shape, gamma, theta)
@@ -180,8 +180,8 @@ class TestAgainstSteps:
         without = simulation.residual(theta, {})
         assert float(without.abs().max()) > 30.0 * tolerance * float(truth.abs().max())
 
-    def test_its_derivatives_are_differences(self, name):
-        """In forward mode, in reverse mode and under vmap, by the amplitude and all else."""
+    def test_derivatives_equal_differences(self, name):
+        """In forward mode, in reverse mode and under vmap, by all parameters."""
         _, shape, gamma, rate, first, _ = CASES[name]
         simulation, _, theta = prepared(name, rate, first, step=0.04)
         model, parameters = joint(name, simulation, shape, gamma, theta)
@@ -189,13 +189,13 @@ class TestAgainstSteps:
         step = 1e-5 * torch.eye(len(parameters), dtype=torch.float64)
         near = [(model.residual(parameters + h) - model.residual(parameters - h)) / 2e-5 for h in step]
         torch.testing.assert_close(slope, torch.stack(near, -1), rtol=1e-3, atol=1e-4 * float(slope.abs().max()))
-        pull = torch.linspace(-1.0, 1.0, slope[..., 0].numel(), dtype=torch.float64).reshape(slope.shape[:-1])
+        weights = torch.linspace(-1.0, 1.0, slope[..., 0].numel(), dtype=torch.float64).reshape(slope.shape[:-1])
         wanted = parameters.clone().requires_grad_()
-        (model.residual(wanted) * pull).sum().backward()
-        torch.testing.assert_close(wanted.grad, torch.einsum("nm,nmp->p", pull, slope), rtol=1e-6, atol=1e-9)
+        (model.residual(wanted) * weights).sum().backward()
+        torch.testing.assert_close(wanted.grad, torch.einsum("nm,nmp->p", weights, slope), rtol=1e-6, atol=1e-9)
 
-    def test_the_search_sees_what_the_fit_does(self, name):
-        """The tangent of a candidate is the derivative of the joint model where the candidate has no amplitude yet."""
+    def test_tangents_of_the_search_equal_those_of_the_fit(self, name):
+        """The tangent of a candidate is the derivative of the joint model at amplitude 0."""
         _, shape, gamma, rate, first, _ = CASES[name]
         simulation, _, theta = prepared(name, rate, first, step=0.02)
         model, parameters = joint(name, simulation, shape, [0.0] * len(gamma), theta)
@@ -205,54 +205,54 @@ class TestAgainstSteps:
 
 
 class TestMemory:
-    """An internal state that an effect brings."""
+    """Internal states of effects."""
 
     def model(self, **attributes):
         _, shape, gamma, rate, first, _ = CASES["bouc_wen_hysteresis"]
         simulation, _, theta = prepared("bouc_wen_hysteresis", rate, first, **attributes)
         return joint("bouc_wen_hysteresis", simulation, shape, gamma, theta)
 
-    def test_a_constant_beside_it_does_not_act_on_its_internal_state(self):
+    def test_a_constant_force_does_not_act_on_the_internal_state(self):
         model, parameters = self.model()
         port = "hysteretic rate of speed"
         changes = model.changes(parameters)
         theta = parameters[: model.base]
         seen = model.prepared.signals(theta, changes)
-        nothing, something = (torch.full((len(seen[port]), 1), one).double() for one in (0.0, 0.1))
+        nothing, something = (torch.full((len(seen[port]), 1), value).double() for value in (0.0, 0.1))
         torch.testing.assert_close(model.residual_with_change(parameters, port, nothing), model.residual(parameters))
-        pushed = model.residual_with_change(parameters, port, something)
+        forced = model.residual_with_change(parameters, port, something)
         other = model.residual_with_change(parameters, "rate of speed", something)
-        torch.testing.assert_close(pushed, other, rtol=0.0, atol=1e-9)
+        torch.testing.assert_close(forced, other, rtol=0.0, atol=1e-9)
 
-    def test_without_it_there_is_no_internal_state(self):
+    def test_without_the_effect_there_is_no_internal_state(self):
         model, parameters = self.model()
         theta = parameters[: model.base]
         constant = {"hysteretic rate of speed": lambda s: torch.full_like(s[:, :1], 0.1)}
         assert model.prepared.trajectory(theta, constant).states.shape[1] == 2
         assert model.prepared.trajectory(theta, model.changes(parameters)).states.shape[1] == 3
 
-    def test_a_second_store_begins_like_the_first(self):
+    def test_a_second_store_starts_at_the_first(self):
         for name, like in (("hidden_lag", ("speed",)), ("hidden_mode", ("", "speed"))):
             _, shape, gamma, rate, first, _ = CASES[name]
             simulation, _, theta = prepared(name, rate, first)
             model, parameters = joint(name, simulation, shape, gamma, theta)
             begin = simulation.trajectory(theta, model.changes(parameters)).states[0]
             assert tuple(simulation.ports[CASES[name][0]].memory.values()) == like
-            assert begin[2:].tolist() == [float(first[1]) if one else 0.0 for one in like]
+            assert begin[2:].tolist() == [float(first[1]) if name else 0.0 for name in like]
 
-    def test_a_lag_of_no_time_changes_nothing(self):
+    def test_a_vanishing_lag_changes_nothing(self):
         rate, first = CASES["hidden_lag"][3:5]
         simulation, _, theta = prepared("hidden_lag", rate, first)
         plain = simulation.residual(theta, {})
         left = []
         for lag in (1e-2, 1e-3, 1e-4):
-            exchange = 1.5  # with a store that becomes ever smaller
+            exchange = 1.5  # with a vanishing store
             model, parameters = joint("hidden_lag", simulation, {"time_constant": lag}, [exchange * lag], theta)
             left.append(float((model.residual(parameters) - plain).abs().max()))
         assert left[0] > 9.0 * left[1] > 81.0 * left[2]
         assert left[2] < 1e-3
 
-    def test_a_store_that_follows_at_once_only_adds_its_capacity(self):
+    def test_a_store_with_a_short_lag_adds_its_capacity(self):
         simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
         larger = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
         whole = larger.residual(torch.cat([theta, theta.new_tensor([0.6 / 1.6])]))
@@ -260,7 +260,7 @@ class TestMemory:
         away = (whole - simulation.residual(theta, {})).abs().max()
         assert float((model.residual(parameters) - whole).abs().max()) < 0.02 * float(away)
 
-    def test_a_stiff_spring_only_adds_its_mass(self):
+    def test_a_stiff_spring_adds_its_mass(self):
         _, _, _, rate, first, _ = CASES["hidden_mode"]
         simulation, _, theta = prepared("hidden_mode", rate, first)
         heavier = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
@@ -273,8 +273,8 @@ class TestMemory:
         assert left[1] < 0.25 * left[0]
         assert left[1] < 0.05 * float((rigid - simulation.residual(theta, {})).abs().max())
 
-    def test_several_effects_remember_beside_each_other(self):
-        """Each has its own internal states, whatever else acts at that rate."""
+    def test_several_effects_have_separate_internal_states(self):
+        """Each effect has its own internal states, with any other effects at the rate."""
         names = ("bouc_wen_hysteresis", "hidden_lag", "hidden_mode")
         simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
         terms = [Term(OF[name], None, CASES[name][1], CASES[name][0]) for name in names]
@@ -284,17 +284,17 @@ class TestMemory:
         for k, name in enumerate(names):
             only = [gamma if i == k else 0.0 * gamma for i, gamma in enumerate(gammas)]
             alone, parameters = joint(name, simulation, CASES[name][1], CASES[name][2], theta)
-            beside = model.residual(torch.cat([theta, *only]))
-            torch.testing.assert_close(beside, alone.residual(parameters), rtol=0.0, atol=1e-9)
+            jointly = model.residual(torch.cat([theta, *only]))
+            torch.testing.assert_close(jointly, alone.residual(parameters), rtol=0.0, atol=1e-9)
 
-    def test_it_begins_anew_with_every_run(self):
-        """Two runs at once are each run by itself."""
+    def test_internal_states_restart_with_every_run(self):
+        """Two joint runs equal two separate runs."""
         _, shape, gamma, rate, first, _ = CASES["bouc_wen_hysteresis"]
         firsts = (first, [-0.2, 1.0, 0.0])
-        parts = [runge_kutta(rate, one, TIME)[:, 0] for one in firsts]
+        parts = [runge_kutta(rate, start, TIME)[:, 0] for start in firsts]
         both = table(
             time=np.concatenate([TIME, TIME]),
-            push=np.tile(push(TIME), 2),
+            drive=np.tile(drive(TIME), 2),
             height=np.concatenate(parts),
             experiment=np.repeat([0.0, 1.0], len(TIME)),
         )
@@ -305,7 +305,7 @@ class TestMemory:
 
 
 def test_a_recorded_spin_drives_the_lift():
-    """γ₁ at the mean spin, and γ₂ for each unit beyond."""
+    """γ₁ at the mean spin, and γ₂ per unit of deviation."""
     truth = runge_kutta(turned(lambda t: 0.01 * spun(t)), [0.0, 1.0, 20.0, 5.0], TIME)
     recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spun(TIME))
     simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
@@ -321,30 +321,30 @@ def test_a_recorded_spin_drives_the_lift():
     assert model.sizes == (2,)
 
 
-def test_what_scales_everything_is_no_added_mass():
-    """With an inertia of the simulation's own, which scales the whole rate, nothing is left of the tangent."""
+def test_added_mass_is_not_identifiable_next_to_an_inertia():
+    """An inertia of the simulation scales the whole rate: the tangent of the added mass is parallel to its tangent."""
 
     class Own(Mass):
         parameters = {"inertia": 1.0}  # noqa: RUF012
         step = 0.02
 
         def derivative(self, time, x, u, p):  # noqa: ARG002
-            return {"height": x.speed, "speed": (u.push - 4.0 * x.height - 0.3 * x.speed) / p.inertia}
+            return {"height": x.speed, "speed": (u.drive - 4.0 * x.height - 0.3 * x.speed) / p.inertia}
 
     truth = runge_kutta(mass(), [0.5, 0.0], TIME)
-    simulation = Own().prepare(table(time=TIME, push=push(TIME), height=truth[:, 0]))
+    simulation = Own().prepare(table(time=TIME, drive=drive(TIME), height=truth[:, 0]))
     theta = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     found = tangents_of(
         JointModel(simulation), theta, NoiseSettings(), (Term(OF["added_mass"], None, {}, "rate of speed"),)
     )
     own, tangent = found.nuisance[:, 0], found.candidates[0][:, 0]
-    left = tangent - own @ torch.linalg.lstsq(own, tangent).solution
-    assert float(left.norm()) < 1e-6 * float(tangent.norm())
+    remainder = tangent - own @ torch.linalg.lstsq(own, tangent).solution
+    assert float(remainder.norm()) < 1e-6 * float(tangent.norm())
 
 
 @pytest.mark.parametrize("name", ["backlash", "input_delay"])
-def test_runs_whose_clock_goes_on_do_not_see_each_other_s_inputs(name):
-    """The same runs on one clock and on clocks of their own are the same."""
+def test_runs_on_a_common_clock_have_separate_inputs(name):
+    """Runs on a common clock and on separate clocks have the same residual."""
     first, second = np.arange(60) * 0.05, 3.0 + np.arange(60) * 0.05
     torque = np.concatenate([2.0 + np.sin(3.0 * first), -2.0 + np.cos(4.0 * second)])
     theta = torch.tensor([0.3, 0.1, 0.0, -0.1, 0.0], dtype=torch.float64)
@@ -353,12 +353,12 @@ def test_runs_whose_clock_goes_on_do_not_see_each_other_s_inputs(name):
     for later in (second, second - 3.0):
         recording = table(
             time=np.concatenate([first, later]),
-            push=torque,
+            drive=torque,
             height=0.0 * torque,
             experiment=np.repeat([0.0, 1.0], 60),
         )
         simulation = type("Mass", (Mass,), {"step": 0.05})().prepare(recording)
-        model = JointModel(simulation, (Term(OF[name], None, shape, "input push"),))
+        model = JointModel(simulation, (Term(OF[name], None, shape, "input drive"),))
         simulated.append(model.residual(torch.cat([theta, theta.new_ones(1)])))
     torch.testing.assert_close(simulated[0], simulated[1], rtol=0.0, atol=1e-9)
     assert math.isfinite(float(simulated[0].abs().max()))
@@ -376,7 +376,7 @@ class Idle(Dynamics):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
 
 
-def test_an_input_that_is_not_used_moves_nothing():
+def test_an_unused_input_has_zero_tangents():
     time = torch.arange(0.0, 4.0, 0.05, dtype=torch.float64)
     recording = Recording({"time": time, "torque": torch.sin(time), "angle": torch.cos(3.0 * time)})
     simulation = Idle().prepare(recording)
@@ -385,5 +385,5 @@ def test_an_input_that_is_not_used_moves_nothing():
         for name, shape in (("input_delay", {"delay": 0.1}), ("dead_zone", {"width": 0.3, "softness": 0.1}))
     ]
     found = tangents_of(JointModel(simulation), simulation.start(), NoiseSettings(), terms).candidates
-    assert [one.shape for one in found] == [(80, 1, 1)] * 2
-    assert all(float(one.abs().max()) == 0.0 for one in found)
+    assert [tangent.shape for tangent in found] == [(80, 1, 1)] * 2
+    assert all(float(tangent.abs().max()) == 0.0 for tangent in found)

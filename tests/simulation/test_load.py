@@ -9,7 +9,7 @@ from mkc_torch.simulation.load import raised_in
 
 GOOD = """
 from mkc_torch.simulation import Dynamics
-from beside import RATE
+from neighbour import RATE
 
 class Decay(Dynamics):
     states = ("level",)
@@ -25,11 +25,11 @@ NUMBER = 3
 
 @pytest.fixture
 def file(tmp_path):
-    (tmp_path / "beside.py").write_text("RATE = 0.5\n")
+    (tmp_path / "neighbour.py").write_text("RATE = 0.5\n")
     path = tmp_path / "my.py"
     path.write_text(GOOD)
     yield path
-    sys.modules.pop("beside", None)
+    sys.modules.pop("neighbour", None)
 
 
 def test_a_class_and_an_instance(file):
@@ -53,7 +53,7 @@ def test_a_relative_path(file, monkeypatch):
         ("my.txt:Decay", "names no simulation"),
         ("other.py:Decay", "there is no such file"),
         ("my.py:Missing", "defines no `Missing`; simulations in it: Decay, ready."),
-        ("my.py:NUMBER", "is no simulation, for it has no `prepare`"),
+        ("my.py:NUMBER", "`NUMBER` is not a simulation"),
     ],
 )
 def test_what_cannot_be_loaded(file, monkeypatch, source, words):
@@ -80,27 +80,27 @@ def test_a_file_that_raises_shows_its_own_lines(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(SimulationFileError) as caught:
         load_simulation(f"{path}:Decay")
-    told = str(caught.value)
-    assert told.startswith(f"{path}: ")
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
     for word in words:
-        assert word in told
-    assert "importlib" not in told
-    assert "_simulation_my" not in sys.modules or "Decay()" in told
+        assert word in message
+    assert "importlib" not in message
+    assert "_simulation_my" not in sys.modules or "Decay()" in message
 
 
 def test_code_that_raises_while_it_simulates(tmp_path):
     path = tmp_path / "my.py"
     path.write_text(
-        GOOD.replace("from beside import RATE", "RATE = 1.0").replace("p.rate * x.level", "p.speed * x.level")
+        GOOD.replace("from neighbour import RATE", "RATE = 1.0").replace("p.rate * x.level", "p.speed * x.level")
     )
     simulation = load_simulation(f"{path}:Decay")
     time = torch.arange(0.0, 5.0, 0.1)
     with pytest.raises(AttributeError) as caught:
         simulation.prepare(Recording({"time": time, "level": torch.exp(-time)}))
-    told = str(raised_in(f"{path}:Decay", caught.value))
-    assert "Decay raised an error of its own" in told
-    assert "p.speed" in told
-    assert "dynamics.py" not in told
+    message = str(raised_in(f"{path}:Decay", caught.value))
+    assert "Decay raised an error of its own" in message
+    assert "p.speed" in message
+    assert "dynamics.py" not in message
     assert raised_in(f"{path}:Decay", ValueError("elsewhere")) is None
 
 
@@ -131,8 +131,8 @@ def test_a_derivative_that_cannot_be_used(value, words):
         Wrong(value).prepare(Recording({"time": time, "level": torch.exp(-time)}))
 
 
-def test_a_file_elsewhere_imports_what_lies_where_it_is_asked_for(tmp_path, monkeypatch):
-    """As a corrected.py among the results does with the class that it was made from."""
+def test_a_file_elsewhere_imports_modules_of_the_current_folder(tmp_path, monkeypatch):
+    """As a corrected.py in a folder of results imports its base class."""
     (tmp_path / "own_base_of_a_test.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
     results = tmp_path / "results"
     results.mkdir()
@@ -148,8 +148,8 @@ def test_a_file_elsewhere_imports_what_lies_where_it_is_asked_for(tmp_path, monk
     sys.modules.pop("own_base_of_a_test")
 
 
-def test_a_file_imports_another_one_of_its_name_and_not_itself(tmp_path, monkeypatch):
-    """As a corrected.py does that was made of a corrected.py."""
+def test_a_file_imports_another_file_of_its_name(tmp_path, monkeypatch):
+    """As a corrected.py of another corrected.py."""
     (tmp_path / "corrected.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
     results = tmp_path / "results"
     results.mkdir()
@@ -164,9 +164,9 @@ def test_a_file_imports_another_one_of_its_name_and_not_itself(tmp_path, monkeyp
     sys.modules.pop("corrected", None)
 
 
-def test_a_missing_base_is_told_with_where_to_put_it(tmp_path):
+def test_a_missing_base_is_refused_with_the_remedy(tmp_path):
     (tmp_path / "corrected.py").write_text("from nowhere_to_be_found import Base\n", encoding="utf-8")
-    with pytest.raises(SimulationFileError, match=r"put nowhere_to_be_found\.py there, or call from there"):
+    with pytest.raises(SimulationFileError, match=r"put nowhere_to_be_found\.py there"):
         load_simulation(f"{tmp_path / 'corrected.py'}:Base")
 
 

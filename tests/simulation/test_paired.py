@@ -50,7 +50,7 @@ def temperature():
     ],
     ids=["gain", "offset", "delay", "output_saturation"],
 )
-def test_what_lies_between_the_two_is_named(values, effect, size):
+def test_effects_between_simulator_and_recording_are_found(values, effect, size):
     found = diagnose(Paired(simulator()), recorded(values(times())), surrogates=19, max_findings=1)
     assert found.verdict == "explained"
     assert found.findings[0].effect == effect
@@ -58,7 +58,7 @@ def test_what_lies_between_the_two_is_named(values, effect, size):
     assert found.findings[0].parameters[0].value == pytest.approx(size, rel=0.2)
 
 
-def test_a_driver_is_named_and_corrects_another_recording():
+def test_a_driver_is_found_and_corrects_another_recording():
     drive = temperature()
     table = recorded(signal(times()) + 0.03 * (drive - 20.0), temperature=drive)
     found = diagnose(Paired(simulator()), table, surrogates=19, max_findings=1)
@@ -73,21 +73,21 @@ def test_a_driver_is_named_and_corrects_another_recording():
 
 
 @pytest.mark.e2e
-def test_clocks_that_differ_by_less_than_a_sample_are_no_finding():
+def test_clock_offsets_below_a_sample_are_not_findings():
     found = diagnose(Paired(simulator()), recorded(signal(times() + 0.02)), surrogates=19)
     assert found.verdict == "adequate"
     assert float(found.model.theta[0]) == pytest.approx(0.02, abs=0.006)
 
 
 def late(prepared, effect, port="output y"):
-    """A joint model with one effect."""
+    """A joint model with a single effect."""
     return JointModel(prepared, (Term(effect, None, {}, port),))
 
 
-def test_a_delay_is_told_in_full_and_no_clock_takes_part_of_it():
+def test_a_delay_is_complete_and_the_clock_offset_is_held():
     prepared = Paired(simulator()).prepare(recorded(signal(times() - 0.2)))
     model = late(prepared, Delay())
-    start = torch.tensor([-0.06, 0.0, 0.155], dtype=torch.float64)  # a clock that is late by most of what it may be
+    start = torch.tensor([-0.06, 0.0, 0.155], dtype=torch.float64)  # a clock with nearly its largest offset
     found = fitted(model, start, graduate=False)
     assert abs(float(found.parameters[0])) < 1e-6
     assert float(found.parameters[2]) == pytest.approx(0.2, abs=0.005)
@@ -108,7 +108,7 @@ def test_a_delay_of_one_output_of_two_leaves_the_clock_free():
     assert float(apart.prior.precision[0, 0] / prepared.prior.precision[0]) > 1e6
 
 
-def test_of_several_runs_the_clocks_differ_beside_a_delay_and_their_mean_is_held():
+def test_with_a_delay_only_the_mean_clock_offset_of_runs_is_held():
     def twice(table):
         columns = {name: torch.cat([values, values]) for name, values in table.columns.items()}
         return Recording(columns | {"experiment": torch.arange(2.0).double().repeat_interleave(len(table))})
@@ -116,19 +116,19 @@ def test_of_several_runs_the_clocks_differ_beside_a_delay_and_their_mean_is_held
     prepared = Paired(twice(simulator())).prepare(twice(recorded(signal(times()))))
     precision = late(prepared, Delay()).prior.precision
     known = float(prepared.prior.precision[0])
-    apart, mean = (precision.new_tensor(one) for one in ([1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]))
+    apart, mean = (precision.new_tensor(row) for row in ([1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]))
     assert float(apart @ precision @ apart) == pytest.approx(2.0 * known, rel=1e-6)
     assert float(mean @ precision @ mean) > 1e6 * known
     assert float(precision[2, 2]) == pytest.approx(float(prepared.prior.precision[2]))
 
 
-def test_a_drift_is_told_in_full_and_the_clocks_rate_is_held():
+def test_a_drift_is_complete_and_the_clock_rate_is_held():
     prepared = Paired(simulator()).prepare(recorded(signal(1.002 * times())))
     found = fitted(late(prepared, ClockDrift(), "all outputs"), torch.tensor([0.0, 5e-5, 0.0019]).double())
     assert abs(float(found.parameters[1])) < 1e-8
 
 
-def test_the_clocks_that_were_fitted_go_into_the_correction():
+def test_the_correction_uses_the_fitted_clocks():
     prepared = Paired(simulator()).prepare(recorded(signal(1.0001 * times() + 0.03)))
     theta = torch.tensor([0.04, 9e-5], dtype=torch.float64)
     corrected = DiagnosedModel("simulated", prepared.state, theta, (), (), Paired(simulator()))
@@ -138,7 +138,7 @@ def test_the_clocks_that_were_fitted_go_into_the_correction():
     assert torch.allclose(older(Recording({"time": times()}))["y"], signal(times()), atol=1e-3)
 
 
-def test_interpolation_meets_a_smooth_signal_and_its_slope():
+def test_interpolation_of_a_smooth_signal_and_its_slope():
     load_forward_mode()
     prepared = Paired(simulator(0.2)).prepare(recorded(signal(times())))
     at = times() + 0.013
@@ -152,7 +152,7 @@ def test_derivatives_of_the_residual():
     load_forward_mode()
     prepared = Paired(simulator()).prepare(recorded(signal(times())))
     theta = torch.tensor([0.004, 2e-5], dtype=torch.float64)
-    forward = torch.func.jacfwd(lambda one: prepared.residual(one, {}))(theta)
+    forward = torch.func.jacfwd(lambda at: prepared.residual(at, {}))(theta)
     step = torch.tensor([1e-6, 1e-8], dtype=torch.float64)
     for k in range(2):
         change = step * torch.eye(2, dtype=torch.float64)[k]
@@ -173,9 +173,9 @@ def test_columns_that_are_the_same_are_inputs():
 
 
 def test_runs_are_matched_by_their_labels():
-    def joined(one, other, name, labels):
-        run = torch.cat([torch.zeros(len(one)), torch.ones(len(other))])
-        columns = {key: torch.cat([one[key], other[key]]) for key in ("time", "y")}
+    def joined(first, second, name, labels):
+        run = torch.cat([torch.zeros(len(first)), torch.ones(len(second))])
+        columns = {key: torch.cat([first[key], second[key]]) for key in ("time", "y")}
         return Recording(columns | {"experiment": run}, name=name, labels={"experiment": labels})
 
     second = Recording({"time": times(), "y": 2.0 * signal(times())})
@@ -191,7 +191,7 @@ def test_runs_are_matched_by_their_labels():
         Paired(joined(doubled, sim, "SIM", ("a", "c"))).prepare(table)
 
 
-def test_samples_outside_the_simulated_times_are_left_out():
+def test_samples_outside_the_simulated_times_are_excluded():
     prepared = Paired(simulator(first=0.0, last=15.0)).prepare(recorded(signal(times())))
     assert len(prepared.time) == 300
     assert (
@@ -199,7 +199,7 @@ def test_samples_outside_the_simulated_times_are_left_out():
     )
 
 
-def test_tables_that_do_not_meet():
+def test_tables_without_common_times_or_columns_are_refused():
     with pytest.raises(SimulationError, match=r"REC and SIM do not meet in time: 0 to 19.95 s was recorded, 100 to "):
         Paired(simulator(first=100.0, last=120.0)).prepare(recorded(signal(times())))
     with pytest.raises(SimulationError, match=r"no column in common to compare: z there, y here. Rename"):

@@ -36,7 +36,7 @@ def recording(*, load=0.0, count=300, **more):
     [Thermistor(), Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))],
     ids=["class", "module"],
 )
-def test_what_drives_an_output_is_found(simulation):
+def test_the_driver_of_an_output_is_found(simulation):
     found = diagnose(simulation, recording(load=0.05), surrogates=19, max_findings=1)
     first = found.findings[0]
     assert (first.effect, first.drivers, first.channels) == ("driver_linear", ("current",), ("voltage",))
@@ -59,8 +59,8 @@ class Joint(Static):
         return {"angle": p.scale * u.command}
 
 
-def test_a_wrong_zero_is_an_offset_though_a_column_follows_it_a_little_better_by_chance():
-    """By three standard errors of the slope: more than another number costs, and less than a special case does."""
+def test_a_wrong_zero_is_an_offset_despite_a_chance_correlation():
+    """A slope of three standard errors: more than the penalty of a parameter, less than that of a generalisation."""
     count = 300
     g = torch.Generator().manual_seed(4)
     time = 0.02 * torch.arange(count, dtype=torch.float64)
@@ -70,15 +70,15 @@ def test_a_wrong_zero_is_an_offset_though_a_column_follows_it_a_little_better_by
     noise = noise - (noise @ trend) * trend + 3.0 * 0.01 * trend
     columns = {"time": time, "command": command, "angle": command + 0.05 + noise, "temperature": 22.0 + 3.0 * trend}
     found = diagnose(Joint(), Recording(columns), surrogates=19, max_findings=1)
-    assert [(one.effect, one.drivers) for one in found.findings] == [("offset", ())]
+    assert [(finding.effect, finding.drivers) for finding in found.findings] == [("offset", ())]
     assert found.findings[0].parameters[0].value == pytest.approx(0.05, abs=0.003)
 
 
-def test_nothing_is_missing_from_a_right_one():
+def test_a_correct_simulation_is_adequate():
     assert diagnose(Thermistor(), recording(), surrogates=19).verdict == "adequate"
 
 
-def test_a_module_computes_as_it_does_by_itself():
+def test_a_module_predicts_the_same_values():
     torch.manual_seed(0)
     module = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.BatchNorm1d(3), torch.nn.Linear(3, 1))
     before = {name: values.clone() for name, values in module.state_dict().items()}
@@ -110,10 +110,10 @@ def test_parameters_that_the_data_cannot_determine_are_named():
         def output(self, time, u, p):  # noqa: ARG002
             return {"voltage": p.upper / p.lower * u.current}
 
-    told = " ".join(Divider().prepare(recording()).warnings)
-    assert "does not determine `upper` and `lower`, but only what they are together" in told
-    assert "direction 0.71 upper + 0.71 lower" in told
-    assert "does not determine `unused`" in told
+    warnings = " ".join(Divider().prepare(recording()).warnings)
+    assert "does not determine `upper` and `lower`, but only what they are together" in warnings
+    assert "direction 0.71 upper + 0.71 lower" in warnings
+    assert "does not determine `unused`" in warnings
     assert Thermistor().prepare(recording()).warnings == ()
 
 
@@ -172,12 +172,12 @@ def test_modules_that_cannot_be_used():
         (torch.nn.Linear, r"the class Linear; make one, Linear\(\.\.\.\)"),
     ],
 )
-def test_what_is_no_module_is_refused(module, got):
+def test_other_objects_than_modules_are_refused(module, got):
     with pytest.raises(TypeError, match=rf"`module` to be a torch\.nn\.Module but got {got}"):
         Static(module, inputs=("temperature",), outputs=("voltage",))
 
 
-def test_a_text_in_place_of_names_is_refused_and_not_taken_by_its_letters():
+def test_text_is_refused_as_a_sequence_of_names():
     line = torch.nn.Linear(1, 1)
     with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got 'ab'; write \('ab',\)"):
         Static(line, inputs="ab", outputs=("voltage",))
@@ -196,7 +196,7 @@ def test_a_text_in_place_of_names_is_refused_and_not_taken_by_its_letters():
 
 
 @pytest.mark.parametrize(
-    ("value", "mend"),
+    ("value", "remedy"),
     [
         ("NEW.csv", r"read it, Recording\.read\('NEW\.csv'\)"),
         (Path("NEW.csv"), r"read it, Recording\.read\('NEW\.csv'\)"),
@@ -204,6 +204,6 @@ def test_a_text_in_place_of_names_is_refused_and_not_taken_by_its_letters():
         (Recording, r"make one, Recording\(\.\.\.\)"),
     ],
 )
-def test_what_is_no_recording_is_told_how_to_become_one(value, mend):
-    with pytest.raises(TypeError, match=f"`recording` to be a Recording but got .*; {mend}"):
+def test_other_objects_than_recordings_are_refused_with_the_remedy(value, remedy):
+    with pytest.raises(TypeError, match=f"`recording` to be a Recording but got .*; {remedy}"):
         Thermistor().prepare(value)

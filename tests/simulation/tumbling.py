@@ -1,4 +1,4 @@
-"""A sensor that is turned through all directions, by SciPy's rotations: recordings whose truth is known."""
+"""Recordings of a sensor that turns through all directions, by SciPy's rotations, with known truth."""
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ RATE = 50.0  # Hz
 
 
 def turns(time, size=(1.0, 1.0, 1.0)):
-    """Rotations from body to world; ``size`` scales the yaw, pitch and roll angles."""
+    """Rotations from the sensor frame to the world frame; ``size`` scales the yaw, pitch and roll angles."""
     yaw = 2.0 * np.pi * time / 2.9 + 0.4 * np.sin(1.1 * time)
     pitch = 2.0 * np.pi * time / 7.0 + 0.3 * np.sin(0.7 * time + 1.0)
     roll = 2.0 * np.pi * time / 5.0 + 0.3 * np.sin(0.43 * time)
@@ -21,7 +21,7 @@ def turns(time, size=(1.0, 1.0, 1.0)):
 
 
 def body_rate(time, size=(1.0, 1.0, 1.0), step=1e-5):
-    """Angular rate in the body's axes in rad/s, by central differences of the rotation itself."""
+    """Angular rate in the sensor frame in rad/s, by central differences of the rotation."""
     before, after = turns(time - step, size), turns(time + step, size)
     return (before.inv() * after).as_rotvec() / (2.0 * step)
 
@@ -40,9 +40,9 @@ def tumbling(
     moments=None,
     **columns,
 ):
-    """A recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` go into the table as they are.
+    """A recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` to the table.
 
-    ``moments`` (N,) in s are those of the motion, where they are not those of the samples.
+    ``moments`` (N,) in s are the times of the motion, if they differ from the times of the samples.
     """
     time = np.arange(N) / rate
     rotation = turns(time if moments is None else moments, size)
@@ -62,26 +62,26 @@ def tumbling(
 
 
 def resting(N, first, last, rate=RATE):
-    """Moments of a motion that rests from one sample to another."""
+    """Moments of a motion that rests between two samples."""
     steps = np.ones(N)
     steps[first:last] = 0.0
     return np.cumsum(steps) / rate
 
 
 def changed(recording, **columns):
-    """The recording with columns replaced, added, or (None) taken away."""
+    """The recording with columns replaced, added, or (None) removed."""
     table = {name: values for name, values in recording.columns.items() if columns.get(name, 0) is not None}
     added = {name: torch.as_tensor(values) for name, values in columns.items() if values is not None}
     return Recording(table | added, name=recording.name)
 
 
 def true_matrix(strength):
-    """What makes the measurement less its offset the ambient field, where that is taken to have this strength."""
+    """The calibration matrix for an ambient field of this strength."""
     return np.linalg.inv(RESPONSE) * (strength / np.linalg.norm(FIELD))
 
 
 def full_truth(strength, *tilt):
-    """Parameters of the view with a full response matrix; the tilt of the field is against where that view starts."""
+    """Parameters of the view with a full response matrix; the tilt of the field is relative to the view's start."""
     return torch.tensor([*OFFSET, *np.linalg.inv(true_matrix(strength)).ravel(), *tilt])
 
 

@@ -28,13 +28,13 @@ from mkc_torch.effects import Context
 from mkc_torch.nonlinear import minimise
 
 Selection = frozenset[int]
-"""Numbers of the reactions that have a rate of their own."""
+"""Numbers of the reactions with their own rate."""
 
 MAX_STEPS = 60
 LARGEST_STEP = 2.0
-"""Of a logarithm in one step."""
+"""Largest change of a logarithm in a step."""
 CONVERGED = 1e-9
-"""Decrease of the sum of squares in a step, below which a fit has converged."""
+"""A fit has converged when a step decreases the sum of squares by less than this."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,16 @@ class Calibration:
 
         Args:
             squares: sum of squares of the means' residuals, weighted by their number of measurements.
-            rates: number of motif-specific rates; ``a_b`` is estimated beside them.
+            rates: number of motif-specific rates; ``a_b`` is estimated in addition.
         """
         return float(calculate_aicc(self.perfect + 0.5 * squares, rates + 1, self.count, 0))
 
     def bound(self, rates: int) -> float:
-        """The least AICc of any model with so many motif-specific rates: that of a fit through all means."""
+        """Return the least possible AICc with this number of motif-specific rates: that of an exact fit."""
         return self.aicc(0.0, rates)
 
     def fitted(self, selections: Iterable[Selection], near: Fit | None = None) -> dict[Selection, Fit]:
-        """Fits by selection: the better of two starts, the shared rate and the parameters of ``near``."""
+        """Return fits by selection: the better of two starts, the shared rate and the parameters of ``near``."""
         found: dict[Selection, Fit] = {}
         by_size: dict[int, list[Selection]] = {}
         for one in selections:
@@ -87,7 +87,7 @@ class Calibration:
         return found
 
     def by_effects(self, selection: Selection) -> Fit:
-        """The same fit from all measurements, by the simulation with an effect for each motif-specific rate."""
+        """Fit all measurements by the simulation with an effect for each motif-specific rate."""
         prepared = HistoneAcetylation().prepare(recording(self.logs))
         effects = [EFFECTS[number] for number in sorted(selection)]
         nothing = prepared.time.new_zeros(len(prepared.time), 0)
@@ -109,7 +109,7 @@ class Calibration:
         return Fit(self.aicc(squares - scatter, len(selection)), parameters)
 
     def _from(self, start: Mapping[int, float], selections: Sequence[Selection]) -> list[Fit]:
-        """Fits of selections of one size; what the start lacks begins at the shared rate."""
+        """Fit selections of one size; rates that are not in the start begin at the shared rate."""
         numbers = [sorted(one) for one in selections]
         places = torch.tensor(numbers, dtype=torch.long).reshape(len(selections), -1)
         begin = [[start.get(-1, NOMINAL_LOG_RATE), *(start.get(number, 0.0) for number in one)] for one in numbers]
@@ -159,7 +159,7 @@ class Calibration:
 
 
 def _step(theta: Tensor, residual: Tensor, slopes: Tensor, damping: Tensor) -> Tensor:
-    """Damped Gauss-Newton steps (B, p); parameters at a bound that the gradient pushes outwards stay there."""
+    """Damped Gauss-Newton steps (B, p); parameters at a bound stay there if the gradient points outwards."""
     gradient = (slopes * residual.unsqueeze(-1)).sum(1)
     at_bound = theta.abs() >= LARGEST_LOG_RATE - 1e-12
     free = (~(at_bound & (theta * gradient < 0.0))).double()

@@ -5,7 +5,7 @@ and backward elimination at -1707.51; of FAMoS's searches from random models les
 test case. Here the search goes on from every model within 2 of the best so far, with swaps, from ten starts: no rate of
 its own, all 32, and random halves.
 
-It needs the package petab-select (extra `examples`). The data lie beside this file, with source and licence.
+It needs the package petab-select (extra `examples`). The data are in this folder, with source and licence.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def published() -> tuple[Selection, float]:
 
 
 def starts(count: int, seed: int) -> list[Selection]:
-    """No rate, all rates, and random halves of them."""
+    """Return the starts: no rate, all rates, and random halves."""
     generator = torch.Generator().manual_seed(seed)
     halves = [torch.rand(EFFECT_COUNT, generator=generator) < 0.5 for _ in range(max(count - 2, 0))]
     drawn = [frozenset(half.nonzero().flatten().tolist()) for half in halves]
@@ -62,7 +62,7 @@ def shares(good: Mapping[Selection, Fit]) -> list[tuple[str, float]]:
 
 
 def claimed(logs: Mapping[str, Tensor]) -> dict[str, float]:
-    """The factors that `diagnose` claims, by reaction; it learns the noise, and asks for evidence instead of AICc."""
+    """Return the factors that `diagnose` claims, by reaction; it tests the evidence instead of AICc."""
     diagnosis = diagnose(HistoneAcetylation(), recording(logs), effects=EFFECTS)
     return {finding.effect: float(torch.as_tensor(finding.parameters[0].value).exp()) for finding in diagnosis.findings}
 
@@ -73,7 +73,7 @@ def named(selection: Selection) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--starts", type=int, default=STARTS, help="searches, each from a start of its own")
+    parser.add_argument("--starts", type=int, default=STARTS, help="number of searches, each from another start")
     parser.add_argument("--seed", type=int, default=0, help="of the random starts")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)

@@ -1,8 +1,8 @@
 """Search for the best sets of effects by a criterion: forward, backward, and best first with swaps.
 
-Forward selection and backward elimination end in local optima where effects can stand in for each other. A search that
-goes on from every model that the criterion hardly tells from the best one (Burnham & Anderson 2002, 2.6: a difference
-of 2) walks through them.
+Forward selection and backward elimination end in local optima if effects can replace each other. A search that
+continues from every model close to the best by the criterion (Burnham & Anderson 2002, 2.6: a difference of 2) passes
+through them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from calibration import Calibration, Fit, Selection
 
 EFFECT_COUNT = 32
 CLOSE = 2.0
-"""AICc above the best within which models are as good: all of them are searched around."""
+"""Models within this AICc of the best are as good; the search continues from all of them."""
 
 
 NOISE = 1e-9
-"""Of AICc: less is no gain."""
+"""Smallest decrease of AICc that counts as a gain."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search ended with.
+    """Result of a search.
 
     Attributes:
         stepwise: end of forward and backward steps alone.
@@ -41,7 +41,7 @@ class Found:
 
 
 def neighbours(selection: Selection, *, swaps: bool) -> Iterable[Selection]:
-    """Sets with one effect more, with one less, and with one exchanged for another."""
+    """Return the sets with an effect added, removed, or swapped."""
     others = [number for number in range(EFFECT_COUNT) if number not in selection]
     yield from (selection | {new} for new in others)
     yield from (selection - {old} for old in selection)
@@ -50,10 +50,10 @@ def neighbours(selection: Selection, *, swaps: bool) -> Iterable[Selection]:
 
 
 class Search:
-    """A search that remembers the fits of this start.
+    """A search that caches the fits of this start.
 
     Args:
-        calibration: which fits models.
+        calibration: fits models.
         start: set of effects to begin with.
     """
 
@@ -62,13 +62,13 @@ class Search:
         self.fits = calibration.fitted([start])
 
     def step(self, forward: bool, backward: bool) -> Selection:
-        """The end of steps that add or remove the one effect by which the criterion gains most."""
+        """Add or remove the effect with the largest gain of the criterion, until there is no gain."""
         here = self.start
         while True:
             near = [
                 one
-                for one in neighbours(here, swaps=False)
-                if (forward and len(one) > len(here)) or (backward and len(one) < len(here))
+                for selected in neighbours(here, swaps=False)
+                if (forward and len(selected) > len(here)) or (backward and len(selected) < len(here))
             ]
             self._fit(near, here)
             best = min(near, key=self._aicc, default=here)
@@ -77,25 +77,27 @@ class Search:
             here = best
 
     def best_first(self) -> Found:
-        """Steps, then on from the best model not yet searched around, while one is within 2 of the best of all."""
+        """Take steps, then search around the best unsearched model, while it is within 2 of the best."""
         stepwise = self.step(forward=True, backward=True)
         best, searched = stepwise, set[Selection]()
         while True:
             limit = self._aicc(best) + CLOSE
-            waiting = [one for one, fit in self.fits.items() if fit.aicc < limit and one not in searched]
+            waiting = [selected for selected, fit in self.fits.items() if fit.aicc < limit and selected not in searched]
             if not waiting:
                 break
             here = min(waiting, key=self._aicc)
             searched.add(here)
-            near = [one for one in neighbours(here, swaps=True) if self.calibration.bound(len(one)) < limit]
+            near = [
+                selected for selected in neighbours(here, swaps=True) if self.calibration.bound(len(selected)) < limit
+            ]
             self._fit(near, here)
             best = min((best, *near), key=self._aicc)
-        good = {one: fit for one, fit in self.fits.items() if fit.aicc < self._aicc(best) + CLOSE}
+        good = {selected: fit for selected, fit in self.fits.items() if fit.aicc < self._aicc(best) + CLOSE}
         ordered = dict(sorted(good.items(), key=lambda item: item[1].aicc))
         return Found(self.fits[stepwise], best, ordered, len(self.fits), len(searched))
 
     def _fit(self, selections: Iterable[Selection], here: Selection) -> None:
-        new = dict.fromkeys(one for one in selections if one not in self.fits)
+        new = dict.fromkeys(selected for selected in selections if selected not in self.fits)
         self.fits |= self.calibration.fitted(new, self.fits[here])
 
     def _aicc(self, selection: Selection) -> float:

@@ -1,4 +1,4 @@
-"""What real magnetometers' recordings hide: diagnosed, and set beside the step that the true attitude shows.
+"""Hidden physics in recordings of real magnetometers: the diagnosis, and the step by the true attitude.
 
 Data:
     broad: Laidig et al., "BROAD - A Benchmark for Robust Inertial Orientation Estimation", Data 6(7):72 (2021),
@@ -25,7 +25,7 @@ from mkc_torch.diagnosis.result import Finding
 from mkc_torch.simulation import Magnetometer
 
 DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "magnetometer"
-"""Where the recordings lie by default: beside the project's folder."""
+"""Default folder of the recordings, next to the project's folder."""
 
 FIELD = ("mag_x", "mag_y", "mag_z")
 QUATERNION = ("q_x", "q_y", "q_z", "q_w")  # in SciPy's order
@@ -34,7 +34,7 @@ SHOWN = "broad_34_attached_magnet_3cm"
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, what is used of it, and, where a magnet is taken off, the moments between which that happens."""
+    """A recording, its view, and the interval in which a magnet is taken off, if any."""
 
     name: str
     use: str = "norm"
@@ -64,10 +64,9 @@ CASES = (
 
 
 def step_by_attitude(folder: Path, case: Case) -> npt.NDArray[np.float64]:
-    """The offset after a magnet was taken off less that before, from the true attitude by least squares.
+    """Return the step of the offset when a magnet is taken off, from the true attitude by least squares.
 
-    A constant field of the world, turned into the sensor, and one offset for each of the two parts; nothing of this
-    library but its reader.
+    The model is a constant world field in sensor axes and an offset for each part; only the reader is of this library.
     """
     assert case.taken_off is not None
     whole = Recording.read(folder / f"{case.name}.csv")
@@ -81,14 +80,14 @@ def step_by_attitude(folder: Path, case: Case) -> npt.NDArray[np.float64]:
     return solution[6:] - solution[3:6]
 
 
-def told(finding: Finding) -> str:
-    """A finding in a line: what, when, of which size, and what it gains on blocks that the fit has not seen."""
+def finding_line(finding: Finding) -> str:
+    """Return a line on a finding: effect, time, size, and its gain on held-out blocks."""
     moment = "" if finding.onset is None else f" at {finding.onset:.1f} s"
     drivers = f" by {', '.join(finding.drivers)}" if finding.drivers else ""
     size = finding.parameters[0]
     value, error = (
-        ", ".join(f"{v:.3g}" for v in np.ravel(np.array(one, dtype=float)).tolist())
-        for one in (size.value, size.standard_error)
+        ", ".join(f"{v:.3g}" for v in np.ravel(np.array(numbers, dtype=float)).tolist())
+        for numbers in (size.value, size.standard_error)
     )
     held = finding.held_out
     gain = "" if held is None else f"; residual {held.rmse_before:.3g} -> {held.rmse_after:.3g} {held.unit}"
@@ -96,7 +95,7 @@ def told(finding: Finding) -> str:
 
 
 def picture(diagnosis: Diagnosis, path: Path) -> None:
-    """The residual over time before and after, with the onset."""
+    """Draw the residual over time before and after, with the onset."""
     t = diagnosis.traces
     figure, axes = plt.subplots(2, 1, figsize=(9, 5), sharex=True, sharey=True, layout="constrained")
     for ax, residual, words in zip(axes, (t.before, t.after), ("one ellipsoid", "with what was found"), strict=True):
@@ -121,7 +120,7 @@ def main() -> None:
         diagnosis = diagnose(Magnetometer(case.use), case.recording(options.data))
         print(f"{case.name}, {case.use}: {diagnosis.verdict}, {time.perf_counter() - start:.0f} s")
         for finding in diagnosis.findings:
-            print(told(finding))
+            print(finding_line(finding))
         if case.taken_off is not None:
             print(f"  by the true attitude: {np.round(step_by_attitude(options.data, case), 2).tolist()} µT")
         if options.output and case.name == SHOWN:

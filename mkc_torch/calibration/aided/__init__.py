@@ -1,1 +1,1 @@
-"""Calibration of a sensor that hardly tilts: with a gyroscope, an attitude, or place and date."""
+"""Calibrate a sensor that hardly tilts with the aid of a gyroscope, an attitude, or place and date."""

@@ -1,4 +1,4 @@
-"""The response of a sensor that turned about the vertical, by the field of the place alone."""
+"""Fit the response of a sensor that turned about the vertical, given only the field of the place."""
 
 from __future__ import annotations
 
@@ -24,35 +24,34 @@ if TYPE_CHECKING:
 __all__ = ["chosen_by_place"]
 
 _MOST_OFF = 3.0 * SOFT_IRON
-"""Share by which the circle may be wider or narrower than the field of the place makes it: gains and soft iron are off
-by a third of that."""
+"""Largest relative difference of the circle's radius from the horizontal field of the place: three standard deviations
+of gains and soft iron."""
 
 _CLEARLY = 5.0
-"""Nats by which a simpler response has to be likelier than the full matrix, which costs little, as it is near the unit
-matrix beforehand; set on the example's seeds 0 to 29."""
+"""Advantage in log evidence, in nats, that a simpler response needs over the full matrix, whose prior near the unit
+matrix costs little; set on the example's seeds 0 to 29."""
 
 _SURE = 12.0
-"""Nats from which it is known to which side of the circle the field stands: disturbances were worth up to ten on draws
-100,100 to 100,240 of the example, to whatever side they happened to fit."""
+"""Advantage in log evidence, in nats, from which the side of the circle on which the field lies is certain.
+Disturbances added up to ten on draws 100,100 to 100,240 of the example, to either side by chance."""
 
 _REJECTED_BELOW = 0.5
-"""A sample of less than this weight counts as rejected."""
+"""Samples with a smaller weight count as rejected."""
 
 
 def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: PlaceField) -> SelectedResponse:
-    """Fit the three responses so that the field has the length of the place's, and keep the one with most evidence.
+    """Fit the three responses with the length of the place's field, and select the response with the most evidence.
 
-    The turns are taken to be about the vertical, so that the circle of the measurements has the field's horizontal part
-    for its radius and stands above or below the offset by the vertical one. Which of the two shows where the vehicle
-    tilts.
+    The turns are assumed to be about the vertical: the measurements form a circle, whose radius is the horizontal field
+    and which lies above or below the offset by the vertical field. Tilts of the vehicle show which of the two holds.
 
     Args:
-        measured: in one unit, in the order of time.
-        taken: (N,), which samples may count: of a rest a few.
+        measured: measurements in the order of time.
+        taken: mask (N,) of the samples in use; rests are thinned.
         place: the field, in the same unit.
 
     Raises:
-        NotIdentifiableError: the measurements draw no circle of the width that the field of the place has.
+        NotIdentifiableError: the measurements do not form a circle of the radius of the place's horizontal field.
     """
     rows = rows_of(taken)
     points = measured[rows]
@@ -64,16 +63,16 @@ def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: PlaceF
             first.append(_first(_model(drawn, place, sign), points, place))
     if not first:
         raise NotIdentifiableError(
-            "Not identifiable: no ellipsoid near the field of the place goes through the measurements."
+            "Not identifiable: no ellipsoid with about the field of the place fits the measurements."
         )
-    # the errors of the wrong side follow one another for longer, and each would count for less
-    best = max(first, key=lambda one: float(one.fit.log_likelihood))
+    # the residuals of the wrong side are correlated for longer and would be inflated more
+    best = max(first, key=lambda fitted: float(fitted.fit.log_likelihood))
     counted = max(best.inflation, _burst(best.fit.weights[:, 0] < _REJECTED_BELOW))
     sides = []
-    for one in first:
-        with suppress(NoFitError):  # what leaves more than the density of the other reaches over
-            sides.append(_judged(one.model, one.fit.theta, points, place, best.fit.bound, counted))
-    full = max(sides, key=lambda one: one.evidence)
+    for fitted in first:
+        with suppress(NoFitError):  # residuals beyond the bound of the better side's density
+            sides.append(_judged(fitted.model, fitted.fit.theta, points, place, best.fit.bound, counted))
+    full = max(sides, key=lambda fitted: fitted.evidence)
     model = full.model
     assert isinstance(model, LengthModel)
     judgements = [full]
@@ -82,40 +81,40 @@ def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: PlaceF
         start = simpler.start(full.fit.theta[:3], model.response(full.fit.theta))
         with suppress(NoFitError):
             judgements.append(_judged(simpler, start, points, place, best.fit.bound, counted))
-    likeliest = max(judgements, key=lambda one: one.evidence - (0.0 if one is full else _CLEARLY))
+    selected = max(judgements, key=lambda fitted: fitted.evidence - (0.0 if fitted is full else _CLEARLY))
     return SelectedResponse(
-        likeliest,
+        selected,
         full,
-        {one.model.name: one.evidence for one in judgements},
+        {fitted.model.name: fitted.evidence for fitted in judgements},
         still(len(points)),
         rows,
         points.new_zeros(ERRORS),
-        torch.stack([_either_side(full, one) for one in sides]).sum(0),
+        torch.stack([_either_side(full, fitted) for fitted in sides]).sum(0),
     )
 
 
 def _refuse_other_width(drawn: Circle, place: PlaceField) -> None:
-    """Refuse a circle that is no turn about the vertical in the field of the place."""
+    """Reject a circle that does not come from turns about the vertical in the field of the place."""
     level = place.strength * math.cos(place.inclination)
     leaning = math.hypot(LEVEL, place.inclination_error) * abs(math.sin(place.inclination))
     if abs(drawn.radius - level) <= _MOST_OFF * level + 3.0 * leaning * place.strength:
         return
     raise NotIdentifiableError(
-        f"Not identifiable: the measurements draw a circle of radius {drawn.radius:.3g} µT, and the horizontal field "
-        f"of the place is {level:.3g} µT. Turn the vehicle about its vertical axis, once round at least; check the "
+        f"Not identifiable: the measurements form a circle of radius {drawn.radius:.3g} µT, but the horizontal field "
+        f"of the place is {level:.3g} µT. Turn the vehicle about its vertical axis, at least once round; check the "
         "place and the unit."
     )
 
 
 def _model(drawn: Circle, place: PlaceField, sign: float) -> LengthModel:
-    """The full matrix, with the field's vertical part to one side of the circle."""
+    """The full matrix model, with the vertical field on the given side of the circle."""
     error = math.hypot(LEVEL, place.inclination_error)
     rises = sign * place.inclination
     return LengthModel("full matrix", place.strength, biased=False, circle=drawn, rises=rises, rises_error=error)
 
 
 def _first(model: LengthModel, points: Tensor, place: PlaceField) -> FittedResponse:
-    """The full matrix, from the offset alone: a flat response would take disturbances for tilts."""
+    """Fit the full matrix, starting from a fit of the offset: a flat response would fit disturbances as tilts."""
     offset = model.circle.center - math.sin(model.rises) * model.scale * model.circle.axis
     alone = replace(model, name="offset")
     start = alone.start(offset, model.scale * torch.eye(3, dtype=points.dtype))
@@ -137,7 +136,7 @@ def _judged(
 
 
 def _burst(rejected: Bool[Tensor, " N"]) -> float:
-    """Samples that a rejected one is rejected together with, in the mean: what disturbs them is one event.
+    """Mean length of the bursts of rejected samples, weighted by samples; a burst is a single disturbance.
 
     Example:
         >>> _burst(torch.tensor([True, False, True, True, True, False]))
@@ -148,9 +147,9 @@ def _burst(rejected: Bool[Tensor, " N"]) -> float:
     return float(runs.square().sum() / runs.sum()) if len(runs) else 1.0
 
 
-def _either_side(one: FittedResponse, other: FittedResponse) -> Float[Tensor, "p p"]:
-    """What it adds to the covariance that the field may stand to the other side of the circle."""
-    if one.evidence - other.evidence > _SURE:
-        return torch.zeros_like(one.covariance)
-    apart = one.fit.theta - other.fit.theta
+def _either_side(full: FittedResponse, other: FittedResponse) -> Float[Tensor, "p p"]:
+    """Addition to the covariance because the field may be on the other side of the circle, (p, p)."""
+    if full.evidence - other.evidence > _SURE:
+        return torch.zeros_like(full.covariance)
+    apart = full.fit.theta - other.fit.theta
     return 0.25 * torch.outer(apart, apart)

@@ -1,4 +1,4 @@
-"""A calibration with a gyroscope or an attitude in the place of the tilts that are missing."""
+"""Calibrate with a gyroscope, an attitude or the place's field, which replace the missing tilts."""
 
 from __future__ import annotations
 
@@ -43,33 +43,38 @@ ACCEL = ("accel_x", "accel_y", "accel_z")
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")
 
 MAX_HEADING_ERROR = 5.0
-"""Standard error in ° of the heading's changes, above which the turns have not determined enough for a compass."""
+"""Largest standard error of heading changes, in °, of a calibration that is good enough for a compass."""
 
 MAX_MISFIT = 0.1
-"""Share of the field that is left in each axis, from which the turns are not those of the field."""
+"""Largest residual per axis, as a share of the field, of turns that agree with the field."""
 
 HARDLY_TURNS = 0.1
-"""Share of the field within which half of the measurements stay where a sensor has hardly turned."""
+"""Radius, as a share of the field, that holds half of the measurements of a sensor that has hardly turned."""
 
-MAX_UNEXPLAINED, _FEW = 0.3, 1500
-"""Share of the field by which half of the samples may be off before gains are fitted: soft iron of 10 % and a bias of
-1 °/s leave a tenth. It is looked at on so many samples."""
+MAX_UNEXPLAINED = 0.3
+"""Largest median residual before gains are fitted, as a share of the field; soft iron of 10 % and a bias of 1 °/s cause
+0.1."""
+
+_FEW = 1500
+"""Number of samples on which that median is computed."""
 
 _KNOWN = 0.5
-"""Share of what was known beforehand, of a standard deviation, above which the recording has not determined a value."""
+"""Largest standard error, as a share of the prior's standard deviation, of a matrix entry that the data determine."""
 
 _OFFSET_KNOWN = 0.25
-"""The same of an offset, in lengths of the field."""
+"""Largest standard error of an offset that the data determine, as a share of the field."""
 
 MISALIGNED = 3.0
-"""Angle in ° between the axes of two sensors from which it is told."""
+"""Smallest angle in ° between the axes of two sensors that a warning reports."""
 
 _REJECTED_BELOW = 0.5
+"""Samples with a smaller weight count as rejected."""
+
 _AXES = "xyz"
 
 
 def aids(recording: Recording) -> tuple[str, ...]:
-    """What a recording has that stands in for tilts, the attitude first.
+    """The aids in a recording that can replace tilts: attitude before gyroscope.
 
     Example:
         >>> aids(Recording({name: torch.zeros(3) for name in ("time", *GYRO)}))
@@ -86,19 +91,19 @@ def aids(recording: Recording) -> tuple[str, ...]:
 def aided_calibration(
     recording: Recording, by: str, *, field_strength: float | None = None, place: PlaceField | None = None
 ) -> Calibration:
-    """Calibrate a sensor that hardly tilts by how it turned.
+    """Calibrate a sensor that hardly tilts by its recorded turns or by the place's field.
 
-    The measurement is ``offset + response @ field``; the field stands still in the world, or, along the rates of a
-    gyroscope, for ten seconds or half a turn. Offset, response and what a gyroscope is off by are fitted together by
-    maximum likelihood of the MKC density, and of three responses, a multiple of the identity, a diagonal and any
-    matrix, the one with the most evidence is taken. What the recording does not determine is what is likely beforehand,
-    no offset and the unit matrix, and has no standard error.
+    The measurement is ``offset + response @ field``. The field is constant in the world frame; with a gyroscope it is
+    constant for ten seconds or half a turn, once rotated by the integrated rates. Offset, response and the gyroscope's
+    errors are fitted jointly by maximum likelihood of the MKC density. Of three responses, a multiple of the identity,
+    a diagonal and a full matrix, the response with the most evidence is selected. Parameters that the recording does
+    not determine keep their prior values, zero offset and the unit matrix, and have no standard error.
 
     Args:
-        recording: as prepared for a calibration.
+        recording: recording as prepared for a calibration.
         by: "attitude", "gyroscope" or "place".
         field_strength: length of the corrected field in µT; default the geometric mean of the semi-axes.
-        place: what is known of the field, in the recording's unit; needed where it is calibrated by.
+        place: prior of the field in the recording's unit; required for "place".
 
     Raises:
         NotIdentifiableError: the turns do not explain the field, or leave a heading uncertain by more than 5°.
@@ -131,33 +136,35 @@ def aided_calibration(
     best = chosen.best
     theta, model = best.fit.theta, best.model
     response = model.response(theta)
-    # tilts are no misfit
+    # the second channel holds tilts, which are not a misfit
     off = best.fit.residual[:, :1] if by == "place" else best.fit.residual
-    left = robust_size(off) / float(torch.linalg.det(response).abs()) ** (1.0 / 3.0)
-    if left > MAX_MISFIT:
+    misfit = robust_size(off) / float(torch.linalg.det(response).abs()) ** (1.0 / 3.0)
+    if misfit > MAX_MISFIT:
         reason = (
-            "what is measured does not have the length of the place's field"
+            "the measurements do not have the length of the place's field"
             if by == "place"
-            else f"the {by} does not turn as the field does"
+            else f"the {by} does not turn like the field"
         )
         advice = (
-            "Check the place and the unit." if by == "place" else "See that both are of one sensor and of one time."
+            "Check the place and the unit."
+            if by == "place"
+            else "Check that both belong to the same sensor and the same times."
         )
         raise NotIdentifiableError(
-            f"Not identifiable: {reason}; {100.0 * left:.0f} % of the field are left in each axis, more than "
+            f"Not identifiable: {reason}; the residual in each axis is {100.0 * misfit:.0f} % of the field, more than "
             f"{100.0 * MAX_MISFIT:.0f} %. {advice}"
         )
     errors = _heading(chosen, points, whole, usable, by)
     if errors[0] > MAX_HEADING_ERROR:
         raise NotIdentifiableError(
-            f"Not identifiable: with the {by} a heading is known to {errors[0]:.0f}° only, more than "
-            f"{MAX_HEADING_ERROR:g}°. Turn the vehicle about its vertical axis, once round at least."
+            f"Not identifiable: with the {by} the standard error of a heading is {errors[0]:.0f}°, more than "
+            f"{MAX_HEADING_ERROR:g}°. Turn the vehicle about its vertical axis, at least once round."
         )
     return _result(usable, chosen, whole, by, errors, field_strength)
 
 
 def _upwards(usable: Recording, by: str) -> Float[Tensor, " 3"] | None:
-    """The middle direction of the vertical in the body's axes, by an attitude or an accelerometer; None without."""
+    """The mean upward direction in the body's axes, by an attitude or an accelerometer; None without either."""
     if by == "attitude":
         return torch.nn.functional.normalize(from_quaternion(usable.stack(*QUATERNION))[:, 2, :].mean(0), dim=0)
     if not all(name in usable for name in ACCEL):
@@ -166,35 +173,36 @@ def _upwards(usable: Recording, by: str) -> Float[Tensor, " 3"] | None:
 
 
 def _refuse_other_turns(points: Tensor, turns: Turns, by: str) -> None:
-    """Refuse turns that are not those of the field, before anything is fitted to them.
+    """Reject turns that disagree with the field, before anything is fitted to them.
 
     Raises:
-        NotIdentifiableError: with what seems to be wrong.
+        NotIdentifiableError: with the probable reason.
     """
     few = torch.arange(0, len(points), max(1, len(points) // _FEW))
     points, turns = points[few], turns.rows(few)
-    _, length, left = offset_by_turns(points, turns)
+    _, length, misfit = offset_by_turns(points, turns)
     reach = float(torch.linalg.vector_norm(points - points.median(0).values, dim=-1).median())
     if reach < HARDLY_TURNS * length:
         raise NotIdentifiableError(
-            f"Not identifiable: half of the measurements stay within {100.0 * reach / length:.0f} % of the field of "
-            "one value. Turn the vehicle about its vertical axis, once round at least."
+            f"Not identifiable: half of the measurements are within {100.0 * reach / length:.0f} % of the field of a "
+            "single value. Turn the vehicle about its vertical axis, at least once round."
         )
-    if left <= MAX_UNEXPLAINED * length:
+    if misfit <= MAX_UNEXPLAINED * length:
         return
-    # one offset for all, for it is constant
+    # a single window, because the offset is constant
     found = mounting(points, turns, torch.zeros_like(turns.window), length, by)
     if found is not None:
-        reason = f"{found.sentence} Mend that to use it."
+        reason = f"{found.sentence} Correct that to use it."
     elif by == "gyroscope":
-        reason = "See that the rates are in rad/s, and of this sensor."
+        reason = "Check that the rates are in rad/s and belong to this sensor."
     else:
         reason = (
-            "See that the quaternions turn the body into the world, in the order w, x, y, z, and are of this sensor."
+            "Check that the quaternions rotate the body to the world frame, are in the order w, x, y, z, and belong to "
+            "this sensor."
         )
     raise NotIdentifiableError(
-        f"Not identifiable: the {by} does not turn as the field does; half of the samples are off by "
-        f"{100.0 * left / length:.0f} % of the field or more. {reason}"
+        f"Not identifiable: the {by} does not turn like the field; the residual of half of the samples is "
+        f"{100.0 * misfit / length:.0f} % of the field or more. {reason}"
     )
 
 
@@ -227,7 +235,7 @@ def _result(
     strength = radius if field_strength is None else field_strength
     field = (points - theta[:3]) @ root.mT
 
-    # of any matrix, for a simpler one is likelier, not sure
+    # errors of the full matrix: a simpler response is more likely, but not certain
     full = chosen.full
 
     def derived(at: Tensor) -> Tensor:
@@ -238,7 +246,7 @@ def _result(
 
     with torch.enable_grad():
         slopes = torch.autograd.functional.jacobian(derived, full.fit.theta)
-    covariance = full.covariance if chosen.input_hold is None else full.covariance + chosen.input_hold
+    covariance = full.covariance if chosen.side_covariance is None else full.covariance + chosen.side_covariance
     spread = torch.einsum("ip,pq,iq->i", slopes, covariance, slopes).clamp(min=0.0).sqrt()
     unknown = torch.cat([spread[:3] > _OFFSET_KNOWN * radius, spread[3:] > _KNOWN * SOFT_IRON])
     known = torch.where(unknown, torch.inf, spread)
@@ -299,10 +307,10 @@ def _result(
 
 
 def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...]:
-    """Sentences about a magnetometer whose axes are not those of what says how it turns."""
-    told, response = exchanged(best.model.response(best.fit.theta), by)
-    if told:
-        return (f"{told} The matrix mends it: the corrected field is in the axes of the {by}.",)
+    """Warnings about a magnetometer whose axes differ from those of the gyroscope or attitude."""
+    sentence, response = exchanged(best.model.response(best.fit.theta), by)
+    if sentence:
+        return (f"{sentence} The matrix corrects this: the corrected field is in the axes of the {by}.",)
     angle, axis = turned_by(response)
     sure = math.degrees(float(spread[6:].square().mean().sqrt()))
     if best.model.name != "full matrix" or angle < max(MISALIGNED, 3.0 * sure):
@@ -315,7 +323,7 @@ def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...
 
 
 def _weights(chosen: SelectedResponse, points: Tensor, whole: Turns) -> Float[Tensor, " N"]:
-    """Of all samples in the direction of their stretch."""
+    """Weights of all samples in the mean direction of their window, (N,)."""
     theta, model = chosen.best.fit.theta, chosen.best.model
     at = torch.cat([theta[:-ERRORS], torch.zeros(ERRORS, dtype=theta.dtype)]) if model.biased else theta
     return model.first_weight(at, points, whole)

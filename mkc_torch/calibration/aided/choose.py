@@ -1,4 +1,4 @@
-"""Offset alone, and scale, or the full matrix: the response that the recording is evidence of."""
+"""Select the sensor's response by its evidence: offset, offset and scale, or full matrix."""
 
 from __future__ import annotations
 
@@ -23,31 +23,32 @@ if TYPE_CHECKING:
 __all__ = ["NAMES", "SelectedResponse", "chosen_response", "rows_of"]
 
 _MOST = 3000
-"""Samples that a fit takes, evenly: the offset is known to a hundredth of the noise from these, and what limits it is
-no noise."""
+"""Most samples of a fit, taken evenly; they determine the offset to a hundredth of the noise, and noise is not what
+limits it."""
 
 _ROUNDS = 2
-"""Times that the errors are taken off the rates, which are summed up anew, and that weights are those of the fit."""
+"""Number of refits after the rates are corrected and integrated again and the weights are updated."""
 
 _LEAST_WEIGHT = 1e-6
+"""Smallest weight of a sample."""
 
 NAMES: tuple[ModelName, ...] = ("offset", "offset and scale", "full matrix")
-"""From the simplest to the one that has the others as special cases."""
+"""Responses from the simplest to the most general."""
 
 
 @dataclass(frozen=True)
 class SelectedResponse:
-    """The response that was chosen, and all that were tried.
+    """The selected response, and all candidates.
 
     Attributes:
-        best: the likeliest.
-        full: the full matrix, whose standard errors are those of all that could be otherwise.
-        tried: evidence of each, in nats, by name; without those that leave far more than the full matrix does.
-        turns: with the gyroscope's bias taken off, of the rows.
-        rows: which samples the fits took.
-        errors: of the gyroscope's rates, bias in rad/s and gains; zero of an attitude.
-        input_hold: what it adds to the covariance of ``full`` that its parameters may be altogether others; they would
-            make the same headings.
+        best: the selected response.
+        full: the full matrix; its standard errors allow for every possible response.
+        tried: log evidence in nats by name; without responses whose residuals are far larger than the full matrix'.
+        turns: turns of ``rows``, corrected for the gyroscope's errors.
+        rows: indices of the samples in the fits.
+        errors: errors of the gyroscope's rates, bias in rad/s and gains; zero for an attitude.
+        side_covariance: addition to the covariance of ``full``, (p, p), because the field may be on the other side of
+            the circle; None if that is not in question. Headings are the same on either side.
     """
 
     best: FittedResponse
@@ -56,7 +57,7 @@ class SelectedResponse:
     turns: Turns
     rows: Int[Tensor, " n"]
     errors: Float[Tensor, " 12"]
-    input_hold: Float[Tensor, "p p"] | None = None
+    side_covariance: Float[Tensor, "p p"] | None = None
 
 
 def chosen_response(
@@ -67,15 +68,14 @@ def chosen_response(
     place: PlaceField | None = None,
     upwards: Float[Tensor, " 3"] | None = None,
 ) -> SelectedResponse:
-    """Fit the three responses and keep the one with the most evidence.
+    """Fit the three responses and select the response with the most evidence.
 
     Args:
-        measured: in one unit, in the order of time.
-        turns_at: the turns of all samples, at errors of the rates.
-        taken: (N,), which samples may count: of a rest a few.
-        place: what is known of the field; used where ``upwards`` is known too, for a length does not tell above from
-            below.
-        upwards: the middle direction of the vertical in the body's axes.
+        measured: measurements in the order of time.
+        turns_at: computes the turns of all samples from errors of the rates.
+        taken: mask (N,) of the samples in use; rests are thinned.
+        place: prior of the field; only used with ``upwards``, because a length does not distinguish up from down.
+        upwards: mean upward direction in the body's axes.
     """
     rows = rows_of(taken)
     points, errors = measured[rows], measured.new_zeros(ERRORS)
@@ -86,7 +86,7 @@ def chosen_response(
         place, scale = None, length
     else:
         scale = length = place.strength
-        # what turns about the vertical leave open is where the field's vertical part begins
+        # turns about the vertical leave the vertical offset undetermined
         vertical = float((points @ upwards).median()) + scale * math.sin(place.inclination)
         offset = offset + (vertical - offset @ upwards) * upwards
     full = Model("full matrix", scale, biased)
@@ -108,7 +108,7 @@ def chosen_response(
     for name in NAMES[:-1]:
         model = Model(name, scale, biased)
         start = model.start(offset, response)
-        # what leaves more than the density reaches over is no rival
+        # a response whose residuals exceed the density's bound is not a candidate
         with suppress(NoFitError):
             judgements.append(
                 judged(
@@ -123,17 +123,22 @@ def chosen_response(
                     inflation=inflation,
                 )
             )
-    likeliest = max(judgements, key=lambda one: one.evidence)
+    best_fit = max(judgements, key=lambda fitted: fitted.evidence)
     return SelectedResponse(
-        likeliest, best, {one.model.name: one.evidence for one in judgements}, turns, rows, errors + _errors(likeliest)
+        best_fit,
+        best,
+        {fitted.model.name: fitted.evidence for fitted in judgements},
+        turns,
+        rows,
+        errors + _errors(best_fit),
     )
 
 
 def rows_of(taken: Tensor) -> Int[Tensor, " n"]:
-    """Of the samples that may count, those that a fit takes."""
+    """Indices of the samples of a fit, evenly thinned from the mask of usable samples."""
     rows = taken.nonzero().flatten()
     return rows[:: max(1, -(-len(rows) // _MOST))]
 
 
-def _errors(one: FittedResponse) -> Tensor:
-    return one.fit.theta[-ERRORS:] if one.model.biased else one.fit.theta.new_zeros(ERRORS)
+def _errors(fitted: FittedResponse) -> Tensor:
+    return fitted.fit.theta[-ERRORS:] if fitted.model.biased else fitted.fit.theta.new_zeros(ERRORS)

@@ -1,4 +1,4 @@
-"""A fit of one response, its evidence, and the covariance of its parameters with what was known beforehand in it."""
+"""Fit a response with a prior, and compute its evidence and the covariance of its parameters."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["FittedResponse", "judged"]
 
 _LEAST_INFLATION = 1.0
+"""Smallest inflation of the samples' errors by autocorrelation."""
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class FittedResponse:
     """A fitted response.
 
     Attributes:
-        model: which.
-        fit: by maximum likelihood of the MKC density, with the prior.
-        covariance: of the parameters, (p, p): of the errors of the samples, which are a time series, and of what the
-            prior is off by. What the samples do not determine has the spread of the prior.
-        prior_covariance: of the prior alone, (p, p); infinite, as a large number, where it says nothing.
-        inflation: times by which the samples' errors, which follow one another, count as fewer.
-        evidence: log of the chance of the measurements by this response, over all parameters that the prior allows, in
-            nats; by Laplace's approximation. Compare at equal bounds only.
+        model: the response.
+        fit: the maximum likelihood fit of the MKC density, with the prior.
+        covariance: covariance of the parameters, (p, p), by the autocorrelated errors of the samples and by the prior.
+            Parameters that the samples do not determine have the variance of the prior.
+        prior_covariance: covariance of the prior, (p, p); very large for parameters without a prior.
+        inflation: factor by which autocorrelation reduces the effective number of samples.
+        evidence: log evidence, the log probability of the measurements averaged over the prior, in nats, by Laplace's
+            approximation. Only comparable at equal bounds.
     """
 
     model: Model
@@ -56,24 +57,24 @@ def judged(
     bound: Tensor | None = None,
     inflation: float | None = None,
 ) -> FittedResponse:
-    """Fit a response and say how likely it is.
+    """Fit a response and compute its evidence.
 
     Args:
         model: the response.
-        start: of its parameters.
-        measured: finite, in the order of time.
-        turns: of the same samples.
-        weight: with which each enters into the direction of its stretch.
-        place: what is known of the field.
-        errors: of the gyroscope, that are taken off the turns already.
-        bound: of the density, (3,), of another fit that this one is compared with.
-        inflation: times by which the samples count as fewer, of another fit; 1 if not given.
+        start: starting values of its parameters.
+        measured: finite measurements in the order of time.
+        turns: turns of the same samples.
+        weight: weight of each sample in the mean direction of its window.
+        place: prior of the field.
+        errors: errors of the gyroscope for which the turns are corrected already.
+        bound: bounds of the density, (3,), from another fit with which this fit is compared.
+        inflation: inflation from another fit; 1 if not given.
 
     References:
         MacKay, "Bayesian interpolation", Neural Computation 4 (1992), for the evidence.
     """
     known = model.prior(place, errors)
-    # errors that follow one another make the likelihood surer than it is, so what was known counts as much more
+    # autocorrelation makes the likelihood too sharp by this factor, so the prior is strengthened by the same factor
     times = 1.0 if inflation is None else inflation
     prior = GaussianPrior(known.mean, times * known.precision)
     fit = nonlinear_fit(
@@ -100,7 +101,7 @@ def judged(
     counted = data / times + precision
     far = fit.theta - known.mean
     likelihood = float(fit.log_likelihood) * len(measured) / times
-    # what the prior leaves free is as free in every response, and cancels
+    # parameters without a prior are free in every response, and cancel
     volume = torch.linalg.slogdet(precision)[1] - torch.linalg.slogdet(counted)[1]
     evidence = likelihood - 0.5 * float(far @ precision @ far) + 0.5 * float(volume)
     return FittedResponse(

@@ -1,4 +1,4 @@
-"""Where an ellipsoid is refused: what else the recording has to calibrate by."""
+"""Calibrate with the aids in a recording if the ellipsoid fit is rejected."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from mkc_torch.recording.recording import Recording, RecordingError
 __all__ = ["with_aid"]
 
 _GROUND = 0.01
-"""Standard deviation of what rock and buildings add to the field, as a share of it, and of its inclination in rad."""
+"""Standard deviation of the local anomaly by rock and buildings: of the field, as a share, and of its inclination, in
+rad."""
 
 _MANY = 0.2
-"""Share of rejected samples above which a steady sensor is a doubtful model, as for an ellipsoid."""
+"""Share of rejected samples above which a warning questions the model of a constant sensor."""
 
 _OTHER = 0.15
-"""Share by which a field is another one than the place's; gains of a chip are off by some per cent."""
+"""Relative difference from the place's field above which there is a warning; gains differ by a few per cent."""
 
 
 def with_aid(
@@ -34,16 +35,16 @@ def with_aid(
     field_strength: float | None = None,
     earth: Field | None = None,
 ) -> Calibration:
-    """The calibration by an attitude, or else by a gyroscope, with a warning that says so and why.
+    """Calibrate by an attitude, a gyroscope or the place's field, with a warning that gives the reason.
 
     Args:
-        usable: as prepared for a calibration.
-        refusal: of the ellipsoid.
+        usable: recording as prepared for a calibration.
+        refusal: the error of the ellipsoid fit.
         field_strength: length of the corrected field in µT, if given.
         earth: the field at the place of the recording.
 
     Raises:
-        NotIdentifiableError: the refusal, and why nothing of the recording stands in for what is missing.
+        NotIdentifiableError: the error of the ellipsoid fit and of each aid.
     """
     tried, place = [], _known(usable, earth)
     for by in (*aids(usable), *(["place"] if place else [])):
@@ -54,15 +55,15 @@ def with_aid(
             continue
         reason = str(refusal).removeprefix("Not identifiable: ")
         stands = "the field of the place" if by == "place" else f"the {by}"
-        told = (
-            f"The ellipsoid alone is not identifiable; {stands} stands in for the turns that are missing. "
+        explanation = (
+            f"The ellipsoid alone is not identifiable; {stands} replaces the missing turns. "
             f"{reason[:1].upper()}{reason[1:]}"
         )
         return dataclasses.replace(
             found,
             warnings=(
                 *found.warnings,
-                told,
+                explanation,
                 *([_taken(place)] if by == "place" and place else []),
                 *_rejected(found),
                 *_undetermined(found),
@@ -73,59 +74,60 @@ def with_aid(
 
 
 def _known(usable: Recording, earth: Field | None) -> PlaceField | None:
-    """The field in the recording's unit, where that is µT."""
+    """The prior of the field in the recording's unit; None if that is not µT."""
     if earth is None or usable.units["mag_x"] != "µT":
         return None
     return PlaceField(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
 
 
 def _taken(place: PlaceField) -> str:
-    """What a calibration by place and date takes for true."""
+    """The assumptions of a calibration by place and date, as a warning."""
     return (
-        "The vehicle is taken to turn on level ground, and the sensor's axes for those of the vehicle: lengths do not "
-        "tell how it is turned in it. Each degree about the vertical is one of every heading, and each that it leans "
-        f"against the vehicle up to {abs(math.tan(place.inclination)):.2g}°. Compare one heading with a known one."
+        "This assumes that the vehicle turns on level ground, and that the sensor's axes are those of the vehicle: "
+        "lengths do not determine its mounting. Each degree of rotation about the vertical is a degree in every "
+        f"heading, and each degree of tilt up to {abs(math.tan(place.inclination)):.2g}°. Compare a heading with a "
+        "known heading."
     )
 
 
 def _rejected(found: Calibration) -> tuple[str, ...]:
-    """A sentence about many samples that the turns do not explain."""
+    """A warning about many samples that the turns do not explain."""
     if found.rejected_share <= _MANY:
         return ()
     return (
-        f"{100.0 * found.rejected_share:.0f} % of the samples do not fit how the vehicle turned: currents, or a change "
-        "of the offset, may be in them, and errors may be larger than the standard errors say. `mkc diagnose` says "
-        "what changed, and when.",
+        f"{100.0 * found.rejected_share:.0f} % of the samples do not fit the vehicle's turns: they may contain fields "
+        "of currents, or a change of the offset, and errors may be larger than the standard errors. `mkc diagnose` "
+        "reports what changed and when.",
     )
 
 
 def _other(found: Calibration, earth: Field | None) -> tuple[str, ...]:
-    """A sentence about a field that is another one than the place's."""
+    """A warning about a field that differs from the place's field."""
     if earth is None or found.unit != "µT" or abs(found.radius / earth.strength - 1.0) < _OTHER:
         return ()
     return (
-        f"The field found is {found.radius:.3g} µT long, that of the place {earth.strength:.3g} µT: check the unit, "
-        "the place and what of iron is near.",
+        f"The length of the field is {found.radius:.3g} µT, but that of the place is {earth.strength:.3g} µT: check "
+        "the unit, the place, and iron nearby.",
     )
 
 
 def _undetermined(found: Calibration) -> tuple[str, ...]:
-    """What the recording does not determine, and what the calibration is good for."""
+    """A warning about what the recording does not determine, and the resulting accuracy of a heading."""
     aid = found.aid
     assert aid is not None
-    told = []
+    parts = []
     offsets = [name[-1] for name in aid.undetermined if name.startswith("offset")]
     entries = [name[-2:] for name in aid.undetermined if name.startswith("matrix")]
     if offsets:
-        told.append(f"the offset of {', '.join(offsets)}")
+        parts.append(f"the offset of {', '.join(offsets)}")
     if entries:
-        told.append("the matrix" if len(entries) == 9 else f"the matrix at {', '.join(entries)}")
-    if not told:
+        parts.append("the matrix" if len(entries) == 9 else f"the matrix at {', '.join(entries)}")
+    if not parts:
         return ()
-    constant = "" if math.isinf(aid.constant_error) else f", and a constant to {aid.constant_error:.2g}°"
-    advice = ", or give place and date of the recording, beside an attitude or an accelerometer"
+    constant = "" if math.isinf(aid.constant_error) else f", and a constant offset of it to {aid.constant_error:.2g}°"
+    advice = ", or give place and date of the recording, with an attitude or an accelerometer"
     return (
-        f"Not determined: {' and '.join(told)}, which {'is' if len(told) == 1 else 'are'} what was likely beforehand. "
-        f"A heading is good while the vehicle tilts as it did: to {aid.heading_error:.2g}°{constant}. "
+        f"Not determined: {' and '.join(parts)}, which {'keeps its' if len(parts) == 1 else 'keep their'} prior value. "
+        f"While the vehicle tilts no more than it did, a heading is known to {aid.heading_error:.2g}°{constant}. "
         f"Tilt it more{'' if aid.by == 'place' else advice}.",
     )

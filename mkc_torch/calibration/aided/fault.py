@@ -1,4 +1,4 @@
-"""What would mend recorded turns that do not turn the field: a sign, degrees, axes, a quaternion's order, a lag."""
+"""Diagnose recorded turns that disagree with the field: sign, degrees, axes, quaternion order, or lag."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope, stretches
+from mkc_torch.calibration.aided.misfit import misfit_of_attitude, misfit_of_gyroscope, stretches
 from mkc_torch.calibration.aided.rotation import from_quaternion, gaps, rotation_since
 
 if TYPE_CHECKING:
@@ -19,27 +19,33 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "z")
 
-__all__ = ["LAG", "Fault", "mend_of_attitude", "mend_of_gyroscope"]
+__all__ = ["LAG", "Fault", "attitude_fault", "gyroscope_fault"]
 
 HALVES = 0.5
-"""Of what is left, the most that a mend may leave."""
+"""Largest residual after a correction, as a share of the residual before."""
 
 _PLAIN = 1.2
-"""A plainer reason is named that leaves at most so many times what the best one leaves."""
+"""Largest residual of a simpler explanation that is preferred, in multiples of the smallest residual."""
 
 _DEGREES = math.pi / 180.0
 _OVER = 0.1
-"""Time in s over which the field's turn is compared with the recorded one."""
+"""Interval in s over which the field's turn is compared with the recorded turn."""
 
-LAG, _LAG_STEP = 2.0, 0.01
-"""Greatest shift in time that is tried, and the least step, in s."""
+LAG = 2.0
+"""Largest lag that is tried, in s."""
+
+_LAG_STEP = 0.01
+"""Smallest step between lags, in s."""
 
 _REWEIGHTED = 6
+"""Iterations of the reweighted least squares fit."""
+
 _MOST = 6000
+"""Most samples of a comparison."""
 
 
 class Fault(NamedTuple):
-    """What is wrong, as a sentence, and the size of what would be left without it, in the field's unit."""
+    """A fault as a sentence, and the size of the residual after its correction, in the field's unit."""
 
     sentence: str
     left: float
@@ -50,7 +56,7 @@ class _Trial(NamedTuple):
     left: Callable[[], float]
 
 
-def mend_of_gyroscope(
+def gyroscope_fault(
     field: Float[Tensor, "N 3"],
     time: Float[Tensor, " N"],
     rate: Float[Tensor, "N 3"],
@@ -58,15 +64,15 @@ def mend_of_gyroscope(
     first: Int[Tensor, " N"],
     left: float,
 ) -> Fault | None:
-    """What is wrong with a gyroscope's rates; None where nothing tried halves what they leave.
+    """Find the fault of a gyroscope's rates; None if no correction halves the residual.
 
     Args:
-        field: calibrated: the sensor's offset and gains taken off.
+        field: calibrated field, corrected for the sensor's offset and gains.
         time: in s, ascending.
-        rate: in rad/s, as recorded.
-        window: number of each sample's window, in which the field is steady once turned.
-        first: number of the first sample of that window.
-        left: size of what is left of the field with the rates as they are.
+        rate: rates in rad/s, as recorded.
+        window: index of each sample's window, in which the rotated field is constant.
+        first: index of the first sample of that window.
+        left: size of the residual with the recorded rates.
 
     Example:
         >>> time = torch.arange(0.0, 20.0, 0.02).double()
@@ -75,13 +81,13 @@ def mend_of_gyroscope(
         >>> first = 100 * window
         >>> turned = rotation_since(time, rate, first)
         >>> field = turned.mT @ torch.tensor([20.0, 0.0, -40.0]).double()
-        >>> mend_of_gyroscope(field, time, -rate, window, first, 10.0).sentence
+        >>> gyroscope_fault(field, time, -rate, window, first, 10.0).sentence
         'The rates seem to have the other sign.'
     """
     stretch = stretches(time)
 
     def left_with(rates: Tensor) -> float:
-        return left_by_gyroscope(field, rotation_since(time, rates, first), window, stretch)
+        return misfit_of_gyroscope(field, rotation_since(time, rates, first), window, stretch)
 
     def trials() -> Iterator[_Trial]:
         yield _Trial("The rates seem to have the other sign.", partial(left_with, -rate))
@@ -94,7 +100,7 @@ def mend_of_gyroscope(
         for scale, unit in ((1.0, ""), (_DEGREES, ", and in degrees per second")):
             for axes, sentence in _turns_near(seen):
                 yield _Trial(
-                    f"The gyroscope's axes seem to be other ones than the magnetometer's: {sentence}{unit}.",
+                    f"The gyroscope's axes seem to differ from the magnetometer's: {sentence}{unit}.",
                     partial(left_with, scale * rate @ axes.mT),
                 )
         lag = _lag(field, time, rate)
@@ -103,43 +109,44 @@ def mend_of_gyroscope(
     return _best(trials(), left)
 
 
-def mend_of_attitude(
+def attitude_fault(
     field: Float[Tensor, "N 3"], time: Float[Tensor, " N"], quaternion: Float[Tensor, "N 4"], left: float
 ) -> Fault | None:
-    """What is wrong with a recorded attitude; None where nothing tried halves what it leaves.
+    """Find the fault of a recorded attitude; None if no correction halves the residual.
 
-    Axes of its own do not matter: the response matrix of its view turns them.
+    The attitude may have other axes than the magnetometer: the response matrix includes that rotation.
 
     Args:
-        field: calibrated: the sensor's offset and gains taken off.
+        field: calibrated field, corrected for the sensor's offset and gains.
         time: in s, ascending.
         quaternion: w, x, y, z, as recorded.
-        left: size of what is left of the field with the attitude as it is.
+        left: size of the residual with the recorded attitude.
     """
     stretch = stretches(time)
     to_world = from_quaternion(quaternion)
 
     def left_with(attitude: Tensor) -> float:
-        return left_by_attitude(field, attitude, stretch)
+        return misfit_of_attitude(field, attitude, stretch)
 
     def trials() -> Iterator[_Trial]:
         yield _Trial(
-            "The quaternions seem to be the inverse of what is expected: give the conjugate, with q_x, q_y and q_z of "
-            "the other sign.",
+            "The quaternions seem to be inverted: give the conjugate, with q_x, q_y and q_z of the other sign.",
             partial(left_with, to_world.mT),
         )
         yield _Trial(
-            "The quaternions seem to be in the order x, y, z, w: name the last one q_w.",
+            "The quaternions seem to be in the order x, y, z, w: name the last column q_w.",
             partial(left_with, from_quaternion(quaternion.roll(1, -1))),
         )
         lag = _lag(field, time, _rates(time, to_world))
-        yield _Trial(_late("The attitude", lag), partial(left_with, from_quaternion(_slid(time, quaternion, lag))))
+        yield _Trial(
+            _late("The attitude", lag), partial(left_with, from_quaternion(_shifted_quaternion(time, quaternion, lag)))
+        )
 
     return _best(trials(), left)
 
 
 def _best(trials: Iterator[_Trial], left: float) -> Fault | None:
-    """The plainest of those that leave about as little as the best."""
+    """The simplest fault whose residual is about as small as the smallest; None if none halves the residual."""
     tried = [Fault(trial.sentence, trial.left()) for trial in trials]
     least = min(trial.left for trial in tried)
     if not least < HALVES * left:
@@ -150,7 +157,7 @@ def _best(trials: Iterator[_Trial], left: float) -> Fault | None:
 def _pairs(
     field: Tensor, time: Tensor, rate: Tensor, shift: float = 0.0
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Middles and changes of the field over a tenth of a second, and the turn recorded meanwhile."""
+    """Mean field, change of the field, and recorded turn over intervals of 0.1 s, (n, 3) each."""
     step = max(1, round(_OVER / float(time.diff().median())))
     broken = torch.cat([gaps(time).cumsum(0)[:1] * 0, gaps(time).cumsum(0)])
     number = torch.arange(len(time) - step)
@@ -162,14 +169,14 @@ def _pairs(
 
 
 def _turned(time: Tensor, rate: Tensor) -> Tensor:
-    """Integral of the rates."""
+    """Integrate the rates, (N, 3) in rad."""
     known = rate.nan_to_num(0.0)
     step = 0.5 * (known[1:] + known[:-1]) * time.diff().unsqueeze(-1)
     return torch.cat([torch.zeros_like(rate[:1]), step.cumsum(0)])
 
 
 def _axes(field: Tensor, time: Tensor, rate: Tensor) -> Float[Tensor, "3 3"]:
-    """The matrix that makes recorded rates those that turn the field, by robust least squares: dB = B x (A turn)."""
+    """The matrix A that maps recorded rates to those of the field, by robust least squares: dB = B x (A turn)."""
     middle, change, turn = _pairs(field, time, rate)
     zero = torch.zeros_like(middle[:, 0])
     x, y, z = middle.unbind(-1)
@@ -180,8 +187,8 @@ def _axes(field: Tensor, time: Tensor, rate: Tensor) -> Float[Tensor, "3 3"]:
     for _ in range(_REWEIGHTED):
         gram = (weight * regressors).flatten(0, 1).mT @ regressors.flatten(0, 1)
         moment = (weight * regressors).flatten(0, 1).mT @ change.flatten()
-        pull = 1e-9 * gram.diagonal().mean().clamp(min=1e-300) * torch.eye(9, dtype=gram.dtype)
-        entries = torch.linalg.solve(gram + pull, moment)
+        ridge = 1e-9 * gram.diagonal().mean().clamp(min=1e-300) * torch.eye(9, dtype=gram.dtype)
+        entries = torch.linalg.solve(gram + ridge, moment)
         left = torch.linalg.vector_norm(change - regressors @ entries, dim=-1)
         scale = 2.0 * left.median().clamp(min=1e-12)
         weight = torch.exp(-0.5 * (left / scale).square())[:, None, None]
@@ -189,7 +196,7 @@ def _axes(field: Tensor, time: Tensor, rate: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def _turns_near(seen: Float[Tensor, "3 3"]) -> Iterator[tuple[Float[Tensor, "3 3"], str]]:
-    """The exchange of axes and signs that is nearest to a matrix, and the rotation; with words for each."""
+    """Yield the nearest exchange of axes and signs to a matrix, and the nearest rotation, each with a description."""
     best, size = None, -math.inf
     for order in itertools.permutations(range(3)):
         entries = seen[torch.arange(3), list(order)]
@@ -200,11 +207,11 @@ def _turns_near(seen: Float[Tensor, "3 3"]) -> Iterator[tuple[Float[Tensor, "3 3
     exchange = torch.zeros_like(seen)
     for k, (column, sign) in enumerate(zip(order, signs, strict=True)):
         exchange[k, column] = sign
-    told = ", ".join(
+    description = ", ".join(
         f"its {AXES[k]} is {'minus ' if sign < 0 else ''}{AXES[column]} as recorded"
         for k, (column, sign) in enumerate(zip(order, signs, strict=True))
     )
-    yield exchange, told
+    yield exchange, description
     left, _, right = torch.linalg.svd(seen)
     turn = (
         left @ torch.diag(torch.stack([seen.new_ones(()), seen.new_ones(()), torch.linalg.det(left @ right)])) @ right
@@ -216,7 +223,7 @@ def _turns_near(seen: Float[Tensor, "3 3"]) -> Iterator[tuple[Float[Tensor, "3 3
 
 
 def _lag(field: Tensor, time: Tensor, rate: Tensor) -> float:
-    """By how many s the rates are to be read later, so that they turn the field best."""
+    """The lag in s of the rates that agrees best with the field; positive if the rates are late."""
     step = max(_LAG_STEP, float(time.diff().median()))
     count = int(LAG / step)
 
@@ -234,7 +241,7 @@ def _late(what: str, lag: float) -> str:
 
 
 def _shifted(time: Tensor, values: Tensor, lag: float) -> Tensor:
-    """Values at times that are later by ``lag``, linearly between samples, the first and last beyond."""
+    """Interpolate values linearly at times later by ``lag``; constant beyond the first and last sample."""
     if lag == 0.0:
         return values
     at = (time + lag).clamp(float(time[0]), float(time[-1]))
@@ -243,8 +250,8 @@ def _shifted(time: Tensor, values: Tensor, lag: float) -> Tensor:
     return torch.lerp(values[after - 1], values[after], share.clamp(0.0, 1.0).unsqueeze(-1))
 
 
-def _slid(time: Tensor, quaternion: Tensor, lag: float) -> Tensor:
-    """Quaternions at later times; of the two that are one attitude, those nearest to the ones before."""
+def _shifted_quaternion(time: Tensor, quaternion: Tensor, lag: float) -> Tensor:
+    """Interpolate quaternions at times later by ``lag``, after making their signs continuous."""
     unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     opposite = (unit[1:] * unit[:-1]).sum(-1) < 0.0
     sign = torch.cat([opposite[:1] * 0, opposite.cumsum(0) % 2]).to(unit)
@@ -252,7 +259,7 @@ def _slid(time: Tensor, quaternion: Tensor, lag: float) -> Tensor:
 
 
 def _rates(time: Tensor, to_world: Tensor) -> Tensor:
-    """Body rates of an attitude, by differences."""
+    """Body rates of an attitude in rad/s, by finite differences, (N, 3)."""
     step = to_world[:-1].mT @ to_world[1:]
     axis = 0.5 * torch.stack(
         [step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]], -1

@@ -1,4 +1,4 @@
-"""How well a heading is known by a calibration: how it changes over a level turn, and a constant."""
+"""Standard errors of a heading by a calibration: of its changes over a level turn, and of a constant offset."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 __all__ = ["heading_errors", "turning_axis"]
 
 _STEPS = 36
+"""Number of headings of the level turn."""
 
 
 def turning_axis(rate: Float[Tensor, "N 3"]) -> Float[Tensor, " 3"]:
-    """The axis of the body about which it turns for the most part, which is a vehicle's vertical.
+    """The body axis about which the sensor turns most, the vertical of a vehicle, (3,).
 
     Example:
         >>> turning_axis(torch.tensor([[0.0, 0.1, 1.0], [0.0, -0.1, -1.0], [0.1, 0.0, 1.0]]).double()).abs().round()
@@ -35,14 +36,14 @@ def heading_errors(
     field: Float[Tensor, "N 3"],
     vertical: Float[Tensor, " 3"],
 ) -> tuple[float, float]:
-    """Standard errors in ° of the heading over a whole level turn, less its mean, and of that mean; to first order.
+    """Standard errors in ° of heading changes over a level turn, and of the mean heading error; to first order.
 
     Args:
-        model: of the sensor.
+        model: model of the sensor.
         theta: its parameters.
-        covariance: of their errors.
-        field: corrected, of the recording, in the body's axes.
-        vertical: in the body's axes, a unit vector.
+        covariance: covariance of the parameters.
+        field: corrected field of the recording, in the body's axes.
+        vertical: vertical unit vector in the body's axes.
     """
     up = (field @ vertical).median()
     flat = field - (field @ vertical)[:, None] * vertical
@@ -56,12 +57,12 @@ def heading_errors(
     def heading(at: Tensor) -> Tensor:
         seen = torch.linalg.solve(model.response(at), (measured - at[:3]).mT).mT
         ahead, aside = seen @ first, seen @ second
-        # from the angle that it is, so that none jumps by a turn
+        # relative to the true angle, so that no value jumps by 2π
         return torch.atan2(angle.cos() * aside - angle.sin() * ahead, angle.cos() * ahead + angle.sin() * aside)
 
     with torch.enable_grad():
         slopes = torch.autograd.functional.jacobian(heading, theta)
     mean = slopes.mean(0, keepdim=True)
     spread = [torch.einsum("ip,pq,iq->i", rows, covariance, rows) for rows in (slopes - mean, mean)]
-    change, constant = (math.degrees(math.sqrt(max(0.0, float(one.mean())))) for one in spread)
+    change, constant = (math.degrees(math.sqrt(max(0.0, float(variance.mean())))) for variance in spread)
     return change, constant

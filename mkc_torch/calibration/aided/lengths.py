@@ -1,4 +1,4 @@
-"""What the field of a place makes of turns that nobody recorded: its length, and how far it points down."""
+"""The sensor model for unrecorded turns: it uses the length and the inclination of the place's field."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ if TYPE_CHECKING:
 __all__ = ["Circle", "LengthModel", "circle"]
 
 LEVEL = 0.035
-"""Angle in rad by which the axis of a vehicle's turns is off the vertical: roads and rivers slope by less than 3.5 %
-for the most part, and a helm that is held over leans a boat as much."""
+"""Standard deviation of the angle between the axis of a vehicle's turns and the vertical, in rad: roads and rivers
+mostly slope by less than 3.5 %, and a boat leans as much in a turn."""
 
 _STEEPEST = 0.9999
-"""Sine of the angle to the horizon beyond which there is no direction along which the field tilts."""
+"""Largest sine of the field's angle to the plane of the circle, which keeps the direction of tilting defined."""
 
 _ROUNDS = 5
+"""Iterations of the reweighted plane fit."""
 
 
 @dataclass(frozen=True)
 class Circle:
-    """The circle that the measurements of a vehicle draw as it turns about one axis.
+    """The circle of a vehicle's measurements as it turns about an axis.
 
     Attributes:
-        axis: (3,), of the turns, in the axes of the sensor, either sign.
-        center: (3,), in the plane in which most of the samples lie.
-        radius: in the unit of the measurement.
+        axis: axis of the turns in the axes of the sensor, (3,), of either sign.
+        center: centre, (3,), in the plane of most samples.
+        radius: radius in the unit of the measurement.
     """
 
     axis: Float[Tensor, " 3"]
@@ -46,15 +47,15 @@ class Circle:
 
 @dataclass(frozen=True)
 class LengthModel(Model):
-    """A sensor whose field has the length of the place's, and which turns about an axis that is vertical.
+    """A sensor in a field of known length that turns about a nearly vertical axis.
 
-    A length does not tell how the sensor is turned in the vehicle: the response is symmetric. A last parameter is the
-    angle in rad by which the axis is not vertical.
+    Lengths do not determine the mounting of the sensor, so the response is symmetric. The last parameter is the angle
+    in rad between the axis and the vertical.
 
     Attributes:
-        circle: that the measurements draw.
-        rises: angle in rad by which the field points along the circle's axis, of the sign that is tried.
-        rises_error: its standard deviation.
+        circle: circle of the measurements.
+        rises: angle of the field above the plane of the circle, in rad, of the assumed sign.
+        rises_error: standard deviation of ``rises``, in rad.
     """
 
     circle: Circle
@@ -75,11 +76,11 @@ class LengthModel(Model):
         return super().size + 1
 
     def start(self, offset: Float[Tensor, " 3"], response: Float[Tensor, "3 3"]) -> Float[Tensor, " p"]:
-        """Parameters at an offset and near a response, about a vertical axis."""
+        """Starting parameters for an offset and a response, with a vertical axis."""
         return torch.cat([super().start(offset, response), offset.new_zeros(1)])
 
     def prior(self, place: PlaceField | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
-        """As of any response, and an axis that is nearly vertical."""
+        """The prior of :meth:`Model.prior`, and of a nearly vertical axis."""
         known = super().prior(place, errors)
         precision = known.precision.clone()
         precision[-1, -1] = self.rises_error**-2
@@ -88,14 +89,14 @@ class LengthModel(Model):
     def residual(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], *_: Turns | Tensor
     ) -> Float[Tensor, "N 2"]:
-        """Distances of each measurement from the ellipsoid and, on it, from the circle that is drawn without tilts.
+        """Distance of each measurement from the ellipsoid and, along it, from the circle of an untilted turn.
 
-        In the unit of the measurement and to first order. The two are at right angles: together they are as likely on
-        either side of the circle where nothing tilts, and the first alone would not be.
+        In the unit of the measurement, to first order. The two distances are orthogonal: without tilts, the likelihood
+        is equal on either side of the circle, which the first distance alone would not ensure.
 
         References:
             Sampson, "Fitting conic sections to 'very scattered' data", Computer Graphics and Image Processing 18
-            (1982): what is off in length would be made small by a large response.
+            (1982): without the division by the slope, a large response would make length errors small.
         """
         response = self.response(theta)
         inverse = torch.linalg.inv(response)
@@ -112,15 +113,15 @@ class LengthModel(Model):
         return torch.cat([(length - 1.0) / slope, along], -1)
 
     def first_weight(self, _: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], *__: Turns) -> Float[Tensor, " N"]:
-        """One for each: no direction is taken from the samples."""
+        """Weight 1 for each sample: the model does not average directions."""
         return measured.new_ones(len(measured))
 
 
 def circle(measured: Float[Tensor, "N 3"]) -> Circle:
-    """The circle nearest to most of the measurements.
+    """Fit a circle to measurements robustly.
 
     Args:
-        measured: of a sensor that turned about one axis for the most part, in any unit.
+        measured: measurements of a sensor that mostly turned about a single axis, in any unit.
 
     Example:
         >>> angle = torch.linspace(0.0, 6.0, 90, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Whether a magnetometer's axes are those of the gyroscope or the attitude: exchanged ones and signs are named."""
+"""Compare a magnetometer's axes with those of the gyroscope or attitude, and report exchanged axes and signs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope
+from mkc_torch.calibration.aided.misfit import misfit_of_attitude, misfit_of_gyroscope
 from mkc_torch.calibration.aided.turns import Turns
 
 if TYPE_CHECKING:
@@ -18,34 +18,40 @@ if TYPE_CHECKING:
 __all__ = ["Mounting", "exchanged", "mounting", "turned_by"]
 
 EXPLAINED = 0.08
-"""Share of the field that may be left in each axis for the axes to be right: twice what soft iron of 10 % leaves."""
+"""Largest residual per axis, as a share of the field, of correct axes: twice that of soft iron of 10 %."""
 
 HALVES = 0.5
-"""Of what is left with the axes as they are, the most that other axes may leave, to be named."""
+"""Largest residual of reported other axes, as a share of the residual with the recorded axes."""
 
 _AXES = "xyz"
 
 
 class Mounting(NamedTuple):
-    """What is wrong, as a sentence, and what would be left of the field in each axis with it and without."""
+    """Wrong axes of a magnetometer.
+
+    Attributes:
+        sentence: the probable fault.
+        left: residual per axis with the recorded axes, in the field's unit.
+        corrected: residual per axis with the corrected axes, in the field's unit.
+    """
 
     sentence: str
     left: float
-    mended: float
+    corrected: float
 
 
 def mounting(
     field: Float[Tensor, "N 3"], turns: Turns, stretch: Int[Tensor, " N"], length: float, by: str
 ) -> Mounting | None:
-    """Other axes of a magnetometer that explain how its field turns; None where its own do, or none.
+    """Find axes of a magnetometer that explain how its field turns; None if its own axes do, or no axes do.
 
-    Of the 48 ways to exchange axes and signs the one is looked for that leaves the least of a field that stands still.
+    This selects, of the 48 ways to exchange axes and signs, the way with the smallest residual of a constant field.
 
     Args:
-        field: measured, of any constant offset.
-        turns: of the body.
-        stretch: number of each sample's stretch with an offset of its own, ascending.
-        length: of the field, in its unit.
+        field: measured field with any constant offset.
+        turns: turns of the body.
+        stretch: index of each sample's stretch with its own offset, ascending.
+        length: length of the field, in its unit.
         by: "gyroscope" or "attitude", for the sentence.
 
     Example:
@@ -61,29 +67,29 @@ def mounting(
         >>> yaw = torch.stack(
         ...     [torch.stack([cos, -sin, o]), torch.stack([sin, cos, o]), torch.stack([o, o, o + 1])]
         ... ).movedim(-1, 0)
-        >>> one = torch.zeros(400, dtype=torch.long)
-        >>> turns = Turns(yaw @ lean, one, None, None)
+        >>> same = torch.zeros(400, dtype=torch.long)
+        >>> turns = Turns(yaw @ lean, same, None, None)
         >>> body = turns.to_frame.mT @ torch.tensor([3.0, 4.0, 12.0]).double()
-        >>> mounting(body[:, [1, 0, 2]], turns, one, 13.0, "attitude").sentence
+        >>> mounting(body[:, [1, 0, 2]], turns, same, 13.0, "attitude").sentence
         "The magnetometer's x and y seem exchanged."
     """
 
     def left(points: Tensor) -> float:
         if turns.vertical is None:
-            return left_by_gyroscope(points, turns.to_frame, turns.window, stretch)
-        return left_by_attitude(points, turns.to_frame, stretch)
+            return misfit_of_gyroscope(points, turns.to_frame, turns.window, stretch)
+        return misfit_of_attitude(points, turns.to_frame, stretch)
 
     own = left(field)
     if own < EXPLAINED * length:
         return None
     ways = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
     tried = [(left(field[:, list(order)] * field.new_tensor(signs)), order, signs) for order, signs in ways]
-    # a turn about the axis that nothing tilts is as good: the plainest of those that leave about as little
-    least = min(one[0] for one in tried)
+    # without tilts a rotation about the axis fits equally well: choose the simplest with about the smallest residual
+    least = min(trial[0] for trial in tried)
     if not least < HALVES * own:
         return None
-    plain = [one for one in tried if one[0] <= 1.2 * least]
-    best = min(plain, key=lambda one: (sum(k != j for k, j in enumerate(one[1])), sum(s < 0 for s in one[2])))
+    plain = [trial for trial in tried if trial[0] <= 1.2 * least]
+    best = min(plain, key=lambda trial: (sum(k != j for k, j in enumerate(trial[1])), sum(s < 0 for s in trial[2])))
     return Mounting(_sentence(best[1], best[2], by), own, best[0])
 
 
@@ -96,26 +102,26 @@ def _sentence(order: tuple[int, ...], signs: tuple[float, ...], by: str) -> str:
         return f"The magnetometer's {names} seem{'' if many else 's'} to have the other sign."
     if len(moved) == 2 and not turned:
         return f"The magnetometer's {' and '.join(_AXES[k] for k in moved)} seem exchanged."
-    told = ", ".join(
+    axes = ", ".join(
         f"{_AXES[k]} is {'minus ' if signs[k] < 0 else ''}{_AXES[order[k]]} of the magnetometer" for k in range(3)
     )
-    return f"The magnetometer's axes seem to be others than the {by}'s, of which {told}."
+    return f"The magnetometer's axes seem to differ from the {by}'s, of which {axes}."
 
 
 def exchanged(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Float[Tensor, "3 3"]]:
-    """What a response says of exchanged axes and signs, empty where there are none, and the response without them.
+    """A sentence about exchanged axes and signs in a response, empty without any, and the response without them.
 
     Args:
-        response: from the field in the axes of a gyroscope or an attitude to the magnetometer's.
+        response: response from the field in the axes of a gyroscope or attitude to the magnetometer's axes.
         by: "gyroscope" or "attitude", for the sentence.
 
     Example:
-        >>> told, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), "gyroscope")
-        >>> told, rest[0].tolist()
+        >>> sentence, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), "gyroscope")
+        >>> sentence, rest[0].tolist()
         ("The magnetometer's x and y seem exchanged.", [9.0, 0.0, 0.0])
     """
     columns = torch.arange(3)
-    order = max(itertools.permutations(range(3)), key=lambda one: float(response[list(one), columns].abs().sum()))
+    order = max(itertools.permutations(range(3)), key=lambda rows: float(response[list(rows), columns].abs().sum()))
     chosen = response[list(order)]
     signs = tuple(1.0 if float(v) >= 0.0 else -1.0 for v in chosen.diagonal())
     plain = order == (0, 1, 2) and min(signs) > 0.0

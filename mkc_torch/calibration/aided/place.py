@@ -9,8 +9,11 @@ from typing import NamedTuple
 
 __all__ = ["Field", "earth_field", "parsed_date", "parsed_place"]
 
-_FIRST, _BEYOND = datetime.date(2015, 1, 1), datetime.date(2030, 1, 1)
-"""Dates that the models in ahrs cover: those of 2015, 2020 and 2025, five years each."""
+_FIRST = datetime.date(2015, 1, 1)
+"""First date of the models in ahrs: those of 2015, 2020 and 2025, valid for five years each."""
+
+_BEYOND = datetime.date(2030, 1, 1)
+"""First date after the models in ahrs."""
 
 
 class Field(NamedTuple):
@@ -22,15 +25,15 @@ class Field(NamedTuple):
 
 
 def earth_field(latitude: float, longitude: float, altitude: float, date: datetime.date) -> Field:
-    """The field by the World Magnetic Model of the date, whose coefficients lie in the package ahrs (MIT).
+    """The field of the World Magnetic Model at a place and date, by the package ahrs (MIT).
 
-    The model has a standard deviation of about 0.15 µT and 0.2°; rock and buildings add as much again and more.
+    The model has a standard deviation of about 0.15 µT and 0.2°; rock and buildings add at least as much.
 
     Args:
         latitude: north, in °.
         longitude: east, in °, from -180 to 360.
         altitude: above the ellipsoid, in m.
-        date: from 2015 to 2029.
+        date: date from 2015 to 2029.
 
     Raises:
         ValueError: a place or date out of range.
@@ -59,16 +62,16 @@ def earth_field(latitude: float, longitude: float, altitude: float, date: dateti
     except ImportError as error:
         raise ImportError("The World Magnetic Model needs ahrs: pip install 'mkc-torch[wmm]'.") from error
     model = WMM(date)
-    # not by the constructor, which takes the equator and Greenwich for no place
+    # the constructor treats latitude 0 and longitude 0 as missing
     model.magnetic_field(latitude, longitude if longitude <= 180.0 else longitude - 360.0, 1e-3 * altitude, date=date)
     return Field(1e-3 * float(model.F), math.radians(float(model.I)), math.radians(float(model.D)))
 
 
 def parsed_place(text: str) -> tuple[float, float, float]:
-    """Latitude, longitude and altitude of "LAT,LON" or "LAT,LON,ALT".
+    """Parse "LAT,LON" or "LAT,LON,ALT" to latitude and longitude in °, and altitude in m.
 
     Raises:
-        ValueError: something else.
+        ValueError: another format.
 
     Example:
         >>> parsed_place("48.1,11.6")
@@ -85,10 +88,10 @@ def parsed_place(text: str) -> tuple[float, float, float]:
 
 
 def parsed_date(text: str) -> datetime.date:
-    """A date of YYYY-MM-DD.
+    """Parse a date YYYY-MM-DD.
 
     Raises:
-        ValueError: something else.
+        ValueError: another format.
     """
     try:
         return datetime.date.fromisoformat(text.strip())

@@ -1,4 +1,4 @@
-"""What a turned sensor makes of a field: offset, and a response of one, three or nine numbers."""
+"""Models of a sensor that turns in a constant field: offset, and a response of 1, 3 or 9 parameters."""
 
 from __future__ import annotations
 
@@ -20,32 +20,33 @@ __all__ = ["ERRORS", "GYRO_BIAS", "SOFT_IRON", "Model", "ModelName", "PlaceField
 ModelName = Literal["offset", "offset and scale", "full matrix"]
 
 SOFT_IRON = 0.1
-"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix."""
+"""Prior standard deviation of the deviation of the response from the unit matrix, by soft iron, gains and
+misalignment."""
 
 OFFSET = 1.0
-"""The same of the offset, in lengths of the field: hard iron on a vehicle is seldom more."""
+"""Prior standard deviation of the offset, in lengths of the field; hard iron on a vehicle is seldom more."""
 
 _FREE = 1e-8
-"""Precision of what is not known beforehand: enough for rounding not to make it negative."""
+"""Prior precision of free parameters, which keeps the precision matrix positive despite rounding."""
 
 GYRO_BIAS = 0.02
-"""The same of a gyroscope's bias, in rad/s."""
+"""Prior standard deviation of a gyroscope's bias, in rad/s."""
 
 GYRO_GAIN = 0.01
-"""The same of a gyroscope's gains and of the angles between its axes, each as a share or in rad."""
+"""Prior standard deviation of a gyroscope's relative gain errors and of its axis angles in rad."""
 
 ERRORS = 12
-"""Parameters of a gyroscope: bias, gains and axes."""
+"""Number of error parameters of a gyroscope: bias (3), gains and axes (9)."""
 
 
 @dataclass(frozen=True)
 class PlaceField:
-    """What is known of the field at a place, in the unit of the measurement.
+    """Prior of the field at a place, in the unit of the measurement.
 
     Attributes:
         strength: length of the field.
         inclination: angle below the horizon in rad.
-        strength_error, inclination_error: standard deviations of both: of the model, and of what the ground adds to it.
+        strength_error, inclination_error: their standard deviations, by the model and local anomalies.
     """
 
     strength: float
@@ -56,15 +57,15 @@ class PlaceField:
 
 @dataclass(frozen=True)
 class Model:
-    """``measured = offset + response @ direction``, the direction of the field in the body's axes.
+    """``measured = offset + response @ direction``, with the direction of the field in the body's axes.
 
-    Parameters are the offset (3), the response over ``scale`` (1, 3 or 9), and with a gyroscope its bias (3) and what
-    its gains and axes are off (9). Offset and residual are in the unit of the measurement.
+    Parameters are the offset (3), the response over ``scale`` (1, 3 or 9), and with a gyroscope its bias (3) and the
+    errors of its gains and axes (9). Offset and residual are in the unit of the measurement.
 
     Attributes:
-        name: what of the response is free: a multiple of the identity, its diagonal, or all of it.
-        scale: a rough length of the field in the unit of the measurement.
-        biased: whether there is a gyroscope.
+        name: the free part of the response: a multiple of the identity, its diagonal, or the full matrix.
+        scale: approximate length of the field in the unit of the measurement.
+        biased: True with a gyroscope.
     """
 
     name: ModelName
@@ -73,7 +74,7 @@ class Model:
 
     @property
     def entries(self) -> Float[Tensor, "9 k"]:
-        """What the parameters of the response make of its nine entries, in columns of length 1: volumes compare."""
+        """Linear map from the parameters of the response to its entries, with columns of length 1."""
         eye = torch.eye(9, dtype=torch.float64)
         diagonal = eye[:, [0, 4, 8]]
         return {"offset": diagonal.sum(-1, keepdim=True) / 3.0**0.5, "offset and scale": diagonal, "full matrix": eye}[
@@ -82,25 +83,26 @@ class Model:
 
     @property
     def size(self) -> int:
+        """Number of parameters."""
         return 3 + self.entries.shape[1] + (ERRORS if self.biased else 0)
 
     def response(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
-        """In the unit of the measurement."""
+        """The response matrix in the unit of the measurement."""
         entries = self.scale * self.entries.to(theta)
         return (entries @ theta[3 : 3 + entries.shape[1]]).unflatten(0, (3, 3))
 
     def start(self, offset: Float[Tensor, " 3"], response: Float[Tensor, "3 3"]) -> Float[Tensor, " p"]:
-        """Parameters at an offset and near a response, and no bias."""
+        """Starting parameters for an offset and the nearest response, without gyroscope errors."""
         entries = self.entries
         found = torch.linalg.lstsq(entries, response.flatten()[:, None] / self.scale).solution[:, 0]
         return torch.cat([offset, found, offset.new_zeros(ERRORS if self.biased else 0)])
 
     def prior(self, place: PlaceField | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
-        """A response near a multiple of the identity, an offset and errors of a gyroscope near zero.
+        """Prior of a response near a multiple of the identity, with offset and gyroscope errors near zero.
 
-        ``errors`` are taken off the rates already, so that the parameters are what is left of them.
-
-        How long the field is, is not known beforehand but with a place: the mean of the diagonal is free without one.
+        Args:
+            place: prior of the field; without it the length of the field, the mean of the diagonal, is free.
+            errors: errors for which the rates are corrected already; the parameters are the remaining errors.
         """
         count, entries = self.entries.shape[1], self.entries
         precision = torch.zeros(self.size, self.size, dtype=torch.float64)
@@ -111,7 +113,7 @@ class Model:
         shape = (torch.eye(9, dtype=torch.float64) - along) / SOFT_IRON**2
         if place is not None:
             mean[3 : 3 + count] *= place.strength / self.scale
-            # gains are alike but for some per cent, the less so the longer they are averaged
+            # the mean gain has a third of the variance of a gain, plus that of the field's length
             spread = (SOFT_IRON**2 / 3.0 + (place.strength_error / place.strength) ** 2) * 3.0
             shape = shape + along / spread
         precision[3 : 3 + count, 3 : 3 + count] = entries.mT @ shape @ entries + _FREE * torch.eye(count)
@@ -125,16 +127,16 @@ class Model:
     def residual(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"]
     ) -> Float[Tensor, "N 3"]:
-        """Of the measurement, in its unit.
+        """Residual of the measurement in its unit, (N, 3).
 
         Args:
             theta: the parameters.
-            measured: of each sample.
-            turns: of each sample.
-            weight: with which each enters into the direction of its stretch; constant, so that slopes are exact.
+            measured: measurement of each sample.
+            turns: turns of the samples.
+            weight: weight of each sample in the mean direction of its window; constant, so that derivatives are exact.
         """
         response = self.response(theta)
-        # not the measured field, whose noise would shrink the response, but what each stretch shows on the whole
+        # use the mean field of each window: the noise of a single sample would shrink the response
         along, turned = self._along(theta, measured, turns)
         direction = steady(along, turns, weight)
         direction = (direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True))[turns.window]
@@ -146,7 +148,7 @@ class Model:
     def first_weight(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns
     ) -> Float[Tensor, " N"]:
-        """Weights to begin with: of the distances from a robust middle of each stretch."""
+        """Initial weights of the samples, by their distance from the robust mean field of their window, (N,)."""
         along, _ = self._along(theta, measured, turns)
         weight = along.new_ones(len(along))
         for cut in (2.0, 1.0, 1.0, 1.0):
@@ -155,18 +157,18 @@ class Model:
         return weight
 
     def _along(self, theta: Tensor, measured: Tensor, turns: Turns) -> tuple[Tensor, Tensor | None]:
-        """The field in the axes of its stretch, in its own lengths, and what errors of the rates turned it by."""
+        """The unit field in the axes of its window, and the rotation in rad by errors of the rates."""
         field = torch.linalg.solve(self.response(theta), (make_dual(measured, theta[0]) - theta[:3]).mT).mT
         along = (turns.to_frame @ field.unsqueeze(-1)).squeeze(-1)
         if turns.summed is None:
             return along, None
-        # an error of the rates, small, turns what has been summed up by its integral
+        # a small error of the rates rotates the integrated attitude by its integral
         turned = turns.summed @ theta[-ERRORS:]
         return along - torch.linalg.cross(turned, along), turned
 
 
 def steady(along: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"]) -> Float[Tensor, "W 3"]:
-    """The weighted mean of each stretch."""
+    """The weighted mean of each window, (W, 3)."""
     share = weight.unsqueeze(-1)
     total = share.new_zeros(turns.count, 1).index_add(0, turns.window, share)
     part = make_dual(share / total[turns.window], along[0, 0])

@@ -1,4 +1,4 @@
-"""Rotations from quaternions and rates."""
+"""Rotations from quaternions and angular rates."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 __all__ = ["from_quaternion", "gaps", "rotated", "rotation_since", "turns"]
 
 _GAP = 5.0
-"""Median intervals beyond which nobody knows how a gyroscope turned in between."""
+"""Longest interval over which rates are integrated, in median intervals."""
 
 
 def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices from body to world of quaternions (w, x, y, z) of any length but 0.
+    """Rotation matrices from the body to the world frame, of quaternions (w, x, y, z) of nonzero length.
 
     Example:
         >>> from_quaternion(torch.tensor([2.0, 0.0, 0.0, 0.0])) @ torch.tensor([1.0, 2.0, 3.0])
@@ -33,7 +33,7 @@ def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
 
 
 def rotated(vectors: Float[Tensor, "N 3"], by: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3"]:
-    """Each vector by a matrix of its own.
+    """Multiply each vector by its own matrix.
 
     Example:
         >>> rotated(torch.tensor([[1.0, 2.0, 3.0]]), 2.0 * torch.eye(3).unsqueeze(0))
@@ -50,14 +50,14 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _steps(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tensor, "n 4"]:
-    """Quaternions of the turn from each sample to the next."""
+    """Quaternions of the rotation between consecutive samples."""
     turn = 0.5 * (rate[1:] + rate[:-1]) * time.diff().unsqueeze(-1)
     angle = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
     return torch.cat([torch.cos(0.5 * angle), 0.5 * torch.sinc(0.5 * angle / torch.pi) * turn], -1)
 
 
 def gaps(time: Float[Tensor, " N"]) -> Bool[Tensor, " n"]:
-    """Whether each interval between samples is too long for the rates at its ends to tell the turn in it.
+    """Mask of the intervals that are too long for integrating the rates at their ends, (N - 1,).
 
     Example:
         >>> gaps(torch.tensor([0.0, 0.1, 0.2, 0.3, 1.3, 1.4]))
@@ -68,17 +68,17 @@ def gaps(time: Float[Tensor, " N"]) -> Bool[Tensor, " n"]:
 
 
 def turns(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices from the body at each sample but the first to the body at the one before, from a gyroscope."""
+    """Rotation matrices from the body at each sample to the body at the previous sample, by a gyroscope."""
     return from_quaternion(_steps(time, rate))
 
 
 def rotation_since(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], first: Tensor) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices from the body at each sample to the body at sample ``first`` of its window, from a gyroscope.
+    """Rotation matrices from the body at each sample to the body at sample ``first`` of its window, by a gyroscope.
 
     Args:
         time: in s, ascending.
         rate: angular rate in the body's axes, in rad/s.
-        first: for each sample the index of the first one of its window; windows are runs of samples.
+        first: for each sample the index of the first sample of its window; windows are consecutive samples.
 
     Example:
         >>> time = torch.linspace(0.0, 1.0, 101)

@@ -1,4 +1,4 @@
-"""A robust offset to start from: the one that leaves the field of each stretch steady."""
+"""Estimate a robust starting offset that makes the field of each window constant."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ if TYPE_CHECKING:
 
 __all__ = ["offset_by_turns"]
 
-_ABSOLUTE, _REWEIGHTED = 15, 15
-"""Steps of least absolute distances, and then of Welsch's estimator, which forgets what is far."""
+_ABSOLUTE = 15
+"""Iterations of least absolute distances."""
 
-_PULL = 1e-4
-"""Towards no offset, of what moves it most: enough where nothing turns, and nothing where something does."""
+_REWEIGHTED = 15
+"""Iterations of Welsch's redescending estimator that follow."""
+
+_RIDGE = 1e-4
+"""Relative regularisation towards zero offset, which only matters along directions that the turns do not determine."""
 
 
 def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float[Tensor, " 3"], float, float]:
-    """Offset, length of the field, and what is left, of a sensor whose response is a multiple of the identity.
+    """Estimate offset, field length and residual of a sensor whose response is a multiple of the identity.
 
-    A field that turns with the body, less the offset, stands still once it is turned back: linear equations for the
-    offset. Where the sensor turns about one axis alone, the offset along it shows nowhere, and is taken for 0.
+    The measured field minus the offset is constant once it is rotated back, which gives linear equations for the
+    offset. If the sensor only turns about a single axis, the offset along that axis is undetermined and set to 0.
 
     Args:
-        measured: in any unit.
-        turns: of the body.
+        measured: measurements in any unit.
+        turns: turns of the body.
 
     Returns:
-        Offset, length of the field without it, and by how much half of the samples are off a field that stands still,
-        in the unit of the measurement.
+        Offset (3,), length of the field, and median residual of a constant field, in the unit of the measurement.
 
     References:
         Kok & Schön, "Magnetometer calibration using inertial sensors", IEEE Sensors Journal 16 (2016), use the same
@@ -44,24 +46,24 @@ def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float
     size = float(torch.linalg.vector_norm(measured, dim=-1).median()) or 1.0
     weight = measured.new_ones(len(measured), 1)
     offset = measured.new_zeros(3)
-    left = measured.new_zeros(1)
+    residual = measured.new_zeros(1)
     for step in range(_ABSOLUTE + _REWEIGHTED):
         target = seen - _mean(seen, weight, turns)
         by = turned - _mean(turned.flatten(1), weight, turns).unflatten(-1, (3, 3))
         gram = torch.einsum("kai,k,kaj->ij", by, weight[:, 0], by)
         moment = torch.einsum("kai,k,ka->i", by, weight[:, 0], target)
-        pull = _PULL * torch.linalg.eigvalsh(gram)[-1].clamp(min=1e-12 * len(seen)) * torch.eye(3, dtype=gram.dtype)
-        offset = torch.linalg.solve(gram + pull, moment)
-        left = torch.linalg.vector_norm(target - by @ offset, dim=-1, keepdim=True)
+        ridge = _RIDGE * torch.linalg.eigvalsh(gram)[-1].clamp(min=1e-12 * len(seen)) * torch.eye(3, dtype=gram.dtype)
+        offset = torch.linalg.solve(gram + ridge, moment)
+        residual = torch.linalg.vector_norm(target - by @ offset, dim=-1, keepdim=True)
         if step < _ABSOLUTE:
-            weight = 1.0 / left.clamp(min=1e-3 * size)
+            weight = 1.0 / residual.clamp(min=1e-3 * size)
         else:
-            scale = 2.0 * left.median().clamp(min=1e-9 * size)
-            weight = torch.exp(-0.5 * (left / scale).square()).clamp(min=1e-9)
-    return offset, float(torch.linalg.vector_norm(measured - offset, dim=-1).median()), float(left.median())
+            scale = 2.0 * residual.median().clamp(min=1e-9 * size)
+            weight = torch.exp(-0.5 * (residual / scale).square()).clamp(min=1e-9)
+    return offset, float(torch.linalg.vector_norm(measured - offset, dim=-1).median()), float(residual.median())
 
 
 def _mean(values: Tensor, weight: Tensor, turns: Turns) -> Tensor:
-    """Of each sample's stretch."""
+    """Weighted mean of each sample's window, (N, k)."""
     total = values.new_zeros(turns.count, values.shape[-1]).index_add(0, turns.window, weight * values)
     return (total / weight.new_zeros(turns.count, 1).index_add(0, turns.window, weight))[turns.window]

@@ -1,4 +1,4 @@
-"""How a sensor was turned, as a gyroscope or an attitude says, in stretches in which the field is one vector."""
+"""Turns of a sensor by a gyroscope or an attitude, in windows in which the field is constant."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 __all__ = ["Turns", "still", "turns_of_attitude", "turns_of_gyroscope"]
 
 WINDOW = 10.0
-"""Longest stretch in s over which the rotation of a gyroscope is trusted: its noise makes 0.1° of it."""
+"""Longest window of integrated rates, in s; the gyroscope's noise causes an error of 0.1° in it."""
 
 HALF_A_TURN = math.pi
-"""Angle in rad at which a stretch ends too: what a gain wrong by one per cent makes of it is 2°, of which the stretch's
-own direction takes up half."""
+"""Largest turn of a window, in rad; a gain error of 1 % causes 2°, half of which the window's mean absorbs."""
 
 _FEWEST = 5
+"""Fewest samples of a window."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Turns:
     """Rotations of N samples.
 
     Attributes:
-        to_frame: (N, 3, 3), from the body at each sample to axes that stand still within its stretch.
-        window: (N,), number of the stretch, ascending.
-        summed: (N, 3, 12), rotation in rad since the stretch's first sample, in its axes, by each error of the rates:
-            a bias of each axis in rad/s, and the nine entries, row by row, of gains and axes that are off; None of an
-            attitude, which has none.
-        vertical: (3,), upwards in axes that do not depend on the stretch; None where they do, as those of a gyroscope.
+        to_frame: rotations from the body at each sample to axes that are fixed within its window, (N, 3, 3).
+        window: index of each sample's window, ascending, (N,).
+        summed: rotation in rad since the window's first sample, in its axes, per unit of each error of the rates: the
+            bias of each axis in rad/s, and the nine entries, row by row, of the errors of gains and axes, (N, 3, 12);
+            None for an attitude.
+        vertical: upward direction in axes that are common to all windows, (3,); None for a gyroscope.
     """
 
     to_frame: Float[Tensor, "N 3 3"]
@@ -47,11 +47,11 @@ class Turns:
 
     @property
     def count(self) -> int:
-        """Number of stretches."""
+        """Number of windows."""
         return int(self.window[-1]) + 1
 
     def rows(self, chosen: Int[Tensor, " n"]) -> Turns:
-        """Of some samples; stretches without any go."""
+        """Turns of the chosen samples; empty windows are dropped."""
         _, window = torch.unique_consecutive(self.window[chosen], return_inverse=True)
         summed = None if self.summed is None else self.summed[chosen]
         return Turns(self.to_frame[chosen], window, summed, self.vertical)
@@ -60,13 +60,14 @@ class Turns:
 def turns_of_gyroscope(
     time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], runs: tuple[slice, ...], errors: Float[Tensor, " 12"]
 ) -> Turns:
-    """Turns by angular rates, from the first sample of each stretch of ten seconds or half a turn.
+    """Integrate angular rates from the first sample of each window of ten seconds or half a turn.
 
     Args:
         time: in s, ascending within each run.
         rate: in rad/s, in the body's axes.
-        runs: where each run lies.
-        errors: bias in rad/s and, row by row, the matrix of gains and axes less the identity, taken off the rates.
+        runs: rows of each run.
+        errors: bias in rad/s and, row by row, the matrix of gains and axes minus the identity, subtracted from the
+            rates.
 
     Example:
         >>> time = torch.linspace(0.0, 1.0, 101).double()
@@ -82,23 +83,23 @@ def turns_of_gyroscope(
         w = w - w @ gains.mT
         window, first = _stretches(t, w)
         turned = rotation_since(t, w, first)
-        # what a gain of row i for axis j adds: the axis i, turned along, times the rate about j
+        # effect of the gain error (i, j): the rotated axis i times the rate about j
         by = torch.cat([turned, torch.einsum("kai,kj->kaij", turned, w).flatten(2)], -1)
         step = 0.5 * (by[1:] + by[:-1]) * t.diff()[:, None, None]
         total = torch.cat([torch.zeros_like(by[:1]), step.cumsum(0)])
         frames.append(turned)
         windows.append(window + count)
-        # between stretches the axes differ, but what was summed before one's first sample is taken off
+        # the axes differ between windows, but the sum before the window's first sample is subtracted
         sums.append(total - total[first])
         count += int(window[-1]) + 1
     return Turns(torch.cat(frames), torch.cat(windows), torch.cat(sums), None)
 
 
 def turns_of_attitude(quaternion: Float[Tensor, "N 4"]) -> Turns:
-    """Turns into the world by a recorded attitude, one stretch.
+    """Turns into the world frame by a recorded attitude, in a single window.
 
     Args:
-        quaternion: w, x, y, z of any length but 0, from the body to a world whose third axis points upwards.
+        quaternion: w, x, y, z of nonzero length, from the body to a world frame whose third axis points upwards.
     """
     to_world = from_quaternion(quaternion)
     window = torch.zeros(len(quaternion), dtype=torch.int64)
@@ -106,7 +107,7 @@ def turns_of_attitude(quaternion: Float[Tensor, "N 4"]) -> Turns:
 
 
 def still(count: int) -> Turns:
-    """No turns at all, of so many samples, where none are known.
+    """Identity rotations of ``count`` samples, for unknown turns.
 
     Example:
         >>> still(2).to_frame[1].tolist()
@@ -117,7 +118,7 @@ def still(count: int) -> Turns:
 
 
 def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-    """The stretch of each sample, and the first sample of that stretch; a gap starts a new one."""
+    """The window of each sample, and the first sample of that window; a gap starts a new window."""
     if len(time) == 1:
         zero = torch.zeros(1, dtype=torch.int64)
         return zero, zero
@@ -128,7 +129,7 @@ def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
     while begins[-1] < len(times):
         begin = begins[-1]
         far = min(_first_beyond(times, begin, WINDOW), _first_beyond(angle, begin, HALF_A_TURN))
-        # a gap ends a stretch of any length
+        # a gap ends a window of any length
         begins.append(min(max(far, begin + _FEWEST), broken[bisect_right(broken, begin)]))
     first = torch.tensor(begins[:-1])
     count = torch.tensor(begins).diff()
@@ -136,7 +137,7 @@ def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _first_beyond(values: list[float], begin: int, reach: float) -> int:
-    """The first place from ``begin`` on at which ascending values are more than ``reach`` above those there.
+    """The first index from ``begin`` at which ascending values exceed the value at ``begin`` by more than ``reach``.
 
     Example:
         >>> _first_beyond([0.0, 1.0, 2.0, 3.0], 1, 1.5)

@@ -1,4 +1,4 @@
-"""Calibrations in the form that others take, a kind a file; a new one is an :class:`Export` in ``EXPORTS``."""
+"""Export calibrations to the formats of other programs, a module each; add an :class:`Export` to ``EXPORTS``."""
 
 from __future__ import annotations
 
@@ -27,4 +27,4 @@ __all__ = [
 ]
 
 EXPORTS: dict[str, Export] = {export.name: export for export in (PX4, ARDUPILOT, C_HEADER, ROS_YAML, JSON)}
-"""All kinds, by the name that the command line has for them."""
+"""All exports by their name on the command line."""

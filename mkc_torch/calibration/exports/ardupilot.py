@@ -1,14 +1,14 @@
-"""ArduPilot: a parameter file of Mission Planner and MAVProxy with ``COMPASS_*``.
+"""Export to ArduPilot: a parameter file of Mission Planner and MAVProxy with ``COMPASS_*``.
 
-What ArduPilot computes, in milligauss and in the vehicle's axes (ardupilot, ``libraries/AP_Compass/
+ArduPilot computes, in milligauss and in the vehicle's axes (ardupilot, ``libraries/AP_Compass/
 AP_Compass_Backend.cpp``, ``accumulate_sample`` and ``correct_field``)::
 
     field = [DIA, ODI] * (SCALE * (reading + OFS)) + MOT * current
 
 The matrix is symmetric, with ``COMPASS_DIA_X`` … on its diagonal and ``ODI_X`` = xy, ``ODI_Y`` = xz, ``ODI_Z`` = yz.
-Offsets are added. ``SCALE`` counts input_hold 1/1.5 and 1.5 alone (``Compass::have_scale_factor``). ``MOT`` acts where
-``COMPASS_MOTCT`` is 2, by the battery's current in A, and on the corrected field. ArduPilot finds ``COMPASS_DEV_ID`` by
-itself, so it is not written.
+Offsets are added. ``SCALE`` has an effect only between 1/1.5 and 1.5 (``Compass::have_scale_factor``). ``MOT`` has an
+effect if ``COMPASS_MOTCT`` is 2; it is multiplied by the battery's current in A and added to the corrected field.
+ArduPilot finds ``COMPASS_DEV_ID`` by itself, so it is not written.
 """
 
 from __future__ import annotations
@@ -32,24 +32,28 @@ _INSTANCES = 3
 _SCALE = (1.0 / 1.5, 1.5)
 """``COMPASS_MIN_SCALE_FACTOR`` and ``COMPASS_MAX_SCALE_FACTOR`` (``AP_Compass_config.h``)."""
 
-_DIAGONAL, _OFF_DIAGONAL = (0.2, 5.0), 1.0
-"""What ArduPilot's own calibration accepts (``CompassCalibrator::fit_acceptable``)."""
+_DIAGONAL = (0.2, 5.0)
+"""Range of ``DIA`` that ArduPilot's own calibration accepts (``CompassCalibrator::fit_acceptable``)."""
+
+_OFF_DIAGONAL = 1.0
+"""Upper bound of ``ODI`` that ArduPilot's own calibration accepts (``CompassCalibrator::fit_acceptable``)."""
 
 _OFFSET = 1800.0
-"""Largest offset in mG with which a vehicle arms (``AP_COMPASS_OFFSETS_MAX_DEFAULT``; ``COMPASS_OFFS_MAX`` sets it)."""
+"""Largest offset in mG with which a vehicle arms (``AP_COMPASS_OFFSETS_MAX_DEFAULT``; set by ``COMPASS_OFFS_MAX``)."""
 
 _MOTOR = 1000.0
-"""Range of ``COMPASS_MOT_X`` in mG/A (``AP_Compass.cpp``)."""
+"""Largest magnitude of ``COMPASS_MOT_X`` in mG/A (``AP_Compass.cpp``)."""
 
 _FIELD = (185.0, 875.0)
-"""Field in mG with which a vehicle arms (``AP_ARMING_COMPASS_MAGFIELD_MIN`` and ``_MAX``, ``AP_Arming.cpp``)."""
+"""Range of the field in mG with which a vehicle arms (``AP_ARMING_COMPASS_MAGFIELD_MIN`` and ``_MAX``,
+``AP_Arming.cpp``)."""
 
 
 def text(correction: SensorCorrection, to: Destination) -> Exported:
-    """The parameters of a correction.
+    """Write a correction as parameters.
 
     Raises:
-        ExportError: a unit whose size is not known, a matrix that mirrors, or a compass that ArduPilot does not have.
+        ExportError: an unknown unit, a matrix that mirrors, or a compass number that ArduPilot does not have.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -59,7 +63,9 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
     """
     number = 1 if to.instance is None else to.instance
     if not 1 <= number <= _INSTANCES:
-        raise ExportError(f"ArduPilot numbers its compasses 1 to {_INSTANCES}, but `--instance` is {number}.")
+        raise ExportError(
+            f"`--instance` must be 1 to {_INSTANCES}, the numbers of ArduPilot's compasses, but is {number}."
+        )
     found = converted(correction, "mG", "ardupilot")
     matrix, turned = symmetric(found.matrix, "ardupilot")
     size = float(np.linalg.det(matrix)) ** (1.0 / 3.0) if np.linalg.det(matrix) > 0 else 1.0
@@ -89,49 +95,49 @@ def _comments(correction: SensorCorrection, which: str) -> list[str]:
     comments = [
         f"{MADE_BY}: ArduPilot parameters of the compass {one_line(correction.name)}",
         "field = [DIA ODI] SCALE (reading + OFS) in mG, of readings in the vehicle's axes, after "
-        f"COMPASS_ORIENT{which}, which is yours to set.",
-        "A log's MAG message is corrected already: it is the reading where OFS, ODI and MOT were 0, DIA and SCALE 1.",
+        f"COMPASS_ORIENT{which}, which you have to set.",
+        "A log's MAG message is corrected already: it is the raw reading only with OFS, ODI, MOT 0 and DIA, SCALE 1.",
     ]
     if correction.current is not None:
         comments += [
             "MOT in mG per A of the battery's current is added to the field (old firmware adds it before DIA and ODI);",
-            f"it was found by the column {one_line(correction.current.column)}, which has to be that current.",
+            f"it was fitted to the column {one_line(correction.current.column)}, which must be that current.",
         ]
     return comments
 
 
 def _out_of_range(found: Converted, shape: np.ndarray, motor: np.ndarray, size: float) -> list[str]:
-    """Sentences about numbers that ArduPilot takes for mistakes."""
-    told = []
+    """Warnings about numbers that ArduPilot does not accept."""
+    warnings = []
     offset = float(np.abs(found.offset_without_current).max())
     if offset > _OFFSET:
-        told.append(
-            f"ArduPilot does not arm with an offset of more than {_OFFSET:g} mG, and {offset:.0f} mG is one: move the "
-            "sensor away from what makes it, or set COMPASS_OFFS_MAX."
+        warnings.append(
+            f"ArduPilot does not arm with an offset of more than {_OFFSET:g} mG, but it is {offset:.0f} mG: move the "
+            "sensor away from the source of the offset, or set COMPASS_OFFS_MAX."
         )
     if not _SCALE[0] <= size <= _SCALE[1]:
-        told.append(
-            f"ArduPilot counts a scale from {_SCALE[0]:.2f} to {_SCALE[1]:g} alone, and {size:.3g} lies outside; it is "
-            "in DIA and ODI. Check the unit of the columns and the field strength."
+        warnings.append(
+            f"ArduPilot accepts a scale from {_SCALE[0]:.2f} to {_SCALE[1]:g}, but it is {size:.3g}; it is included in "
+            "DIA and ODI. Check the unit of the columns and the field strength."
         )
     diagonal = [f"{v:.3g}" for v in shape.diagonal() if not _DIAGONAL[0] < v < _DIAGONAL[1]]
     if diagonal:
-        told.append(
-            f"ArduPilot's own calibration refuses DIA outside {_DIAGONAL[0]:g} to {_DIAGONAL[1]:g}, as here "
+        warnings.append(
+            f"ArduPilot's own calibration accepts DIA from {_DIAGONAL[0]:g} to {_DIAGONAL[1]:g}, but it is "
             f"{', '.join(diagonal)}: check the unit of the columns, and the directions covered."
         )
     if float(np.abs(shape - np.diag(shape.diagonal())).max()) >= _OFF_DIAGONAL:
-        told.append(
-            "ArduPilot's own calibration refuses ODI of 1 and more, as here: check the columns' order and unit."
+        warnings.append(
+            "ArduPilot's own calibration accepts ODI below 1, but here it is larger: check the columns' order and unit."
         )
     if float(np.abs(motor).max()) > _MOTOR:
-        told.append(f"ArduPilot's COMPASS_MOT goes to {_MOTOR:g} mG/A: move the sensor away from the power wires.")
+        warnings.append(f"COMPASS_MOT is limited to {_MOTOR:g} mG/A: move the sensor away from the power wires.")
     if found.strength is not None and not _FIELD[0] <= found.strength <= _FIELD[1]:
-        told.append(
-            f"ArduPilot does not arm in a field outside {_FIELD[0]:g} to {_FIELD[1]:g} mG, and the corrected one has "
+        warnings.append(
+            f"ArduPilot arms in a field of {_FIELD[0]:g} to {_FIELD[1]:g} mG, but the corrected field is "
             f"{found.strength:.0f} mG: calibrate again with `--field-strength` and the field at your place in µT."
         )
-    return told
+    return warnings
 
 
 ARDUPILOT = Export(

@@ -1,4 +1,4 @@
-"""What every export has in common: the correction of a sensor, where it goes, and what comes of it."""
+"""Common types of all exports: the correction of a sensor, its destination, and the exported file."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mkc_torch.calibration.result import Calibration
 __all__ = ["MADE_BY", "CurrentCoefficients", "Destination", "Export", "ExportError", "Exported", "SensorCorrection"]
 
 MADE_BY = "Made by mkc_torch"
-"""Stands in every file, so that a later run knows it as one that it may replace."""
+"""Marker in every exported file, by which a later export recognises a file that it may replace."""
 
 
 class ExportError(ValueError):
-    """A correction that a kind of file cannot hold; the sentence says why, and what to do."""
+    """An export cannot represent a correction; the message states why, and what to do."""
 
 
 @dataclass(frozen=True)
 class CurrentCoefficients:
-    """The field of a current near the sensor, in proportion to it.
+    """The field of a current near the sensor, proportional to the current.
 
     Attributes:
-        per_ampere: in the sensor's axes, in the unit of the correction per A.
-        mean: the current in A at which it is part of the offset.
-        column: of the recording that the current stood in.
+        per_ampere: field per current in the sensor's axes, in the unit of the correction per A.
+        mean: the mean current in A, whose field is part of the offset.
+        column: the column of the current in the recording.
     """
 
     per_ampere: Vector
@@ -36,17 +36,17 @@ class CurrentCoefficients:
 
 @dataclass(frozen=True)
 class SensorCorrection:
-    """``field = matrix @ (measured - offset - per_ampere * (current - mean))``: what all exports write, each its way.
+    """The correction that all exports write: ``field = matrix @ (measured - offset - per_ampere * (current - mean))``.
 
     Attributes:
-        name: what the sensor is called.
-        unit: of what is measured, and of the offset.
-        offset: at the mean current, where a current is.
-        matrix: from ``unit`` to ``field_unit``.
-        field_unit: of the corrected field.
-        field_strength: its length where the correction was made, in ``field_unit``; None where it is not known.
-        current: the field of a current; None where none was found.
-        left_out: sentences about what was found and is not in it.
+        name: name of the sensor.
+        unit: unit of the measurement and of the offset.
+        offset: offset, at the mean current if there is a current.
+        matrix: matrix from ``unit`` to ``field_unit``.
+        field_unit: unit of the corrected field.
+        field_strength: length of the corrected field during the calibration, in ``field_unit``; None if unknown.
+        current: the field of a current; None without a current.
+        left_out: warnings about findings that the correction does not contain.
 
     Example:
         >>> from mkc_torch.calibration.calibrate import calibrate
@@ -67,17 +67,17 @@ class SensorCorrection:
 
     @staticmethod
     def of(calibration: Calibration) -> SensorCorrection:
-        """That of a calibration."""
+        """The correction of a calibration."""
         c = calibration
         return SensorCorrection(c.name, c.unit, c.center, c.matrix, c.field_unit, c.field_strength)
 
 
 class Destination(NamedTuple):
-    """Where on a vehicle a sensor is.
+    """The sensor of an autopilot that receives the correction.
 
     Attributes:
-        instance: the autopilot's own number of the sensor; None for its first.
-        device_id: PX4's identity of the sensor; None where the user enters it.
+        instance: the autopilot's number of the sensor; None for its first sensor.
+        device_id: PX4's device id of the sensor; None if the user enters it later.
     """
 
     instance: int | None = None
@@ -85,20 +85,20 @@ class Destination(NamedTuple):
 
 
 class Exported(NamedTuple):
-    """A file's text, and sentences about what to notice; these stand in it too, where it has comments."""
+    """The text of a file, and warnings, which the file also contains if it has comments."""
 
     text: str
     warnings: tuple[str, ...]
 
 
 class Export(NamedTuple):
-    """A kind of file that a correction is exported to; a new one is a file of this folder and an entry in ``EXPORTS``.
+    """An export format; a new format is a module of this folder and an entry in ``EXPORTS``.
 
     Attributes:
-        name: as the command line has it.
-        file: name of the file in a folder of results.
-        text: what stands in it; raises :class:`ExportError` where it cannot hold the correction.
-        load: how a user brings it in, for the command line to say.
+        name: name on the command line.
+        file: name of the file in the folder of results.
+        text: encodes a correction; raises :class:`ExportError` if the format cannot represent it.
+        load: how the user loads the file, for the command line's output.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A C header: offset, matrix and a function, for firmware of one's own."""
+"""Export to a C header with offset, matrix and a function, for custom firmware."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ __all__ = ["C_HEADER"]
 
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
-    """The header of a correction, in its own units: C99 and C++.
+    """Write a correction as a header in its own units, for C99 and C++.
 
     Raises:
-        ExportError: numbers that 32 bits do not hold.
+        ExportError: a number is beyond the range of 32 bits.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""JSON: the correction's own numbers, each under a name of its own, for programs."""
+"""Export to JSON for programs: each number of the correction under its own name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCHEMA = "mkc-export/1"
 
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
-    """The numbers of a correction in its own units, with all digits.
+    """Write the numbers of a correction in its own units, with all digits.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -36,4 +36,4 @@ def text(correction: SensorCorrection, _to: Destination) -> Exported:
     return Exported(json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2) + "\n", c.left_out)
 
 
-JSON = Export("json", "numbers.json", text, "in any program: one number a name")
+JSON = Export("json", "numbers.json", text, "in any program: a number for each name")

@@ -1,4 +1,4 @@
-"""Numbers as files hold them, and the matrices that autopilots take."""
+"""Format numbers for export files, and make matrices symmetric for autopilots."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from mkc_torch.calibration.exports.base import ExportError
 __all__ = ["SMALLEST", "not_held", "one_line", "single", "symmetric"]
 
 SMALLEST = float(np.finfo(np.float32).tiny)
-"""Of the numbers of 32 bits that have all their digits."""
+"""Smallest normal number of 32 bits."""
 
 _SYMMETRIC = 1e-9
-_TOLD = 0.01  # degrees
+"""Largest asymmetry of a symmetric matrix, relative to its largest entry."""
+
+_REPORTED_ANGLE = 0.01
+"""Smallest rotation in ° that a warning reports."""
 
 
 def single(value: float) -> str:
-    """A number with the digits that tell it from all others of 32 bits, and no power of ten; nothing if too small.
+    """Format a number with the shortest digits that are unique among 32-bit numbers, without exponent; 0 if too small.
 
     Raises:
-        ExportError: 32 bits hold no number so large.
+        ExportError: the number is beyond the range of 32 bits.
 
     Example:
         >>> single(0.1), single(-2.0), single(1.25e-7)
@@ -34,15 +37,15 @@ def single(value: float) -> str:
 
 
 def not_held(size: float) -> ExportError:
-    """The error for a number that 32 bits do not hold."""
+    """The error about a number beyond the range of 32 bits."""
     return ExportError(
-        f"the calibration has a number of the size {size:.1e}, which 32 bits do not hold; calibrate again with the "
-        "columns in µT, gauss or mG."
+        f"the calibration has a number of size {size:.1e}, which is beyond the range of 32 bits; calibrate again with "
+        "the columns in µT, gauss or mG."
     )
 
 
 def one_line(text: str) -> str:
-    """A text for a comment: on one line, and without what ends a comment in C.
+    """Format a text for a comment: on a single line, and without the marks of C comments.
 
     Example:
         >>> one_line("a\\n*/ b")
@@ -52,14 +55,14 @@ def one_line(text: str) -> str:
 
 
 def symmetric(matrix: np.ndarray, kind: str) -> tuple[np.ndarray, str | None]:
-    """The symmetric matrix that makes the same lengths, and a sentence about the turn that it leaves out.
+    """The symmetric factor of a matrix, which gives the same lengths, and a warning about the omitted rotation.
 
-    A matrix is the product of a turn and of a symmetric one (its polar decomposition). Autopilots take the symmetric
-    one, and the turn is the sensor's mounting.
+    A matrix is the product of a rotation and a symmetric matrix (polar decomposition). Autopilots use the symmetric
+    matrix; the rotation is the sensor's mounting.
 
     Args:
         matrix: (3, 3).
-        kind: of file, for the message.
+        kind: name of the export, for the message.
 
     Raises:
         ExportError: the matrix mirrors the axes.
@@ -77,17 +80,17 @@ def symmetric(matrix: np.ndarray, kind: str) -> tuple[np.ndarray, str | None]:
     turn = left @ right
     if np.linalg.det(turn) < 0:
         raise ExportError(
-            f"the calibration matrix mirrors the axes, and {kind} takes none that does; check the signs of the "
+            f"the calibration matrix mirrors the axes, which {kind} does not support; check the signs of the "
             "magnetometer's columns and calibrate again."
         )
-    told = None
+    warning = None
     angle = math.degrees(math.acos(min(max(0.5 * (float(np.trace(turn)) - 1.0), -1.0), 1.0)))
-    if angle > _TOLD:
+    if angle > _REPORTED_ANGLE:
         axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         axis = axis / max(float(np.linalg.norm(axis)), 1e-300)
         about = ", ".join(f"{value:+.2f}" for value in axis)
-        told = (
+        warning = (
             f"The calibration matrix also turns the field by {angle:.2f}° about ({about}), which is left out: {kind} "
-            "takes a symmetric matrix, and the sensor's mounting apart from it. Length and offset are as they were."
+            "uses a symmetric matrix and a separate mounting of the sensor. Length and offset are unchanged."
         )
-    return (right.T * sizes) @ right, told
+    return (right.T * sizes) @ right, warning

@@ -1,14 +1,14 @@
-"""PX4: a parameter file of QGroundControl with ``CAL_MAG*``.
+"""Export to PX4: a parameter file of QGroundControl with ``CAL_MAG*``.
 
-What PX4 computes, in gauss and in the sensor's own axes (PX4-Autopilot, ``Correct`` of
+PX4 computes, in gauss and in the sensor's own axes (PX4-Autopilot, ``Correct`` of
 ``src/lib/sensor_calibration/Magnetometer.hpp``)::
 
     field = rotation * (scale * ((data + power * compensation) - offset))
 
 ``scale`` is symmetric, with ``CAL_MAGn_XSCALE`` … on its diagonal and ``XODIAG`` = xy, ``YODIAG`` = xz, ``ZODIAG`` = yz
 (``Magnetometer.cpp``, ``set_offdiagonal``). ``power`` is a battery's current in kA while the vehicle is armed, and 0
-otherwise; ``CAL_MAG_COMP_TYP`` 2 takes that of the first battery (``VehicleMagnetometer.cpp``). The file's form is that
-of QGroundControl's ``ParameterManager::writeParametersToStream``: vehicle, component, name, value and MAVLink type.
+otherwise; ``CAL_MAG_COMP_TYP`` 2 selects the first battery (``VehicleMagnetometer.cpp``). The file has the format of
+QGroundControl's ``ParameterManager::writeParametersToStream``: vehicle, component, name, value and MAVLink type.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _SCALE = (0.1, 3.0)
 
 
 def text(correction: SensorCorrection, to: Destination) -> Exported:
-    """The parameters of a correction.
+    """Write a correction as parameters.
 
     Raises:
-        ExportError: a unit whose size is not known, a matrix that mirrors, or a sensor that PX4 does not have.
+        ExportError: an unknown unit, a matrix that mirrors, or a sensor number that PX4 does not have.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -49,11 +49,13 @@ def text(correction: SensorCorrection, to: Destination) -> Exported:
     """
     number = 0 if to.instance is None else to.instance
     if not 0 <= number < _INSTANCES:
-        raise ExportError(f"PX4 numbers its magnetometers 0 to {_INSTANCES - 1}, but `--instance` is {number}.")
+        raise ExportError(
+            f"`--instance` must be 0 to {_INSTANCES - 1}, the numbers of PX4's magnetometers, but is {number}."
+        )
     if to.device_id is not None and not 0 < to.device_id <= _LARGEST_ID:
         raise ExportError(
-            f"PX4's device ids are whole numbers from 1 to {_LARGEST_ID}, but `--device-id` is {to.device_id}; "
-            "`listener sensor_mag` in PX4's console shows it."
+            f"`--device-id` must be a whole number from 1 to {_LARGEST_ID}, but is {to.device_id}; `listener "
+            "sensor_mag` in PX4's console shows the id."
         )
     found = converted(correction, "gauss", "px4")
     scale, turned = symmetric(found.matrix, "px4")
@@ -80,9 +82,9 @@ def _named(sensor: str, what: str, values: np.ndarray) -> dict[str, float]:
 
 def _comments(correction: SensorCorrection, sensor: str, to: Destination) -> list[str]:
     identity = (
-        f"{sensor}_ID, which says whose calibration this is, and {sensor}_ROT, its mounting, are yours to set."
+        f"You have to set {sensor}_ID, the id of the calibrated sensor, and {sensor}_ROT, its mounting."
         if to.device_id is None
-        else f"{sensor}_ROT, the sensor's mounting, is yours to set."
+        else f"You have to set {sensor}_ROT, the sensor's mounting."
     )
     comments = [
         f"{MADE_BY}: PX4 parameters of the magnetometer {one_line(correction.name)}",
@@ -92,7 +94,7 @@ def _comments(correction: SensorCorrection, sensor: str, to: Destination) -> lis
     if correction.current is not None:
         comments += [
             "COMP in gauss per kA of the first battery's current is added to the reading while the vehicle is armed;",
-            f"it was found by the column {one_line(correction.current.column)}, which has to be that current.",
+            f"it was fitted to the column {one_line(correction.current.column)}, which must be that current.",
         ]
     return comments
 
@@ -103,7 +105,7 @@ def _out_of_range(scale: np.ndarray) -> list[str]:
     if not outside:
         return []
     return [
-        f"PX4 takes scales from {least:g} to {most:g}, and {', '.join(outside)} lies outside: check the unit of the "
+        f"PX4 accepts scales from {least:g} to {most:g}, but here they are {', '.join(outside)}: check the unit of the "
         "columns and the field strength."
     ]
 

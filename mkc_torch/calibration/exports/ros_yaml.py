@@ -1,8 +1,8 @@
-"""ROS: a parameter file of ``magnetometer_pipeline``.
+"""Export to ROS: a parameter file of ``magnetometer_pipeline``.
 
 Its ``magnetometer_bias_remover`` (https://docs.ros.org/en/jazzy/p/magnetometer_pipeline, released for ROS 1 and ROS 2)
-is the one node of ROS that takes a whole matrix; ``imu_calib`` is for accelerometers, and ``imu_filter_madgwick`` takes
-an offset alone. It computes, of ``sensor_msgs/MagneticField``, which is in tesla (``bias_remover.cpp``)::
+is the only ROS node that accepts a whole matrix; ``imu_calib`` is for accelerometers, and ``imu_filter_madgwick`` only
+accepts an offset. It computes, from ``sensor_msgs/MagneticField`` in tesla (``bias_remover.cpp``)::
 
     field = initial_mag_scaling_matrix * (reading - initial_mag_bias)
 """
@@ -17,10 +17,10 @@ __all__ = ["ROS_YAML"]
 
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
-    """The parameters of a correction.
+    """Write a correction as parameters.
 
     Raises:
-        ExportError: a unit whose size is not known.
+        ExportError: an unknown unit.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -32,13 +32,13 @@ def text(correction: SensorCorrection, _to: Destination) -> Exported:
     warnings = list(correction.left_out)
     if correction.current is not None:
         warnings.append(
-            "current_field is left out: magnetometer_pipeline knows no current. The offset is that at "
+            "current_field is left out: magnetometer_pipeline does not support currents. The offset is valid at "
             f"{found.mean:.3g} A of the column {correction.current.column}."
         )
     comments = [
         f"{MADE_BY}: parameters of ROS's magnetometer_pipeline, of the magnetometer {one_line(correction.name)}",
         "field = matrix (reading - bias) in tesla, as sensor_msgs/MagneticField is; the matrix row by row.",
-        "ROS 2: --ros-args --params-file FILE; ROS 1: the four parameters alone.",
+        "ROS 2: --ros-args --params-file FILE; ROS 1: only the four parameters.",
         *map(one_line, warnings),
     ]
     rows = [f"    initial_mag_bias_{axis}: {_double(v)}" for axis, v in zip("xyz", found.offset, strict=True)]
@@ -48,7 +48,7 @@ def text(correction: SensorCorrection, _to: Destination) -> Exported:
 
 
 def _double(value: float) -> str:
-    """A number that YAML 1.1 too takes for one: with a point, where it has a power of ten."""
+    """Format a number so that YAML 1.1 reads it as a number: with a decimal point before an exponent."""
     digits, power, exponent = repr(float(f"{value:.12g}")).partition("e")
     return f"{digits if '.' in digits else digits + '.0'}{power}{exponent}"
 

@@ -1,4 +1,4 @@
-"""Corrections in the unit that a kind of file is in."""
+"""Convert corrections to the unit of an export."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _NAMES = {spelling: unit for unit, spellings in _SPELT.items() for spelling in s
 
 
 class Converted(NamedTuple):
-    """A correction whose measurement and field are in one unit.
+    """A correction with measurement and field in the same unit.
 
     Attributes:
         offset: (3,), at the mean current.
         matrix: (3, 3), no unit.
-        per_ampere: (3,), in the sensor's axes, in the unit per A; zero where there is no current.
-        mean: of the current in A.
-        strength: of the field; None where it is not known.
+        per_ampere: (3,), field of the current in the sensor's axes, in the unit per A; zero without a current.
+        mean: mean of the current in A.
+        strength: length of the field; None if unknown.
     """
 
     offset: np.ndarray
@@ -41,20 +41,20 @@ class Converted(NamedTuple):
 
     @property
     def offset_without_current(self) -> np.ndarray:
-        """(3,): the offset where no current flows."""
+        """The offset at zero current, (3,)."""
         return self.offset - self.per_ampere * self.mean
 
 
 def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
-    """The correction with measurement and field in a unit of the magnetic field.
+    """Convert a correction to a unit of the magnetic field.
 
     Args:
-        correction: in any unit.
-        unit: such as gauss.
-        kind: of file, for the message.
+        correction: correction in any unit.
+        unit: unit of the result, such as gauss.
+        kind: name of the export, for the message.
 
     Raises:
-        ExportError: the correction is in a unit whose size is not known, such as counts.
+        ExportError: the correction is in an unknown unit, such as counts.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -65,9 +65,9 @@ def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
     if of_measured is None or of_field is None:
         found = correction.unit if of_measured is None else correction.field_unit
         raise ExportError(
-            f"the calibration is in {found or 'no known unit'}, and {kind} needs {unit}, so nothing was exported to "
-            "it. If the columns are in a unit of the magnetic field, calibrate again with, for example, "
-            "`--convert mag=gauss`; raw counts have to be scaled by the sensor's data sheet first."
+            f"the calibration is in {found or 'an unknown unit'}, but {kind} needs {unit}; nothing was exported. If "
+            "the columns are in a unit of the magnetic field, calibrate again with, for example, `--convert "
+            "mag=gauss`; scale raw counts by the sensor's data sheet first."
         )
     current = correction.current
     return Converted(
@@ -90,6 +90,6 @@ def is_known(unit: str) -> bool:
 
 
 def _ratio(unit: str, other: str) -> float | None:
-    """How many of the other one a unit of the magnetic field is; None where that is not known."""
+    """The ratio of a unit of the magnetic field to another unit; None if a unit is unknown."""
     plain = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     return ratio(_NAMES.get(plain.lower(), plain), other)

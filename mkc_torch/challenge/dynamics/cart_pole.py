@@ -1,4 +1,4 @@
-"""A pole that hangs from a trolley far heavier than itself; places are measured, speeds are not."""
+"""A pole that hangs from a much heavier trolley. Positions are measured, speeds are not."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
-    """Forces in N about the pole's own period."""
+    """Draw forces in N with frequencies about that of the pole."""
     time = moments(STEP, samples)
     period = 2.0 * np.pi * np.sqrt(plant.parameters["length"] / GRAVITY)
     forces = [uniform(g, 4.0, 8.0) * excitation(g, time, period) for _ in range(runs)]

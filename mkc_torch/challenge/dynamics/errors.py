@@ -1,4 +1,4 @@
-"""What the sensors of a system add: white or mildly coloured errors, isolated outliers and short bursts of them."""
+"""Sensor errors of a system: white or coloured noise, isolated outliers and short bursts of outliers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from mkc_torch.challenge.magnetometer.noise import FAMILIES
 from mkc_torch.challenge.magnetometer.process import autoregressive
 
 OUTLIERS = 0.05
-"""Share of the samples of each output."""
+"""Share of outliers in the samples of each output."""
 
 NOISE = (0.005, 0.02)
-"""Standard deviation of an output's errors, over that of the output."""
+"""Standard deviation of an output's noise, over that of the output."""
 
 
 @dataclass(frozen=True)
 class Slow:
-    """A slow error of one output beside its others: autoregressive of first order and stationary.
+    """Drift of an output in addition to its other errors: a stationary first-order autoregressive process.
 
     Attributes:
-        size: standard deviation over that of the output's other errors; 0 where there is none.
+        size: standard deviation over that of the output's other errors; 0 for no drift.
         lasting: correlation time in samples.
     """
 
@@ -35,22 +35,22 @@ class Slow:
     lasting: float
 
     def correlations(self, samples: int) -> Array:
-        """Matrix (T, T) of a run."""
+        """Return the covariance (T, T) of a run."""
         return np.exp(-np.abs(np.subtract.outer(range(samples), range(samples))) / self.lasting)
 
 
 class Whitening(Protocol):
-    """What weighs traces of the outputs by the noise in them."""
+    """Whitens traces of the outputs by their noise."""
 
     def whitened(self, traces: Array) -> Array:
-        """Columns (M, q) of traces (m, T, R, q), or (M,) of (m, T, R), in standard deviations of independent errors."""
+        """Whiten traces (m, T, R, q) to columns (M, q), or (m, T, R) to (M,), in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of each output the standard deviation, and of all the correlation from sample to sample and the family.
+    """Noise of the outputs: a standard deviation for each, and a common sample-to-sample correlation and family.
 
-    Beside these errors each output may have a ``slow`` one; empty where none has.
+    Each output may have a drift in ``slow``; empty without drifts.
     """
 
     deviations: tuple[float, ...]
@@ -60,28 +60,28 @@ class Errors:
 
     def numbers(self, outputs: tuple[str, ...]) -> Mapping[str, Any]:
         """As JSON has it."""
-        told = dict(zip(outputs, self.deviations, strict=True))
+        deviations = dict(zip(outputs, self.deviations, strict=True))
         slow = {
-            name: {"over_noise": one.size, "samples": one.lasting}
-            for name, one in zip(outputs, self.slow, strict=False)
+            name: {"over_noise": drift.size, "samples": drift.lasting}
+            for name, drift in zip(outputs, self.slow, strict=False)
         }
-        return {"deviation": told, "correlation": self.correlation, "family": self.family} | (
+        return {"deviation": deviations, "correlation": self.correlation, "family": self.family} | (
             {"slow": slow} if slow else {}
         )
 
     def whitened(self, traces: Array) -> Array:
-        """Columns (M, q) of traces (m, T, R, q), or (M,) of (m, T, R), in standard deviations of independent errors."""
+        """Whiten traces (m, T, R, q) to columns (M, q), or (m, T, R) to (M,), in standard deviations."""
         scaled = traces / np.reshape(self.deviations, (-1, *[1] * (traces.ndim - 1)))
         if self.slow:
-            return np.stack([self._beside_slow(of, one) for of, one in zip(self.slow, scaled, strict=True)]).reshape(
+            return np.stack([self._with_drift(of, one) for of, one in zip(self.slow, scaled, strict=True)]).reshape(
                 -1, *traces.shape[3:]
             )
         white = scaled.copy()
         white[:, 1:] = (scaled[:, 1:] - self.correlation * scaled[:, :-1]) / np.sqrt(1.0 - self.correlation**2)
         return white.reshape(-1, *traces.shape[3:])
 
-    def _beside_slow(self, slow: Slow, values: Array) -> Array:
-        """An output's (T, R, *), run by run alike."""
+    def _with_drift(self, slow: Slow, values: Array) -> Array:
+        """Whiten an output (T, R, *), each run in the same way."""
         samples = len(values)
         covariance = np.eye(samples)
         if self.correlation:
@@ -92,22 +92,22 @@ class Errors:
 
 
 def draw_errors(g: Generator, outputs: Array) -> Errors:
-    """Of a size that suits the outputs (m, T, R)."""
-    deviations = tuple(uniform(g, *NOISE) * float(one.std()) for one in outputs)
+    """Draw noise of a size in proportion to the outputs (m, T, R)."""
+    deviations = tuple(uniform(g, *NOISE) * float(output.std()) for output in outputs)
     correlation = uniform(g, 0.2, 0.6) if happens(g, 0.4) else 0.0
     return Errors(deviations, correlation, choose(g, FAMILIES))
 
 
 def sample(g: Generator, errors: Errors, samples: int, runs: int) -> Array:
-    """Errors (m, T, R) without outliers."""
+    """Draw errors (m, T, R) without outliers."""
 
-    def one(deviation: float) -> Array:
+    def run_errors(deviation: float) -> Array:
         if errors.correlation:
             return autoregressive((errors.correlation,), deviation, errors.family).sample(g, samples).numpy()
         return deviation * unit_variance(g, errors.family, samples).numpy()
 
-    values = np.stack([np.stack([one(d) for _ in range(runs)], -1) for d in errors.deviations])
-    for own, deviation, slow in zip(values, errors.deviations, errors.slow, strict=False):  # none, or one for each
+    values = np.stack([np.stack([run_errors(d) for _ in range(runs)], -1) for d in errors.deviations])
+    for own, deviation, slow in zip(values, errors.deviations, errors.slow, strict=False):
         if slow.size:
             process = autoregressive((float(np.exp(-1.0 / slow.lasting)),), slow.size * deviation)
             own += np.stack([process.sample(g, samples).numpy() for _ in range(runs)], -1)
@@ -115,7 +115,7 @@ def sample(g: Generator, errors: Errors, samples: int, runs: int) -> Array:
 
 
 def contaminate(g: Generator, errors: Errors, samples: int, runs: int) -> tuple[Array, np.ndarray]:
-    """Outliers (m, T, R) and where they are: True in the mask, in each output by itself."""
+    """Draw outliers (m, T, R) and their mask, for each output separately."""
     mask = np.zeros((len(errors.deviations), samples, runs), dtype=bool)
     bursts = happens(g, 0.5)
     for k, run in np.ndindex(len(mask), runs):

@@ -19,12 +19,12 @@ def weir(row: int, rim: float, power: float) -> RateChange:
 
 
 def seepage(row: int, bend: float) -> RateChange:
-    """A leak through gravel by Darcy and Forchheimer: linear for small levels, less so for large ones."""
+    """A leak through gravel by Darcy and Forchheimer: linear for small levels, less than linear for large."""
     return added(row, lambda x, _: -forchheimer(np.maximum(x[row], 0.0), bend))
 
 
 def forchheimer(head: Array, bend: float) -> Array:
-    """Flow q ≥ 0 with ``q + bend q² = head``.
+    """Return the flow q ≥ 0 with ``q + bend q² = head``.
 
     Example:
         >>> float(forchheimer(np.array(6.0), 1.0))
@@ -33,36 +33,36 @@ def forchheimer(head: Array, bend: float) -> Array:
     return 2.0 * head / (1.0 + np.sqrt(1.0 + 4.0 * bend * head))
 
 
-def exchange(one: int, other: int, flow: Callable[[Array], Array], ratio: float) -> RateChange:
-    """A flow from the higher of two states to the lower, of their difference; ``ratio`` of what one loses is gained."""
+def exchange(first: int, second: int, flow: Callable[[Array], Array], ratio: float) -> RateChange:
+    """A flow from the higher state to the lower, by their difference; the second changes by ``-ratio`` times it."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        away = x[other] - x[one]
+        away = x[second] - x[first]
         passed = size * np.sign(away) * flow(np.abs(away))
         rates = known.copy()
-        rates[one] += passed
-        rates[other] -= ratio * passed
+        rates[first] += passed
+        rates[second] -= ratio * passed
         return rates, z
 
     return change
 
 
 def tap(row: int, head: float) -> RateChange:
-    """A dripping tap on a main of that head: by Torricelli, against the level."""
+    """A dripping tap from a supply of this head: Torricelli's law against the level."""
     return added(row, lambda x, _: np.sqrt(np.maximum(1.0 - x[row] / head, 0.0)))
 
 
 def slot(row: int, top: float, power: float, throat: float) -> RateChange:
-    """A slot from the bottom up: flow by 1.5 or 2.5 powers of the level over ``top``, that narrows with the level."""
+    """A slot that starts at the bottom: flow by a power 1.5 or 2.5 of the level over ``top``."""
     return added(row, lambda x, _: -((np.maximum(x[row], 0.0) / top) ** power) * (1.0 - throat * x[row] / top))
 
 
 def evaporation(row: int, room: float, wet: float) -> RateChange:
-    """Water that evaporates into air at ``room`` °C: by the difference of the pressures of its vapour.
+    """Water that evaporates into air at ``room`` °C, by the difference of the vapour pressures.
 
     Args:
-        row: of the temperature.
-        room: °C.
+        row: row of the temperature.
+        room: room temperature, °C.
         wet: temperature in °C at which the loss is ``size`` K/s.
 
     References:
@@ -77,7 +77,7 @@ def evaporation(row: int, room: float, wet: float) -> RateChange:
 
 
 def natural_convection(row: int, room: float, hot: float, power: float) -> RateChange:
-    """Heat that rising air carries off, by a power of the excess over ``room`` °C; ``size`` K/s at ``hot`` °C."""
+    """Natural convection by a power of the excess over ``room`` °C; ``size`` K/s at ``hot`` °C."""
 
     def force(x: Array, _: Array) -> Array:
         away = (x[row] - room) / (hot - room)
@@ -97,7 +97,7 @@ def radiation(row: int, room: float, slope: float) -> RateChange:
 
 
 def melting(row: int, place: float, width: float) -> RateChange:
-    """Wax in the body that melts about a temperature: its heat capacity rises there by the size."""
+    """Wax in the body that melts near a temperature: the heat capacity rises there by the size."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
         rates = known.copy()

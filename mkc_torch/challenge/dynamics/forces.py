@@ -10,7 +10,7 @@ from mkc_torch.challenge.dynamics.plant import Array, RateChange
 
 
 def added(row: int, force: Callable[[Array, Array], Array]) -> RateChange:
-    """What adds ``size · force(states, inputs)`` to the rate of one state."""
+    """Returns a term that adds ``size · force(states, inputs)`` to the rate of one state."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         rates = known.copy()
@@ -21,12 +21,12 @@ def added(row: int, force: Callable[[Array, Array], Array]) -> RateChange:
 
 
 def drag_factor(speed: Array, typical: float, reynolds: float) -> Array:
-    """Drag over ``-v`` of a sphere, 1 at the typical speed, whose coefficient depends on Reynolds' number.
+    """Return the drag of a sphere over ``-v``, 1 at the typical speed; its coefficient depends on the Reynolds number.
 
     Args:
-        speed: absolute.
-        typical: speed at which Reynolds' number is ``reynolds``.
-        reynolds: there.
+        speed: absolute speed.
+        typical: speed at which the Reynolds number is ``reynolds``.
+        reynolds: Reynolds number at the typical speed.
 
     References:
         Schiller & Naumann, "A drag coefficient correlation", VDI-Zeitung 77 (1935), with a floor of 0.42.
@@ -43,12 +43,12 @@ def drag_factor(speed: Array, typical: float, reynolds: float) -> Array:
 
 
 def sphere_drag(row: int, typical: float, reynolds: float) -> RateChange:
-    """Drag on one speed; its size is the deceleration at the typical speed, over that speed."""
+    """Drag on one speed; the size is the deceleration at the typical speed, over that speed."""
     return added(row, lambda x, _: -x[row] * drag_factor(np.abs(x[row]), typical, reynolds))
 
 
 def flight_drag(rows: tuple[int, int], typical: float, reynolds: float, wind: float = 0.0) -> RateChange:
-    """Drag on a body that flies: along its velocity through the air, which moves with the first axis."""
+    """Drag on a flying body, along its velocity through air that moves along the first axis."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
         one, other = x[rows[0]] - wind, x[rows[1]]
@@ -81,7 +81,7 @@ def hardening(row: int, position: int, reach: float) -> RateChange:
 
 
 def felt(row: int, position: int, reach: float, power: float) -> RateChange:
-    """A spring of felt: its force grows by a power of the deflection, and evenly below a tenth of ``reach``."""
+    """A spring of felt: a power of the deflection, linear below a tenth of ``reach``."""
     return added(
         row,
         lambda x, _: -x[position] / reach * ((x[position] / reach) ** 2 + 0.01) ** (0.5 * (power - 1.0)),
@@ -89,7 +89,7 @@ def felt(row: int, position: int, reach: float, power: float) -> RateChange:
 
 
 def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss: float = 0.2) -> RateChange:
-    """A bumper beyond a place, on the sides ``ways`` (1, -1): Hertz's contact that loses energy.
+    """A bumper beyond a position, on the sides ``ways`` (1, -1): a Hertz contact with energy loss.
 
     References:
         Hunt & Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", J. Appl. Mech. 42 (1975).
@@ -106,7 +106,7 @@ def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss
 
 
 def cogging(row: int, position: int, order: int, phase: float, second: float) -> RateChange:
-    """Magnets that pull: a force with a period of the turn, and a share ``second`` of twice that."""
+    """Cogging: a force periodic in the angle, with a share ``second`` of the second harmonic."""
     return added(
         row,
         lambda x, _: np.sin(order * x[position] + phase) + second * np.sin(2.0 * (order * x[position] + phase) + 1.0),
@@ -114,7 +114,7 @@ def cogging(row: int, position: int, order: int, phase: float, second: float) ->
 
 
 def wind(row: int, speed: float) -> RateChange:
-    """A steady wind of that speed: by the square of the velocity relative to it; 1 at standstill."""
+    """A steady wind: by the square of the relative velocity; 1 at standstill."""
 
     def force(x: Array, _: Array) -> Array:
         relative = 1.0 - x[row] / speed
@@ -124,7 +124,7 @@ def wind(row: int, speed: float) -> RateChange:
 
 
 def warming_bias(row: int, constant: float, share: float) -> RateChange:
-    """A bias of the actuator that loses a share as it warms up, with one own state."""
+    """A bias of the actuator that decreases by a share while it warms up; one state of its own."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
         rates = known.copy()
@@ -135,7 +135,7 @@ def warming_bias(row: int, constant: float, share: float) -> RateChange:
 
 
 def hum(row: int, frequency: float) -> RateChange:
-    """A machine nearby that shakes: an oscillator of its own frequency in Hz, two own states."""
+    """A vibrating machine nearby: an oscillator with its own frequency in Hz, two states of its own."""
     omega = 2.0 * np.pi * frequency
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
@@ -147,7 +147,7 @@ def hum(row: int, frequency: float) -> RateChange:
 
 
 def lift(rows: tuple[int, int], constant: float) -> RateChange:
-    """Magnus' force on a spinning body, at right angles to its velocity; the spin fades, which takes an own state."""
+    """Magnus force on a spinning body, perpendicular to its velocity; the decaying spin is a state of its own."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
         left = size * (1.0 - z[0])
@@ -160,7 +160,7 @@ def lift(rows: tuple[int, int], constant: float) -> RateChange:
 
 
 def fading_drive(row: int, load: int, gain: float, constant: float) -> RateChange:
-    """A motor's torque that fades as its windings heat up: a part of what a current drives, one own state."""
+    """A motor torque that decreases while the windings heat up; one state of its own."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
         rates = known.copy()

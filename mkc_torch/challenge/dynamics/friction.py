@@ -1,4 +1,4 @@
-"""Friction by bristles: it winds up before it slides, and remembers which way."""
+"""Bristle friction models: presliding deflection with hysteresis."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from mkc_torch.challenge.dynamics.plant import Array, RateChange
 
 
 def bristles(row: int, deflection: float, speed: float, rise: float = 0.0) -> RateChange:
-    """LuGre's friction on the rate of a speed, one own state: the mean deflection of the bristles.
+    """LuGre friction on the rate of a speed; its own state is the mean deflection of the bristles.
 
     Args:
-        row: of the speed.
-        deflection: of the bristles when they slide, in the unit of the position.
-        speed: at which the rise has fallen to a third, and that the damping of the bristles is relative to.
+        row: row of the speed.
+        deflection: deflection of the bristles when they slide, in the unit of the position.
+        speed: speed at which the rise has fallen to a third; it also scales the damping of the bristles.
         rise: how much larger friction is at standstill, as a share; it falls with ``exp(-|v| / speed)``.
 
     References:
@@ -33,13 +33,13 @@ def bristles(row: int, deflection: float, speed: float, rise: float = 0.0) -> Ra
 
 
 def teeth(row: int, deflection: float, load: int, gain: float) -> RateChange:
-    """Friction of gear teeth by bristles, in proportion to what drives them: a share and the drive's torque.
+    """Bristle friction of gear teeth, in proportion to the load on them.
 
     Args:
-        row: of the speed.
-        deflection: of the bristles when they slide.
-        load: the state, such as a motor's current, that presses the teeth together.
-        gain: of the load that is as much as the part which is always there.
+        row: row of the speed.
+        deflection: deflection of the bristles when they slide.
+        load: state that presses the teeth together, such as a motor's current.
+        gain: gain of the load relative to the constant part.
     """
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
@@ -53,7 +53,7 @@ def teeth(row: int, deflection: float, load: int, gain: float) -> RateChange:
 
 
 def rubber(row: int, yields: tuple[float, ...]) -> RateChange:
-    """A rubber bushing: elements of Bouc and Wen's kind that yield one after the other, an own state each.
+    """A rubber bushing: Bouc-Wen elements that yield one after the other, each with a state of its own.
 
     ``ż = v (1 − (z / y)² (1 + sign(v z)) / 2)``, the sharper knee of the exponent two.
     """

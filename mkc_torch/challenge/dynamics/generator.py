@@ -27,15 +27,15 @@ from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW
 from mkc_torch.recording.recording import Recording
 
 OUTSIDE_SHARE = 0.08
-"""Share of the cases whose effect no diagnosis with the catalogue can name."""
+"""Share of cases with an effect outside the catalogue."""
 
 _DIGITS = 7
-"""Significant ones, of inputs and outputs as a logger prints them."""
+"""Significant digits of inputs and outputs in a recording."""
 
 
 @dataclass(frozen=True)
 class System:
-    """One of the systems: how its runs are drawn, and what can be hidden in it."""
+    """A system: how its runs are drawn, and the effects that can be hidden in it."""
 
     draw: Callable[[Generator], Setting]
     inside: Sequence[Draw]
@@ -57,7 +57,7 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
 
 @dataclass(frozen=True)
 class MeasuredColumns:
-    """A recording's columns, what its sensors added (m, T, R), and which samples are bad."""
+    """Columns of a recording, its sensor errors (m, T, R), and the mask of outliers."""
 
     columns: dict[str, Tensor]
     errors: Array
@@ -65,12 +65,12 @@ class MeasuredColumns:
 
 
 def draw(seed: int, index: int, *, empty: bool = False) -> Case:
-    """The case at that address; the same address gives the same case.
+    """Draw the case at an address. The same address gives the same case.
 
     Args:
-        seed: of the proof.
-        index: of the case.
-        empty: hide nothing.
+        seed: seed of the proof.
+        index: number of the case.
+        empty: hide no physics.
     """
 
     def stream(what: str) -> Generator:
@@ -88,14 +88,14 @@ def case_of(
     empty: bool = False,
     outside_share: float = OUTSIDE_SHARE,
 ) -> Case:
-    """A case of one system.
+    """Draw a case of a system.
 
     Args:
-        stream: generators by what they are for.
-        name: of the recording.
-        system: whose runs it is of.
-        empty: hide nothing.
-        outside_share: of effects that no diagnosis with the catalogue can name.
+        stream: returns a random generator for each purpose.
+        name: name of the recording.
+        system: the system.
+        empty: hide no physics.
+        outside_share: share of effects outside the catalogue.
     """
     setting = system.draw(stream("setting"))
     plant = setting.plant
@@ -124,7 +124,7 @@ def hide(
     errors: Whitening,
     outside_share: float = OUTSIDE_SHARE,
 ) -> tuple[str, HiddenTerm, float, EffectPower]:
-    """An effect: its kind, itself, its size, and how well it can be seen at that size."""
+    """Return the kind of an effect, the effect, its size, and its detectability at that size."""
     g = stream("effect")
     outside = draws.happens(g, outside_share)
     hidden = draws.choose(g, system.outside if outside else system.inside)(g, scene)
@@ -139,7 +139,7 @@ def hide(
 def measured_by(
     stream: Callable[[str], Generator], when: str, plant: Plant, trial: RunSet, course: Course, errors: Errors
 ) -> MeasuredColumns:
-    """What a logger writes: runs below one another, inputs, outputs with errors, and columns that mean nothing."""
+    """Return the recording: its runs one after the other, inputs, outputs with errors, and decoy columns."""
     samples, runs = trial.samples, trial.runs
     noise = sample(stream(f"{when}errors"), errors, samples, runs)
     bad, mask = contaminate(stream(f"{when}outliers"), errors, samples, runs)
@@ -154,7 +154,7 @@ def measured_by(
 
 
 def _decoys(g: Generator, plant: Plant, columns: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A trend of the temperature and, where there is an input, a noisy copy of it."""
+    """Draw decoys: a trend of the temperature and, with an input, a noisy copy of it."""
     count = len(columns["time"])
     found = {"temperature": 22.0 + plain(g, "trend", torch.arange(count, dtype=torch.float64))}
     if plant.inputs:
@@ -164,14 +164,14 @@ def _decoys(g: Generator, plant: Plant, columns: Mapping[str, Tensor]) -> dict[s
 
 
 def _column(values: Array) -> Tensor:
-    """(T, R) as one column, run after run, to so many digits."""
+    """Return (T, R) as one column, run after run, rounded to a number of digits."""
     flat = values.T.ravel()
     unit = 10.0 ** (np.floor(np.log10(np.abs(flat).max() + 1e-300)) - _DIGITS + 1)
     return torch.from_numpy(np.round(flat / unit) * unit)
 
 
 def _numbers(mask: np.ndarray) -> tuple[int, ...]:
-    """Bad samples of (m, T, R), numbered output by output and run by run."""
+    """Return the numbers of the outliers in (m, T, R), counted output by output and run by run."""
     return tuple(np.flatnonzero(mask.transpose(0, 2, 1)).tolist())
 
 
@@ -194,7 +194,7 @@ def key_of(name: str, kind: str, plant: Plant, errors: Errors, measured: Measure
 
 
 def key_effect(hidden: HiddenTerm, size: float, seen: EffectPower) -> KeyEffect:
-    told = [KeyRival(rival.effect, (), rival.z_sep, rival.at) for rival in (*seen.rivals, *seen.larger)]
+    rivals = [KeyRival(rival.effect, (), rival.z_sep, rival.at) for rival in (*seen.rivals, *seen.larger)]
     return KeyEffect(
         effect=hidden.effect,
         form=hidden.form,
@@ -205,7 +205,7 @@ def key_effect(hidden: HiddenTerm, size: float, seen: EffectPower) -> KeyEffect:
         parameters=(),
         z=seen.z,
         z_sep=seen.z_sep,
-        rival=told[0] if told else None,
-        inseparable=tuple(rival for rival in told if rival.z_sep < INSEPARABLE_BELOW),
+        rival=rivals[0] if rivals else None,
+        inseparable=tuple(rival for rival in rivals if rival.z_sep < INSEPARABLE_BELOW),
         at=hidden.at,
     )

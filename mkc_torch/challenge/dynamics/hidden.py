@@ -1,4 +1,4 @@
-"""What can be hidden in several systems: effects drawn to the size of a scene, with the names that a diagnosis has."""
+"""Effects that can be hidden in several systems, scaled to a scene, with the names of the catalogue."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from mkc_torch.challenge.dynamics.scene import SystemScene
 Draw = Callable[[Generator, SystemScene], HiddenTerm]
 
 Exchange = Callable[[Generator, float], Callable[[Array], Array]]
-"""From a difference that is typical, a function of differences of at least 0, in the same unit."""
+"""Returns a function of differences ≥ 0 in the same unit, given a typical difference."""
 
 
 def rate_of(state: str) -> str:
-    """Where a diagnosis says that it acts."""
+    """Return the name of the port in a diagnosis."""
     return f"rate of {state}"
 
 
@@ -221,12 +221,12 @@ def felt_spring(speed: str, position: str) -> Draw:
 
 
 def second_store(state: str, exchange: Exchange, name: str) -> Draw:
-    """A store that takes up what a state gives off, later.
+    """Draw a second store that exchanges with a state, with delay.
 
     Args:
-        state: it is beside.
-        exchange: draws what drives the flow between them, from a difference that is typical.
-        name: of what it is.
+        state: state that it is connected to.
+        exchange: draws the flow between them, given a typical difference.
+        name: name of the store.
     """
 
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:

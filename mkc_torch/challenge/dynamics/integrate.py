@@ -1,4 +1,4 @@
-"""The generator's own integration: Runge and Kutta's classical method at a fixed fine step."""
+"""The generator's own integration: the classical Runge-Kutta method at a fixed fine step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet
 
 @dataclass(frozen=True)
 class Course:
-    """States (n, F, R) at the fine moments, the inputs (k, F, R) that were sent, and the outputs (m, T, R)."""
+    """A trajectory: states (n, F, R) at the fine times, the actual inputs (k, F, R), and the outputs (m, T, R)."""
 
     states: Array
     inputs: Array
@@ -19,7 +19,7 @@ class Course:
 
 
 def between(values: Array, parts: int) -> Array:
-    """Signals (k, T, R) at ``parts`` moments an interval: (k, (T - 1) parts + 1, R), linear between samples.
+    """Interpolate signals (k, T, R) linearly at ``parts`` times an interval: (k, (T - 1) parts + 1, R).
 
     Example:
         >>> input_hold(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
@@ -32,7 +32,7 @@ def between(values: Array, parts: int) -> Array:
 
 
 def holding(values: Array, parts: int) -> Array:
-    """The same, of signals that are held until the next sample.
+    """Sample held signals (k, T, R) at ``parts`` times an interval: (k, (T - 1) parts + 1, R).
 
     Example:
         >>> holding(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
@@ -44,14 +44,14 @@ def holding(values: Array, parts: int) -> Array:
 def simulate(
     plant: Plant, trial: RunSet, hidden: HiddenTerm | None = None, size: float = 0.0, disturbance: Array | None = None
 ) -> Course:
-    """The runs of a trial, with something hidden or nothing.
+    """Simulate the runs of a trial, with or without a hidden effect.
 
     Args:
         plant: the system.
         trial: the runs.
-        hidden: what acts beside the known physics.
-        size: of it.
-        push: what is added to the rates (n, F - 1, R), constant in each fine step.
+        hidden: effect in addition to the known physics.
+        size: size of the effect.
+        disturbance: added rates (n, F - 1, R), constant in each fine step.
     """
     h = trial.step / plant.fine
     half = _sent(plant, trial)
@@ -61,7 +61,7 @@ def simulate(
 
 
 def outputs_of_sizes(plant: Plant, trial: RunSet, hidden: HiddenTerm, sizes: Array) -> list[Array]:
-    """Outputs (m, T, R) for each of several sizes, which are integrated side by side as so many more runs."""
+    """Return outputs (m, T, R) for each of several sizes, integrated in parallel."""
     h = trial.step / plant.fine
     half = _sent(plant, trial)
     sent = np.concatenate([hidden.inputs(half, 0.5 * h, size) for size in sizes], -1)
@@ -72,7 +72,7 @@ def outputs_of_sizes(plant: Plant, trial: RunSet, hidden: HiddenTerm, sizes: Arr
 
 
 def _sent(plant: Plant, trial: RunSet) -> Array:
-    """Inputs (k, 2F - 1, R) at every half fine step."""
+    """Return inputs (k, 2F - 1, R) at every half fine step."""
     return (holding if trial.held else between)(trial.inputs, 2 * plant.fine)
 
 
@@ -85,7 +85,7 @@ def _states(
     sizes: Array,
     disturbance: Array | None = None,
 ) -> Array:
-    """(n, F, R) for inputs (k, 2F - 1, R), a trial's first states (n, R) and the size of what is hidden (R,)."""
+    """Return states (n, F, R), given inputs (k, 2F - 1, R), initial states (n, R) and sizes of the effect (R,)."""
     own = 0 if hidden is None else hidden.own
     n, p = len(plant.states), plant.values
 
@@ -106,7 +106,7 @@ def _states(
     for k in range(len(path) - 1):
         a, b, c = sent[:, 2 * k], sent[:, 2 * k + 1], sent[:, 2 * k + 2]
         if trial.held:
-            c = b  # the next value begins where this step ends
+            c = b  # a held input jumps at the end of the step
         w = None if disturbance is None else disturbance[:, k]
         k1 = rate(x, a, w)
         k2 = rate(x + 0.5 * h * k1, b, w)
@@ -117,22 +117,22 @@ def _states(
 
 
 def _measured(plant: Plant, states: Array, inputs: Array, h: float, hidden: HiddenTerm | None, size: float) -> Array:
-    """Outputs (m, T, R) of states (n, F, R) and inputs (k, F, R)."""
+    """Return outputs (m, T, R), given states (n, F, R) and inputs (k, F, R)."""
     found = plant.read(states, inputs)
     return (found if hidden is None else hidden.outputs(found, h, size))[:, :: plant.fine]
 
 
 def variation(jacobian: Array, forcing: Array, begin: Array, step: float) -> Array:
-    """Solutions of the variational equation ``δẋ = A δx + f`` along a course.
+    """Solve the variational equation ``δẋ = A δx + f`` along a trajectory.
 
     Args:
-        jacobian: A (F, R, n, n) at moments ``step`` apart, an odd number of them.
-        forcing: f (F, R, n, K), one column a direction.
-        begin: δx (R, n, K) at the beginning.
-        step: in s; the method takes two at once.
+        jacobian: A (F, R, n, n) at an odd number of times, ``step`` apart.
+        forcing: f (F, R, n, K), a column for each direction.
+        begin: initial δx (R, n, K).
+        step: time step in s; the method takes two steps at once.
 
     Returns:
-        δx ((F + 1) / 2, R, n, K) at every other moment.
+        δx ((F + 1) / 2, R, n, K) at every second time.
     """
     h = 2.0 * step
     out = np.empty((len(jacobian) // 2 + 1, *begin.shape))

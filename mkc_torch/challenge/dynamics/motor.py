@@ -1,4 +1,4 @@
-"""A motor that turns a load; its angle and its current are measured, its speed is not."""
+"""A motor with a load. Angle and current are measured, the speed is not."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int, samples: int) -> RunSet:
-    """Voltages of either sign, from standstill or not."""
+    """Draw voltages of both signs; the motor starts at standstill or in motion."""
     time = moments(STEP, samples)
     voltages = [uniform(g, 6.0, 12.0) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)]
     reach = ((0.0, 6.0), (-3.0, 3.0), (-0.5, 0.5))
@@ -54,20 +54,20 @@ def trial(g: Generator, runs: int, samples: int) -> RunSet:
 
 
 def gear_teeth(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Teeth that rub the more the harder the motor pulls."""
+    """Friction of gear teeth in proportion to the motor's torque."""
     form = friction.teeth(1, uniform(g, 0.005, 0.015) * scene.largest("angle"), 2, 1.0 / scene.typical("current"))
     large = 0.3 * scene.pace("speed")
     return HiddenTerm("load_dependent_friction", "teeth by bristles", (hidden.rate_of("speed"),), large, form, own=1)
 
 
 def oil(g: Generator, typical: float) -> Callable[[Array], Array]:
-    """A coupling by oil, that grips a little more the faster it slips."""
+    """A fluid coupling whose torque grows more than linearly with the slip."""
     share = uniform(g, 0.0, 0.1)
     return lambda slip: slip * (1.0 + share * slip / typical)
 
 
 def hot_windings(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Torque that fades as the windings heat up."""
+    """Torque that decreases while the windings heat up."""
     heat = scene.typical("current") ** 2
     form = forces.fading_drive(1, 2, scene.plant.parameters["torque"], uniform(g, 0.1, 0.5) * scene.length)
     return HiddenTerm("fading_drive", "hot windings", (hidden.rate_of("speed"),), 1.0 / heat, form, own=1)

@@ -1,6 +1,6 @@
-"""The simulations as a user would write them, of what everybody knows; the diagnosis is given a copy of this file."""
+"""The nominal simulations, as a user would write them. The diagnosis gets a copy of this file."""
 
-# ruff: noqa: ARG002, RUF012 - plain class attributes, and a derivative that is given more than it uses
+# ruff: noqa: ARG002, RUF012 - plain class attributes, and a derivative with unused arguments
 
 from __future__ import annotations
 

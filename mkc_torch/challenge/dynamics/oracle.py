@@ -1,10 +1,10 @@
-"""How well the best possible test would see a hidden effect in a system's outputs, and tell it from its best rival.
+"""Power of the best possible test to detect a hidden effect in a system's outputs, and to separate it from its rivals.
 
-``z² = (1 − ε) δᵀ M δ``: δ is how the outputs with the effect differ from those without it at the parameters and first
-states that follow them best, M the inverse of the errors' covariance with the tangents by those projected out in its
-metric, ε the share of outliers. Projecting a rival's columns out too leaves a smaller number; what the effect's own
-textbook form leaves, which is not the true form, is taken off its square for ``z_sep``: twice the nats by which the own
-form goes before the rival.
+``z² = (1 − ε) δᵀ M δ``. δ is the difference between the outputs with the effect and those of the best fit without it.
+M is the inverse covariance of the errors, with the tangents of parameters and initial states projected out in its
+metric. ε is the share of outliers. Projecting out a rival's columns, too, gives a smaller number. For ``z_sep``, the
+residual of the effect's own textbook form, which differs from the true form, is subtracted from its square: the result
+is twice the log-likelihood gain of the own form over the rival, in nats.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from mkc_torch.challenge.dynamics.errors import OUTLIERS, Whitening
 from mkc_torch.challenge.dynamics.integrate import simulate, variation
 from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet
 from mkc_torch.challenge.dynamics.readings import readings
-from mkc_torch.challenge.dynamics.rivals import SUPERSETS, RivalModel, accounts
+from mkc_torch.challenge.dynamics.rivals import SUPERSETS, RivalModel, rival_forms
 from mkc_torch.challenge.dynamics.scene import SystemScene
 
 _RANK = 1e-9
 _FLAT = 1e-7
 _CLEARLY = 9.0
-"""Twice the nats by which an account that contains the own form has to go before it."""
+"""Twice the log-likelihood gain that a form containing the own form needs to count as a rival, nats."""
 
 _ROUNDS = 3
 _KEPT = math.sqrt(1.0 - OUTLIERS)
@@ -34,7 +34,7 @@ _KEPT = math.sqrt(1.0 - OUTLIERS)
 
 @dataclass(frozen=True)
 class RivalPower:
-    """Another account, and by how many standard deviations the effect's own form goes before it."""
+    """A rival form, and the number of standard errors by which the effect's own form is better."""
 
     effect: str
     at: tuple[str, ...]
@@ -43,10 +43,10 @@ class RivalPower:
 
 @dataclass(frozen=True)
 class EffectPower:
-    """Numbers of standard deviations: against nothing, and against the best of ``rivals``, hardest first.
+    """Detectability of an effect in standard errors: against no effect, and against the best of ``rivals``.
 
-    ``missed`` is what the effect's own form leaves; of effects outside the catalogue, all of it. ``larger`` are
-    accounts that contain the own form and go before it.
+    The rivals are sorted, best first. ``missed`` is the residual of the effect's own form; for effects outside the
+    catalogue, all of the effect. ``larger`` are better forms that contain the own form.
     """
 
     z: float
@@ -58,28 +58,28 @@ class EffectPower:
 
 @dataclass(frozen=True)
 class WhitenedTangents:
-    """Whitened derivatives of the outputs: by parameters and first states (M, p + nR), and by each account (M, q)."""
+    """Whitened derivatives of the outputs by parameters and initial states (M, p + nR), and by each form (M, q)."""
 
     known: Array
-    accounts: Sequence[tuple[RivalModel, Array]]
+    forms: Sequence[tuple[RivalModel, Array]]
 
 
 def tangents(scene: SystemScene, errors: Whitening, *, rivals: bool) -> WhitenedTangents:
-    """Along the course of a scene, by the variational equation.
+    """Compute the tangents along the trajectory of a scene by the variational equation.
 
     Args:
-        scene: a plant and its course.
-        errors: by which outputs are weighed.
-        rivals: all accounts too, or the known parameters alone.
+        scene: a plant and its trajectory.
+        errors: whiten the outputs.
+        rivals: whether to include the rival forms.
     """
     plant, trial, x, u = scene.plant, scene.trial, scene.course.states, scene.course.inputs
     if plant.reads is not None:
         read = readings(scene) if rivals else []
-        told = [(one, errors.whitened(one.outputs)) for one in read if one.outputs is not None]
-        return WhitenedTangents(errors.whitened(_readings_by_parameters(plant, u)), told)
+        forms = [(form, errors.whitened(form.outputs)) for form in read if form.outputs is not None]
+        return WhitenedTangents(errors.whitened(_readings_by_parameters(plant, u)), forms)
     n, p, runs = len(plant.states), len(plant.parameters), trial.runs
-    found = accounts(scene, _by_inputs(plant, x, u)) if rivals else []
-    forced = [account.forcing for account in found if account.forcing is not None]
+    found = rival_forms(scene, _by_inputs(plant, x, u)) if rivals else []
+    forced = [form.forcing for form in found if form.forcing is not None]
     blocks = [_by_parameters(plant, x, u), np.zeros((*x.shape, n)), *forced]
     forcing = np.concatenate(blocks, -1).transpose(1, 2, 0, 3)
     begin = np.zeros((runs, n, forcing.shape[-1]))
@@ -89,19 +89,19 @@ def tangents(scene: SystemScene, errors: Whitening, *, rivals: bool) -> Whitened
     traces = moved.transpose(2, 0, 1, 3)[[plant.row(name) for name in plant.outputs]]
     starts = np.einsum("mtrn,rs->mtrsn", traces[..., p : p + n], np.eye(runs))
     known = np.concatenate([traces[..., :p], starts.reshape(*traces.shape[:3], -1)], -1)
-    told, place = [], p + n
-    for account in found:
-        if account.outputs is not None:
-            told.append((account, errors.whitened(account.outputs)))
-        elif account.forcing is not None:
-            size = account.forcing.shape[-1]
-            told.append((account, errors.whitened(traces[..., place : place + size])))
+    forms, place = [], p + n
+    for form in found:
+        if form.outputs is not None:
+            forms.append((form, errors.whitened(form.outputs)))
+        elif form.forcing is not None:
+            size = form.forcing.shape[-1]
+            forms.append((form, errors.whitened(traces[..., place : place + size])))
             place += size
-    return WhitenedTangents(errors.whitened(known), told)
+    return WhitenedTangents(errors.whitened(known), forms)
 
 
 def jacobian_by_states(plant: Plant, x: Array, u: Array) -> Array:
-    """Jacobian (n, n, F, R) of the rates, by central differences."""
+    """Return the Jacobian (n, n, F, R) of the rates, by central differences."""
     p = plant.values
     scale = np.abs(x).max((1, 2)) + 1e-9
     columns = []
@@ -113,7 +113,7 @@ def jacobian_by_states(plant: Plant, x: Array, u: Array) -> Array:
 
 
 def _by_inputs(plant: Plant, x: Array, u: Array) -> Array:
-    """(n, k, F, R), by central differences."""
+    """Return the derivatives of the rates by the inputs (n, k, F, R), by central differences."""
     if not len(u):
         return np.zeros((len(x), *u.shape))
     columns = []
@@ -125,7 +125,7 @@ def _by_inputs(plant: Plant, x: Array, u: Array) -> Array:
 
 
 def _by_parameters(plant: Plant, x: Array, u: Array) -> Array:
-    """(n, F, R, p), by central differences."""
+    """Return the derivatives of the rates by the parameters (n, F, R, p), by central differences."""
     p = plant.values
     columns = []
     for k in range(len(p)):
@@ -136,7 +136,7 @@ def _by_parameters(plant: Plant, x: Array, u: Array) -> Array:
 
 
 def _readings_by_parameters(plant: Plant, u: Array) -> Array:
-    """(m, T, R, p) of a system without states, by central differences."""
+    """Return output derivatives (m, T, R, p) of a system without states, by central differences."""
     assert plant.reads is not None
     p, columns = plant.values, []
     for k in range(len(p)):
@@ -147,7 +147,7 @@ def _readings_by_parameters(plant: Plant, u: Array) -> Array:
 
 
 def power(plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: Whitening) -> EffectPower:
-    """Of an effect at its size, about the parameters and first states that follow it best without it."""
+    """Return the power for an effect of a size, about the best fit without it."""
     truth = simulate(plant, trial, hidden, size).outputs
     scene = SystemScene(plant, trial, simulate(plant, trial))
     best = scene, errors.whitened(truth - scene.course.outputs)
@@ -163,7 +163,7 @@ def power(plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: 
 
 
 def moved(plant: Plant, trial: RunSet, step: Array) -> tuple[Plant, RunSet]:
-    """Parameters and first states (p + nR,) further by a step."""
+    """Add a step to the parameters and initial states (p + nR,)."""
     p = len(plant.parameters)
     values = dict(zip(plant.parameters, (plant.values + step[:p]).tolist(), strict=True))
     begin = trial.begin + step[p:].reshape(trial.runs, -1).T
@@ -171,53 +171,55 @@ def moved(plant: Plant, trial: RunSet, step: Array) -> tuple[Plant, RunSet]:
 
 
 class Judge:
-    """Accounts with the known parameters projected out, ready to be compared with whatever a hidden effect leaves."""
+    """Rival forms with the known parameters projected out, for comparison with a hidden effect."""
 
     def __init__(self, found: WhitenedTangents) -> None:
         self._basis = range_of(found.known)
-        self._accounts = [
-            ((account.effect, account.at), Cone(self._beside(columns), positive=account.positive))
-            for account, columns in found.accounts
+        self._cones = [
+            ((form.effect, form.at), Cone(self._projected(columns), positive=form.positive))
+            for form, columns in found.forms
         ]
 
-    def _beside(self, columns: Array) -> Array:
+    def _projected(self, columns: Array) -> Array:
         return columns - self._basis @ (self._basis.T @ columns)
 
     def power(self, left: Array, hidden: HiddenTerm) -> EffectPower:
-        """Of an effect that leaves so much (M,)."""
-        left = self._beside(left)
+        """Return the power for an effect with this residual (M,)."""
+        left = self._projected(left)
         total = float(left @ left)
         missed: dict[Key, float] = {}
-        for key, cone in self._accounts:
+        for key, cone in self._cones:
             missed[key] = min(missed.get(key, total), max(total - cone.explained(left), 0.0))
         own = min((value for key, value in missed.items() if _is_own(key, hidden)), default=0.0)
-        told = [
+        rivals = [
             RivalPower(*key, _KEPT * math.sqrt(max(value - own, 0.0)))
             for key, value in missed.items()
             if not _is_own(key, hidden) and not _contains(key, hidden) and key[0] not in hidden.twins
         ]
-        told.sort(key=lambda rival: rival.z_sep)
+        rivals.sort(key=lambda rival: rival.z_sep)
         larger = [RivalPower(*key, 0.0) for key in missed if _contains(key, hidden) and own - missed[key] > _CLEARLY]
         larger += [RivalPower(*key, 0.0) for key in missed if key[0] in hidden.twins]
         z = _KEPT * math.sqrt(total)
-        return EffectPower(z, min([z, *(r.z_sep for r in told)]), _KEPT * math.sqrt(own), tuple(told), tuple(larger))
+        return EffectPower(
+            z, min([z, *(r.z_sep for r in rivals)]), _KEPT * math.sqrt(own), tuple(rivals), tuple(larger)
+        )
 
 
 Key = tuple[str, tuple[str, ...]]
-"""An effect and where it acts."""
+"""Return the name of an effect with its ports."""
 
 
 def names(scene: SystemScene) -> frozenset[Key]:
-    """All that a diagnosis could say: dry friction, say, it could not at speeds that never reverse."""
+    """Return the forms that a diagnosis could report; dry friction, for example, needs reversing speeds."""
     if scene.plant.reads is not None:
         found = readings(scene)
     else:
-        found = accounts(scene, _by_inputs(scene.plant, scene.course.states, scene.course.inputs))
-    return frozenset((account.effect, account.at) for account in found)
+        found = rival_forms(scene, _by_inputs(scene.plant, scene.course.states, scene.course.inputs))
+    return frozenset((form.effect, form.at) for form in found)
 
 
 def can_be_named(hidden: HiddenTerm, known: frozenset[Key]) -> bool:
-    """Whether one of the names is that of the effect, at one of its places."""
+    """Whether one of the names is the effect at one of its ports."""
     return any(_is_own(key, hidden) for key in known)
 
 
@@ -230,7 +232,7 @@ def _contains(key: Key, hidden: HiddenTerm) -> bool:
 
 
 class Cone:
-    """What columns (M, q) can explain, with amplitudes of any sign or none below 0.
+    """The span of columns (M, q), with amplitudes of any sign or ≥ 0.
 
     Example:
         >>> column = np.array([[1.0], [0.0]])
@@ -249,7 +251,7 @@ class Cone:
         ]
 
     def explained(self, left: Array) -> float:
-        """Squared length that they take off ``left`` (M,)."""
+        """Return the squared length of ``left`` (M,) that the columns explain."""
         best = 0.0
         for columns, inverse in self._faces:
             amplitudes = inverse @ left
@@ -260,13 +262,13 @@ class Cone:
 
 
 def least_squares(columns: Array, left: Array) -> Array:
-    """The step (q,) along columns (M, q) that takes most off ``left`` (M,)."""
+    """Return the amplitudes (q,) of columns (M, q) that explain most of ``left`` (M,)."""
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     return np.linalg.lstsq(columns / size, left, rcond=_RANK)[0] / size
 
 
 def range_of(columns: Array) -> Array:
-    """An orthonormal basis (M, r) of columns of any size."""
+    """Return an orthonormal basis (M, r) of columns of any size."""
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     u, s, _ = np.linalg.svd(columns / size, full_matrices=False)
     return u[:, s > _RANK * s[0]]

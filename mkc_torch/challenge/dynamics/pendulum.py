@@ -1,4 +1,4 @@
-"""A pendulum that a motor turns, of which the angle alone is measured."""
+"""A motor-driven pendulum. Only the angle is measured."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
-    """Swings from a deflection, driven by torques in N m about the pendulum's own period."""
+    """Draw swings from an initial deflection, with torques in N m at frequencies about that of the pendulum."""
     time = moments(STEP, samples)
     period = 2.0 * np.pi / np.sqrt(plant.parameters["stiffness"])
     torques = [uniform(g, 2.0, 5.0) * excitation(g, time, period) for _ in range(runs)]

@@ -1,4 +1,4 @@
-"""A system as everybody knows it, the runs that are made with it, and what may be hidden in it."""
+"""A system with its known physics, its runs, and the effects that may be hidden in it."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 Rate = Callable[[Array, Array, Array], Array]
-"""From states (n, *), inputs (k, *) and parameters (p,) the rates of the states (n, *)."""
+"""Returns the rates of the states (n, *), given states (n, *), inputs (k, *) and parameters (p,)."""
 
 
 @dataclass(frozen=True)
 class Plant:
-    """A system without what is hidden, in state space.
+    """A system without hidden effects, in state space.
 
     Attributes:
-        name: of the system, with which the names of its recordings begin.
-        states, inputs: their names, in the order of ``rate``.
-        outputs: those states that are measured.
-        units: of states.
-        speeds: position to the state that is its speed.
-        parameters: name to true value, in the order of ``rate``.
-        fine: even number of steps of the integration between two samples.
-        reads: of a system without states, its outputs (m, *) from inputs (k, *) and parameters (p,).
+        name: name of the system, the prefix of its recordings' names.
+        states, inputs: names, in the order of ``rate``.
+        outputs: the measured states.
+        units: units of the states.
+        speeds: state of the speed, by its position.
+        parameters: true values by name, in the order of ``rate``.
+        fine: even number of integration steps between two samples.
+        reads: for a system without states, returns its outputs (m, *), given inputs (k, *) and parameters (p,).
     """
 
     name: str
@@ -45,11 +45,11 @@ class Plant:
 
     @property
     def values(self) -> Array:
-        """(p,) of the parameters."""
+        """True values of the parameters (p,)."""
         return np.array(list(self.parameters.values()))
 
     def read(self, states: Array, inputs: Array) -> Array:
-        """Outputs (m, F, R) at states (n, F, R) and inputs (k, F, R)."""
+        """Return outputs (m, F, R), given states (n, F, R) and inputs (k, F, R)."""
         if self.reads is not None:
             return self.reads(inputs, self.values)
         return states[[self.row(name) for name in self.outputs]]
@@ -57,9 +57,9 @@ class Plant:
 
 @dataclass(frozen=True)
 class RunSet:
-    """Runs of one length: inputs (k, T, R) at the samples, and first states (n, R).
+    """Runs of one length: inputs (k, T, R) at the samples, and initial states (n, R).
 
-    Between samples inputs are linear, or ``held`` at what they were at the sample before.
+    Between samples the inputs are linear, or ``held`` at the previous sample.
     """
 
     step: float
@@ -79,10 +79,10 @@ class RunSet:
 
 
 RateChange = Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
-"""From states (n, R), own states (e, R), inputs (k, R), known rates (n, R) and sizes (R,): rates (n, R), own (e, R)."""
+"""Returns rates (n, R) and own rates (e, R), given states, own states (e, R), inputs, known rates, and sizes (R,)."""
 
 SignalChange = Callable[[Array, float, float], Array]
-"""From signals (channels, moments, R), the time between moments in s and a size: the signals as changed."""
+"""Returns changed signals (channels, times, R), given the signals, the time step in s, and a size."""
 
 
 def _unchanged(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
@@ -91,18 +91,18 @@ def _unchanged(values: Array, step: float, size: float) -> Array:  # noqa: ARG00
 
 @dataclass(frozen=True)
 class HiddenTerm:
-    """An effect before its size is known; of size 0 it is not there.
+    """An effect without its size; size 0 is no effect.
 
     Attributes:
-        effect: what a diagnosis should call it.
-        form: what it really is.
-        at: where a diagnosis may say that it acts, one place of several being enough.
-        large: a size that nobody could overlook.
-        rate: what it makes of the rates; None if it leaves them alone.
+        effect: right name in a diagnosis.
+        form: the true form.
+        at: right ports in a diagnosis; one of them suffices.
+        large: an obvious size.
+        rate: change of the rates; None for no change.
         own: number of states of its own.
-        inputs, outputs: what it makes of inputs and of what is measured.
-        begin: from first states (n, R) its own ones (e, R); None where they begin at 0.
-        twins: names of the same thing at another place, from which no data tells it.
+        inputs, outputs: changes of the inputs and of the measured outputs.
+        begin: returns initial own states (e, R), given initial states (n, R); None for 0.
+        twins: names of the same effect at another port that no data can distinguish.
     """
 
     effect: str
@@ -119,7 +119,7 @@ class HiddenTerm:
 
 @dataclass(frozen=True)
 class Setting:
-    """A plant, its runs, and those of the second recording."""
+    """A plant, its runs, and the runs of the second recording."""
 
     plant: Plant
     trial: RunSet

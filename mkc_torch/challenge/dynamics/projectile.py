@@ -1,4 +1,4 @@
-"""Throws of a ball that a camera follows; places are measured, speeds are not."""
+"""Throws of a ball that a camera follows. Positions are measured, speeds are not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int) -> RunSet:
-    """Throws at 20 to 75 degrees, either way."""
+    """Draw throws at 20 to 75 degrees, in both directions."""
     begin = []
     for _ in range(runs):
         pace, rise, way = uniform(g, 9.0, 18.0), np.radians(uniform(g, 20.0, 75.0)), choose(g, (-1.0, 1.0))
@@ -50,7 +50,7 @@ PLACES = (hidden.rate_of("speed"), hidden.rate_of("climb"))
 
 
 def air(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Drag along the velocity, which is more than the catalogue's along each axis."""
+    """Drag along the velocity, unlike the catalogue's drag along each axis."""
     typical = float(np.median(np.hypot(scene.state("speed"), scene.state("climb"))))
     form = forces.flight_drag((2, 3), typical, log_uniform(g, 1e3, 1e5))
     return HiddenTerm("quadratic_drag", "drag of a sphere along its velocity", PLACES, 0.5, form)
@@ -63,7 +63,7 @@ def syrup(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one
 
 
 def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-    """The camera is not level: both axes turn, and gravity has a part along the first."""
+    """The camera is tilted: both axes turn, and gravity has a component along the first."""
 
     def turned(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         one, other = values
@@ -73,19 +73,19 @@ def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG0
 
 
 def fading_gust(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """A push from the side that fades a little."""
+    """A lateral force that decays a little."""
     form = forces.warming_bias(2, uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
-    return HiddenTerm("constant_force", "push that fades", (hidden.rate_of("speed"),), 5.0, form, own=1)
+    return HiddenTerm("constant_force", "decaying force", (hidden.rate_of("speed"),), 5.0, form, own=1)
 
 
 def spin(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """A ball thrown with spin, which fades."""
+    """A ball thrown with spin that decays."""
     form = forces.lift((2, 3), uniform(g, 3.0, 10.0) * scene.length)
     return HiddenTerm("magnus_lift", "lift of a fading spin", PLACES, 0.5, form, own=1)
 
 
 def gusts(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Gusts from the side that come and go."""
+    """Lateral gusts."""
     form = forces.hum(2, uniform(g, 2.0, 6.0) / scene.length)
     return HiddenTerm("vibration", "sinusoid of time", (hidden.rate_of("speed"),), 30.0, form, own=2)
 

@@ -1,4 +1,4 @@
-"""What a diagnosis could say of a system without states: textbook forms of what its outputs and its input lack."""
+"""Rival forms for a system without states: textbook forms of effects on its outputs and its input."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transpor
 
 
 def readings(scene: SystemScene) -> list[RivalModel]:
-    """All forms at all outputs and inputs of a plant that is read at once."""
+    """Return all forms at all outputs and inputs of a plant without states."""
     plant, step = scene.plant, scene.trial.step / scene.plant.fine
     assert plant.reads is not None
     inputs = scene.course.inputs
@@ -34,7 +34,7 @@ def readings(scene: SystemScene) -> list[RivalModel]:
 
 
 def output_forms(y: Array, step: float, length: float) -> Iterator[tuple[str, Array, bool]]:
-    """Forms of one output (1, F, R): effect, what it adds (F, R, q), and whether amplitudes are positive."""
+    """Yield the forms of an output (1, F, R): effect, added columns (F, R, q), and whether amplitudes are positive."""
     largest, (own,) = float(np.abs(y).max()), y
     yield "offset", np.ones_like(own)[..., None], False
     yield "gravity_sag", np.stack([np.cos(own), np.sin(own)], -1), False

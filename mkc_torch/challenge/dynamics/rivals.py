@@ -1,6 +1,6 @@
-"""What a diagnosis could say of a system: textbook forms of missing physics, each linear in its amplitudes.
+"""Rival forms for a system: textbook forms of missing physics, each linear in its amplitudes.
 
-Written anew from the same textbooks as the catalogue, so that the oracle owes it nothing.
+They are written independently of the catalogue, from the same textbooks, so that the oracle does not depend on it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mkc_torch.challenge.dynamics.stores import swung
 from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
 _REVERSED = 0.05
-"""Share of the time in either direction from which a state counts as one that reverses."""
+"""Smallest share of the time in each direction for a state that counts as reversing."""
 
 SHIFTS = tuple(float(s) for s in np.geomspace(0.0007, 0.1, 24))
 """Delays and lags, as shares of a run."""
@@ -29,14 +29,14 @@ SUPERSETS = {
     "quadratic_drag": ("power_law",),
     "cubic_stiffness": ("power_law",),
 }
-"""Effects that contain another: not its rivals, for they can always follow it."""
+"""Effects that contain another effect. They are not its rivals, because they always fit it."""
 
 
 @dataclass(frozen=True)
 class RivalModel:
-    """One form: what it adds to the rates (n, F, R, q), or to the outputs (m, T, R, q), for amplitudes of one.
+    """A form: columns added to the rates (n, F, R, q), or to the outputs (m, T, R, q), for amplitudes of 1.
 
-    ``positive`` says that amplitudes of the other sign are not physics.
+    ``positive``: amplitudes below 0 are not physical.
     """
 
     effect: str
@@ -46,11 +46,11 @@ class RivalModel:
     positive: bool
 
 
-def accounts(scene: SystemScene, gains: Array) -> list[RivalModel]:
-    """All forms at all places.
+def rival_forms(scene: SystemScene, gains: Array) -> list[RivalModel]:
+    """Return all forms at all ports.
 
     Args:
-        scene: whose course the forms are taken along.
+        scene: the forms are evaluated along its trajectory.
         gains: derivative of the rates by the inputs (n, k, F, R).
     """
     plant = scene.plant
@@ -73,7 +73,7 @@ def accounts(scene: SystemScene, gains: Array) -> list[RivalModel]:
 
 
 def rate_forms(scene: SystemScene, state: str) -> Iterator[tuple[str, Array, bool]]:
-    """Forms on the rate of one state: effect, columns (F, R, q), and whether amplitudes are positive."""
+    """Yield the forms on the rate of a state: effect, columns (F, R, q), and whether amplitudes are positive."""
     plant, v = scene.plant, scene.state(state)
     heat, step = plant.units[state] == "°C", scene.trial.step / plant.fine
     position = next((name for name, speed in plant.speeds.items() if speed == state), None)
@@ -100,17 +100,17 @@ def rate_forms(scene: SystemScene, state: str) -> Iterator[tuple[str, Array, boo
 
 
 EXPONENTS = (0.5, 1.25, 1.5, 1.75, 2.5, 3.0)
-"""Of a power law, beside those of linear and quadratic drag."""
+"""Powers of a power law, in addition to linear and quadratic drag."""
 
 
 def powers(y: Array) -> Iterator[Array]:
-    """What drives back by a power of y (F, R), whose largest value is 1: a column (F, R, 1) each."""
+    """Return restoring terms by powers of y (F, R), each with largest value 1: columns (F, R, 1)."""
     for exponent in EXPONENTS:
         yield -(np.sign(y) * np.abs(y) ** exponent)[..., None]
 
 
 def _memories(v: Array, step: float, length: float, *, swings: bool) -> Iterator[tuple[str, Array, bool]]:
-    """A second store that follows a state, and a mass that swings along."""
+    """Yield a second store that follows a state, and a coupled oscillating mass."""
     constants = length * np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.15])
     for constant, behind in zip(constants, np.moveaxis(lagged_each(v[None], step, constants)[0], -1, 0), strict=True):
         yield "hidden_lag", ((behind - v) / constant)[..., None], True
@@ -122,7 +122,7 @@ def _memories(v: Array, step: float, length: float, *, swings: bool) -> Iterator
 
 
 def _load(scene: SystemScene, state: str, position: str | None) -> Array | None:
-    """What drives a speed against what holds it, both at standstill (F, R); None without inputs or a position."""
+    """Return driving and holding force at standstill (F, R); None without inputs or a position."""
     plant, course = scene.plant, scene.course
     if position is None or not plant.inputs:
         return None
@@ -146,7 +146,7 @@ def _frictions(v: Array, typical: float, load: Array | None) -> Iterator[tuple[s
 
 
 def wound_up(x: Array, share: float) -> Array:
-    """Bouc and Wen's hysteretic deflection (F, R) along positions (F, R), that yields at a share of the largest."""
+    """Return the Bouc-Wen deflection (F, R) along positions (F, R); it yields at a share of the largest."""
     limit = share * np.abs(x).max()
     z = np.zeros_like(x)
     for k in range(1, len(x)):
@@ -174,7 +174,7 @@ def _position_forms(x: Array, unit: str, *, named_height: bool) -> Iterator[tupl
 
 
 def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Array]]:
-    """Forms of one input (1, F, R): effect and what it adds (F, R)."""
+    """Yield the forms of an input (1, F, R): effect and added signal (F, R)."""
     largest = float(np.abs(u).max())
     for share in SHIFTS:
         yield "input_delay", (transport(u, step, share * length) - u)[0]

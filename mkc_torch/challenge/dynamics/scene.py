@@ -1,4 +1,4 @@
-"""How large things are in the runs of a plant: what the sizes of hidden physics are measured by."""
+"""Typical magnitudes in the runs of a plant, which scale the hidden effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet
 
 @dataclass(frozen=True)
 class SystemScene:
-    """A plant and its course with nothing hidden."""
+    """A plant and its trajectory without hidden effects."""
 
     plant: Plant
     trial: RunSet
@@ -23,14 +23,14 @@ class SystemScene:
         return self.course.states[self.plant.row(name)]
 
     def typical(self, name: str) -> float:
-        """Median of the absolute value of a state."""
+        """Return the median absolute value of a state."""
         return float(np.median(np.abs(self.state(name))))
 
     def largest(self, name: str) -> float:
         return float(np.abs(self.state(name)).max())
 
     def pace(self, name: str) -> float:
-        """Root mean square of the rate of a state."""
+        """Return the RMS rate of a state."""
         rates = self.plant.rate(self.course.states, self.course.inputs, self.plant.values)
         return float(np.sqrt(np.square(rates[self.plant.row(name)]).mean()))
 

@@ -1,4 +1,4 @@
-"""How well a corrected simulation runs free on a recording that it has not seen, beside the true system."""
+"""Open-loop error of a corrected simulation on an unseen recording, relative to the true system."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from mkc_torch.recording.recording import Recording
 def oracle_rms(
     plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: Errors, left: Array, good: np.ndarray
 ) -> float:
-    """Root mean square of what the true system leaves on good samples, its first state estimated from them.
+    """Return the RMS residual of the true system on inliers, with its initial state estimated from them.
 
     Args:
         plant, trial, hidden, size: the truth.
-        errors: of the outputs.
-        left: measured less true outputs (m, T, R).
-        good: samples that are no outliers (m, T, R).
+        errors: noise of the outputs.
+        left: measured minus true outputs (m, T, R).
+        good: mask of inliers (m, T, R).
 
     Returns:
         In standard deviations of the outputs' errors.
@@ -34,7 +34,7 @@ def oracle_rms(
     scale = np.reshape(errors.deviations, (-1, 1, 1))
     reach = 1e-4 * (np.abs(trial.begin).max(1) + 1e-3)
     n, runs = trial.begin.shape
-    # the truth, and beside it one more copy of all runs for each state that begins elsewhere
+    # the truth, and a copy of all runs for each state with another initial value
     begin = np.tile(trial.begin, n + 1)
     for state in range(n):
         begin[state, runs * (state + 1) : runs * (state + 2)] += reach[state]
@@ -42,7 +42,7 @@ def oracle_rms(
     truth, *moved = np.split(simulate(plant, copies, hidden, size).outputs, n + 1, -1)
     columns: list[Array] = []
     rest = (left / scale)[good]
-    if not moved:  # a system without states has nothing to begin with
+    if not moved:  # a system without states has no initial state
         return float(np.sqrt(np.square(rest).mean()))
     for state, there in enumerate(moved):
         change = (there - truth) / scale / reach[state]
@@ -53,16 +53,15 @@ def oracle_rms(
 
 
 def ratio_to_oracle(simulated: Mapping[str, Tensor], second: Recording, key: Key) -> float:
-    """Root mean square error of a free run on good samples, relative to the oracle's.
+    """Return the RMS error of an open-loop run on inliers, relative to the oracle's.
 
     Args:
-        simulated: the outputs of the corrected simulation.
-        second: the recording they are to follow.
-        key: of the case, with ``oracle_rms``, the errors' standard deviations, and the outliers, which are numbered
-            output by output.
+        simulated: outputs of the corrected simulation.
+        second: the unseen recording.
+        key: key of the case, with ``oracle_rms``, the noise, and the numbers of the outliers, output by output.
 
     Returns:
-        The ratio; infinite where the run is not finite.
+        The ratio; infinite if the run is not finite.
     """
     deviations: Mapping[str, float] = key.noise["deviation"]
     error = np.concatenate(

@@ -1,4 +1,4 @@
-"""A joint that a servo holds where it is told to be: its angle is its command's, as a user's simulation says."""
+"""A servo joint: in the nominal simulation its angle equals the command."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEP = 0.02
 """s."""
 
 PLANNED = 0.08
-"""Time constant in s by which the planner rounds a jump, twice: behind one, a delay would show in a sample alone."""
+"""Time constant in s of the planner's second-order smoothing; after a jump a delay would affect a single sample."""
 
 AT = ("angle",)
 
@@ -45,7 +45,7 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int, samples: int) -> RunSet:
-    """Commands of either sign in rad, as a planner sends them, without jumps."""
+    """Draw commands of both signs in rad, without jumps, as from a planner."""
     time = moments(STEP, samples)
     wanted = runs_of([uniform(g, 0.7, 1.4) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)])
     return RunSet(
@@ -54,7 +54,7 @@ def trial(g: Generator, runs: int, samples: int) -> RunSet:
 
 
 def late(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """The bus and the loop of the servo take their time."""
+    """Delay of the bus and lag of the servo's loop."""
     pipe = happens(g, 0.5)
     form = "transport" if pipe else "four lags in series"
     change = transducers.transport if pipe else transducers.lags(4)
@@ -62,19 +62,19 @@ def late(g: Generator, scene: SystemScene) -> HiddenTerm:
 
 
 def worn(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-    """Play of the gear; what is behind the command and what is before the angle is the same here."""
+    """Backlash of the gear; at the command and at the angle it is the same here."""
     large = 0.3 * scene.largest_input("command")
     return HiddenTerm("backlash", "uneven teeth", (*AT, "input command"), large, outputs=transducers.worn_gear)
 
 
 def wrong_zero(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-    """A horn that sits a tooth off, on a shaft that is not quite round."""
+    """A horn mounted a tooth off, on an eccentric shaft."""
     change = transducers.wrong_zero(uniform(g, 0.0, 0.1), uniform(g, 0.0, 2.0 * math.pi))
     return HiddenTerm("offset", "zero of an eccentric shaft", AT, 0.2, outputs=change)
 
 
 def load(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-    """A load that the loop gives way to."""
+    """A load that deflects the loop."""
     change = transducers.sagging(uniform(g, -0.5, 0.5))
     return HiddenTerm("gravity_sag", "weight on a soft joint", AT, 0.3, outputs=change)
 

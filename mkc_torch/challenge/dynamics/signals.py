@@ -12,12 +12,12 @@ from mkc_torch.challenge.dynamics.plant import Array
 
 
 def moments(step: float, samples: int) -> Array:
-    """(T,) s from 0, ``step`` apart."""
+    """Return times (T,) from 0, ``step`` apart, s."""
     return np.arange(samples, dtype=np.float64) * step
 
 
 def multisine(g: Generator, time: Array, slowest: float, fastest: float) -> Array:
-    """(T,) of sinusoids whose frequencies lie between two, in Hz; its largest value is 1."""
+    """Draw a multisine (T,) with frequencies in a range in Hz; its largest value is 1."""
     total = np.zeros_like(time)
     for _ in range(whole(g, 3, 6)):
         frequency, phase = log_uniform(g, slowest, fastest), uniform(g, 0.0, 2.0 * math.pi)
@@ -26,7 +26,7 @@ def multisine(g: Generator, time: Array, slowest: float, fastest: float) -> Arra
 
 
 def steps(g: Generator, time: Array, shortest: float, longest: float) -> Array:
-    """(T,) of levels between -1 and 1, of either sign in turn, each held for a random while in s."""
+    """Draw steps (T,) between -1 and 1 with alternating signs, each held for a random time in s."""
     values = np.empty_like(time)
     start, way = 0.0, 1.0 if happens(g, 0.5) else -1.0
     while start <= time[-1]:
@@ -37,12 +37,12 @@ def steps(g: Generator, time: Array, shortest: float, longest: float) -> Array:
 
 
 def excitation(g: Generator, time: Array, period: float) -> Array:
-    """(T,) between -1 and 1: a multisine or steps about a system's own period in s."""
+    """Draw a multisine or steps (T,) between -1 and 1, about a system's period in s."""
     if happens(g, 0.6):
         return multisine(g, time, 0.15 / period, 1.5 / period)
     return steps(g, time, 0.3 * period, 2.0 * period)
 
 
 def runs_of(signals: list[Array]) -> Array:
-    """(1, T, R) of one input's runs."""
+    """Stack the runs of one input to (1, T, R)."""
     return np.stack(signals, -1)[None]

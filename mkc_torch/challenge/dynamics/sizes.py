@@ -1,4 +1,4 @@
-"""How large a hidden effect is drawn: by z_sep or by z, but never so large that nobody could miss it."""
+"""Draw the size of a hidden effect by z_sep or z, below an obvious size."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mkc_torch.challenge.dynamics.plant import HiddenTerm
 from mkc_torch.challenge.dynamics.scene import SystemScene
 
 STRONG_SHARE = 0.7
-"""Share of the effects of the catalogue whose size is drawn by z_sep; that of the others by z."""
+"""Share of the effects of the catalogue whose size is drawn by z_sep; the others are drawn by z."""
 
 STRONG_Z_SEP = (12.0, 70.0)
 FREE_Z = (3.0, 60.0)
@@ -24,17 +24,17 @@ MOST_Z = 250.0
 
 _TRIED = 12
 _LEAST = 1e-3
-"""Smallest size that is tried, as a share of the large one."""
+"""Smallest size that is tried, as a share of the obvious size."""
 
 
 def draw_size(g: Generator, hidden: HiddenTerm, scene: SystemScene, errors: Whitening, *, outside: bool) -> float:
-    """A size between a trifle and ``hidden.large``.
+    """Draw a size below ``hidden.large``.
 
     Args:
         hidden: the effect.
-        scene: the runs with nothing hidden.
-        errors: of the outputs.
-        outside: the effect is none of the catalogue's, and has no rivals to be told from.
+        scene: the runs without hidden effects.
+        errors: noise of the outputs.
+        outside: whether the effect is outside the catalogue and has no rivals.
     """
     strong = not outside and happens(g, STRONG_SHARE)
     wanted = log_uniform(g, *(OUTSIDE_Z if outside else STRONG_Z_SEP if strong else FREE_Z))
@@ -43,7 +43,7 @@ def draw_size(g: Generator, hidden: HiddenTerm, scene: SystemScene, errors: Whit
     before = 0.0
     for k, there in enumerate(outputs_of_sizes(scene.plant, scene.trial, hidden, sizes)):
         seen = judge.power(errors.whitened(there - scene.course.outputs), hidden)
-        # how near it is to the one limit or the other; 1 is there
+        # ratio to the limits; 1 is at a limit
         share = max(seen.z / MOST_Z, (seen.z_sep if strong else seen.z) / wanted)
         if share >= 1.0:
             between = math.log(before) / math.log(before / share) if before > 0.0 else 1.0

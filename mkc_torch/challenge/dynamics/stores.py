@@ -1,4 +1,4 @@
-"""What goes along with a state and that nobody measures: a second store behind a resistance, a mass on a spring."""
+"""Unmeasured companions of a state: a second store behind a resistance, a mass on a spring."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from mkc_torch.challenge.dynamics.plant import Array, RateChange
 
 
 def second_store(row: int, flow: Callable[[Array], Array]) -> RateChange:
-    """A store beside that of one state, whose capacity is ``size`` of it; one own state, in the state's unit.
+    """A store connected to that of a state, with ``size`` times its capacity; one own state, in the state's unit.
 
     Args:
-        row: of the state.
-        flow: rate at which the store follows, of how far it is away; both positive.
+        row: row of the state.
+        flow: rate of the store, given its distance from the state; both are positive.
 
     References:
         Bacher & Madsen, "Identifying suitable models for the heat dynamics of buildings", Energy and Buildings 43
@@ -32,13 +32,13 @@ def second_store(row: int, flow: Callable[[Array], Array]) -> RateChange:
 
 
 def second_mass(row: int, omega: float, damping: float, bend: float) -> RateChange:
-    """A mass, ``size`` of the first, on a spring that hardens; own states: the spring's deflection, the mass's speed.
+    """A mass of ``size`` times the first on a hardening spring. Own states: the spring's deflection, the mass's speed.
 
     Args:
-        row: of the speed that carries it.
+        row: row of the speed of its support.
         omega: natural frequency of the mass on the spring in rad/s, for small deflections.
         damping: share of critical damping.
-        bend: by which share the spring is stiffer, over the square of the deflection.
+        bend: relative increase of the stiffness over the square of the deflection.
 
     References:
         Den Hartog, "Mechanical Vibrations" (1956), 3.2; Spong, "Modeling and control of elastic joint robots" (1987).
@@ -55,21 +55,21 @@ def second_mass(row: int, omega: float, damping: float, bend: float) -> RateChan
 
 
 def like(row: int) -> Callable[[Array], Array]:
-    """Own states (1, R) that begin as one state of (n, R) does."""
+    """Return initial own states (1, R), equal to one of the states (n, R)."""
     return lambda begin: begin[[row]]
 
 
 def unstretched(row: int) -> Callable[[Array], Array]:
-    """Own states (2, R): a deflection of 0 and the speed of what carries it."""
+    """Return initial own states (2, R): a deflection of 0 and the speed of the support."""
     return lambda begin: np.stack([np.zeros_like(begin[row]), begin[row]])
 
 
 def swung(speed: Array, step: float, omegas: Array, dampings: Array) -> Array:
-    """What masses on springs pull with at a support whose speed is known, for each unit of mass.
+    """Return the force of masses on springs at a support with known speed, for each unit of mass.
 
     Args:
-        speed: of the support (F, R), straight from moment to moment.
-        step: between moments in s.
+        speed: speed of the support (F, R), linear between times.
+        step: time step in s.
         omegas: natural frequencies in rad/s (q,).
         dampings: shares of critical damping (q,), below 1.
 

@@ -1,4 +1,4 @@
-"""The proof of differential equations of a user's own."""
+"""The proof of differential equations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mkc_torch.challenge.subject import Case, Subject
 
 
 def dynamics() -> Subject:
-    """Recordings of seven systems, each to be compared with a simulation as a user would write it."""
+    """Return the subject: recordings of seven systems, each compared with its nominal simulation."""
     return Subject(
         name="dynamics",
         cases=100,
@@ -24,7 +24,7 @@ def dynamics() -> Subject:
 
 
 def simulation_class(recording: Path) -> str:
-    """The class in the file of simulations that a recording is of, by the name of its file.
+    """Return the class of simulation for a recording, by the name of its file.
 
     Example:
         >>> simulation_class(Path("cart_pole_00012.csv"))

@@ -1,4 +1,4 @@
-"""Two tanks side by side, each with a pump and an outlet of its own."""
+"""Two tanks, each with a pump and an outlet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEP = 2.0
 """s."""
 
 FLOOR = 1e-4
-"""Level below which an outlet is held to be dry, m."""
+"""Level below which an outlet counts as dry, m."""
 
 
 def rate(x: Array, u: Array, p: Array) -> Array:
@@ -47,18 +47,18 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int, samples: int) -> RunSet:
-    """Pumps between 0.5 and 9.5 V, from a first level of 0.1 to 0.7 m."""
+    """Draw pump voltages between 0.5 and 9.5 V, and initial levels of 0.1 to 0.7 m."""
     time = moments(STEP, samples)
     pumps = [
         [5.0 + uniform(g, 2.5, 4.5) * excitation(g, time, uniform(g, 60.0, 150.0)) for _ in range(runs)]
         for _ in range(2)
     ]
     begin = np.array([[uniform(g, 0.1, 0.7) for _ in range(runs)] for _ in range(2)])
-    return RunSet(STEP, np.stack([np.stack(one, -1) for one in pumps]), begin)
+    return RunSet(STEP, np.stack([np.stack(pump, -1) for pump in pumps]), begin)
 
 
 def pipe_between(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """A pipe with a filter in it, by Darcy and Forchheimer."""
+    """A pipe with a filter, by Darcy and Forchheimer."""
     away = np.abs(scene.state("level_1") - scene.state("level_2"))
     typical, bend = float(np.median(away)), uniform(g, 0.0, 0.5)
     form = flows.exchange(0, 1, lambda head: flows.forchheimer(head, bend / typical), uniform(g, 0.7, 1.4))
@@ -75,7 +75,7 @@ def dripping_tap(level: str) -> hidden.Draw:
 
 
 def gravel(g: Generator, typical: float) -> Callable[[Array], Array]:
-    """A wall of gravel to a side basin, by Darcy and Forchheimer."""
+    """A gravel wall to a side basin, by Darcy and Forchheimer."""
     bend = uniform(g, 0.0, 0.3) / typical
     return lambda head: flows.forchheimer(head, bend)
 
@@ -89,7 +89,7 @@ def crack(level: str) -> hidden.Draw:
 
 
 def wavy_inflow(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Rain that comes and goes."""
+    """Intermittent rain."""
     form = forces.hum(0, uniform(g, 3.0, 15.0) / scene.length)
     return HiddenTerm("vibration", "sinusoid of time", (hidden.rate_of("level_1"),), scene.pace("level_1"), form, own=2)
 

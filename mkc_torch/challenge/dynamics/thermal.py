@@ -1,4 +1,4 @@
-"""Two heated bodies in a room, each with a loss of its own."""
+"""Two heated bodies in a room, each with its heat loss."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int, samples: int) -> RunSet:
-    """Heaters between 0 and 100 W, from a warm or a cold body."""
+    """Draw heater powers between 0 and 100 W, for warm or cold bodies."""
     time = moments(STEP, samples)
     heaters = [
         [50.0 + uniform(g, 30.0, 48.0) * excitation(g, time, uniform(g, 200.0, 600.0)) for _ in range(runs)]
         for _ in range(2)
     ]
     begin = np.array([[uniform(g, 20.0, 150.0) for _ in range(runs)] for _ in range(2)])
-    return RunSet(STEP, np.stack([np.stack(one, -1) for one in heaters]), begin)
+    return RunSet(STEP, np.stack([np.stack(heater, -1) for heater in heaters]), begin)
 
 
 def glow(state: str) -> hidden.Draw:
@@ -68,7 +68,7 @@ def glow(state: str) -> hidden.Draw:
 
 
 def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Heat that air carries over, a little more than in proportion, in proportion to how far they are apart."""
+    """Heat exchange by air, slightly more than linear in the temperature difference."""
     away = np.abs(scene.state("temperature_1") - scene.state("temperature_2"))
     typical, power = float(np.median(away)), uniform(g, 1.0, 1.25)
     form = flows.exchange(0, 1, lambda head: typical * (head / typical) ** power, uniform(g, 0.7, 1.4))
@@ -99,13 +99,13 @@ def rising_air(state: str) -> hidden.Draw:
 
 
 def plaster(g: Generator, typical: float) -> Callable[[Array], Array]:
-    """A wall that takes up heat, by conduction and a little by air that rises."""
+    """A wall that stores heat, by conduction and some natural convection."""
     power = uniform(g, 1.0, 1.1)
     return lambda away: away * (away / typical) ** (power - 1.0)
 
 
 def wax(g: Generator, scene: SystemScene) -> HiddenTerm:
-    """Wax that melts somewhere in the middle of the temperatures."""
+    """Wax that melts in the middle of the temperature range."""
     place = float(np.quantile(scene.state("temperature_1"), uniform(g, 0.3, 0.7)))
     form = flows.melting(0, place, uniform(g, 4.0, 10.0))
     return HiddenTerm("latent_heat", "melting", (hidden.rate_of("temperature_1"),), 3.0, form)

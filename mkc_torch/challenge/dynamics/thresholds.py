@@ -1,4 +1,4 @@
-"""What the proof asks of differential equations. Set before the first scored run."""
+"""Thresholds of the proof of differential equations. Set before the first scored run."""
 
 from __future__ import annotations
 

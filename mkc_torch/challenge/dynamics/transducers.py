@@ -1,4 +1,4 @@
-"""Actuators and sensors that are not quite what is sent to them, and what they measure."""
+"""Imperfect actuators and sensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mkc_torch.challenge.dynamics.plant import Array, SignalChange
 
 
 def only(channel: int, change: SignalChange) -> SignalChange:
-    """The change of one channel of several."""
+    """Apply a change to one of several channels."""
 
     def changed(values: Array, step: float, size: float) -> Array:
         out = values.copy()
@@ -19,7 +19,7 @@ def only(channel: int, change: SignalChange) -> SignalChange:
 
 
 def transport(values: Array, step: float, size: float) -> Array:
-    """A pipe or a bus: everything ``size`` s later; before, what there was at the beginning."""
+    """A delay of ``size`` s; the first value is held before."""
     place = np.maximum(np.arange(values.shape[1]) - size / step, 0.0)
     at = np.minimum(place.astype(int), values.shape[1] - 2)
     share = (place - at)[None, :, None]
@@ -27,7 +27,7 @@ def transport(values: Array, step: float, size: float) -> Array:
 
 
 def lags(count: int) -> SignalChange:
-    """So many lags of first order in series, whose delays sum to ``size`` s."""
+    """First-order lags in series, whose time constants sum to ``size`` s."""
 
     def change(values: Array, step: float, size: float) -> Array:
         for _ in range(count):
@@ -43,7 +43,7 @@ def housing(values: Array, step: float, size: float) -> Array:
 
 
 def lagged(values: Array, step: float, constant: float) -> Array:
-    """``constant ẏ = x - y`` from rest at the first value, exact for an x that is linear between moments.
+    """Solve ``constant ẏ = x - y`` from the first value, exactly for an x that is linear between times.
 
     Example:
         >>> lagged(np.array([[[0.0], [1.0], [2.0]]]), 1.0, 0.0)[0, :, 0].tolist()
@@ -55,10 +55,10 @@ def lagged(values: Array, step: float, constant: float) -> Array:
 
 
 def lagged_each(values: Array, step: float, constants: Array) -> Array:
-    """The same with each of several constants (q,), all of them longer than 0.
+    """Solve ``constant ẏ = x - y`` for several positive constants (q,).
 
     Returns:
-        (channels, moments, R, q).
+        (channels, times, R, q).
     """
     ratio = step / constants
     keep = np.exp(-ratio)
@@ -73,7 +73,7 @@ def lagged_each(values: Array, step: float, constants: Array) -> Array:
 
 
 def play(values: Array, half: float) -> Array:
-    """What follows signals (k, moments, R) over a gap of twice ``half``, in its middle when a run begins.
+    """Return the output of a backlash of ``2 half`` on signals (k, times, R), which starts in the middle of the gap.
 
     Example:
         >>> play(np.array([[[0.0], [3.0], [2.5], [-1.0]]]), 1.0)[0, :, 0].tolist()
@@ -87,7 +87,7 @@ def play(values: Array, half: float) -> Array:
 
 
 def worn_linkage(largest: float) -> SignalChange:
-    """A linkage of several worn joints (Prandtl and Ishlinskii): their mean half gap is ``size`` of the largest."""
+    """A linkage of worn joints (Prandtl-Ishlinskii); the mean half gap is ``size`` times the largest signal."""
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         return np.mean([play(values, share * size * largest) for share in (0.5, 1.0, 1.5)], axis=0)
@@ -96,7 +96,7 @@ def worn_linkage(largest: float) -> SignalChange:
 
 
 def soft_limit(largest: float, sharpness: float) -> SignalChange:
-    """An amplifier that gives way smoothly: its limit is ``largest / size``."""
+    """An amplifier that saturates smoothly at ``largest / size``."""
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         ratio = np.abs(values) * size / largest
@@ -106,7 +106,7 @@ def soft_limit(largest: float, sharpness: float) -> SignalChange:
 
 
 def soft_gap(largest: float) -> SignalChange:
-    """A valve with overlap: commands below ``size`` of the largest do little, and larger ones lose as much."""
+    """A valve with overlap: commands below ``size`` of the largest have little effect; larger are reduced as much."""
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         width = max(size * largest, 1e-12)
@@ -116,12 +116,12 @@ def soft_gap(largest: float) -> SignalChange:
 
 
 def follower(values: Array, step: float, size: float) -> Array:
-    """An actuator that follows its command: a lag of ``size`` s, and its electronics with one of a twelfth."""
+    """An actuator with a lag of ``size`` s, and its electronics with a lag of a twelfth of it."""
     return lagged(lagged(values, step, size), step, size / 12.0)
 
 
 def squared(largest: float, power: float) -> SignalChange:
-    """An actuator that acts by about the square of its command; ``size`` of it does, and it is right at the largest."""
+    """An actuator of which a share ``size`` follows about the square of its command; exact at the largest command."""
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         ratio = values / largest
@@ -131,12 +131,12 @@ def squared(largest: float, power: float) -> SignalChange:
 
 
 def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
-    """A gear whose teeth are worn unevenly: its mean half gap is ``size``."""
+    """A gear with unevenly worn teeth; the mean half gap is ``size``."""
     return np.mean([play(values, share * size) for share in (0.7, 1.0, 1.3)], axis=0)
 
 
 def wrong_zero(share: float, phase: float) -> SignalChange:
-    """A zero that is off by ``size``, and by a share more or less about three times a turn of an angle in rad."""
+    """A zero offset of ``size`` that varies by a share, three times a turn of an angle in rad."""
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         return values + size * (1.0 + share * np.sin(3.0 * values + phase))
@@ -145,10 +145,10 @@ def wrong_zero(share: float, phase: float) -> SignalChange:
 
 
 def sagging(level: float) -> SignalChange:
-    """A joint held by a spring of a controller: its load pulls it aside at the angle where it then is, in rad.
+    """A joint held by a spring-like controller: its load deflects it, depending on its angle in rad.
 
     Args:
-        level: angle at which the link is level; there it sags by ``size``.
+        level: angle at which the link is horizontal; there it deflects by ``size``.
     """
 
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
@@ -161,7 +161,7 @@ def sagging(level: float) -> SignalChange:
 
 
 def shaken(omega: float) -> SignalChange:
-    """A sensor on a machine that shakes, by ``size``, at omega in rad/s."""
+    """A sensor on a vibrating machine, with amplitude ``size`` and frequency omega in rad/s."""
 
     def change(values: Array, step: float, size: float) -> Array:
         return values + size * np.sin(omega * np.arange(values.shape[1]) * step)[None, :, None]

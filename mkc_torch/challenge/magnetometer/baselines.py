@@ -1,4 +1,4 @@
-"""The naive competitor: an ellipsoid by least squares, then stepwise regression of the residual by BIC."""
+"""The baseline: an ellipsoid by least squares, then stepwise regression of the residual by BIC."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_FINDINGS = 3
 
 @dataclass(frozen=True)
 class BaselineCandidate:
-    """Columns that an effect would add to the residual of the norm."""
+    """Return columns that an effect would add to the residual of the norm."""
 
     effect: str
     drivers: tuple[str, ...]
@@ -33,7 +33,7 @@ class BaselineCandidate:
 
 
 def stepwise_bic(recording: Recording) -> dict[str, Any] | None:
-    """What least squares with stepwise BIC would write into ``diagnosis.json``; None where no ellipsoid fits."""
+    """Return ``diagnosis.json`` of least squares with stepwise BIC; None if no ellipsoid fits."""
     points = recording.magnetometer()
     try:
         fit = EllipsoidFit(LeastSquares(), max_scatter=math.inf).fit(points)
@@ -73,7 +73,7 @@ def candidates(recording: Recording, u: Float[Tensor, "N 3"], field: Float[Tenso
 
 
 def _forward(residual: Tensor, nuisance: Tensor, options: list[BaselineCandidate]) -> list[BaselineCandidate]:
-    """Add the candidate that lowers BIC most, until none does."""
+    """Add the candidate that lowers BIC most, until no candidate lowers it."""
     basis = torch.linalg.qr(nuisance).Q
     columns = torch.cat([option.columns for option in options], -1)
     columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300)

@@ -1,4 +1,4 @@
-"""The columns of a recording beside the magnetometer's: recorded drivers, motion, decoys."""
+"""The columns of a recording other than the magnetometer's: drivers, motion, decoys."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 MODES = ("norm", "gyro", "attitude")
 MODE_SHARES = (0.60, 0.15, 0.25)
 PRESENT: Mapping[str, float] = {"temperature": 0.6, "current": 0.5, "position": 0.4, "voltage": 0.3, "accel": 0.2}
-"""Shares of the recordings that have a column which nothing needs."""
+"""Shares of the recordings with an unneeded column, by column."""
 
 _DECIMALS: Mapping[str, int] = {"mag": 4, "gyro": 5, "accel": 4, "position": 4, "temperature": 4, "q": 6}
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Which columns a recording has, and its second too; ``copied`` is the driver that decoys may resemble."""
+    """The columns of both recordings of a case; ``copied`` is the driver that decoys may resemble."""
 
     mode: str
     present: frozenset[str]
@@ -39,7 +39,7 @@ class Plan:
 
 
 def draw_plan(g: Generator, needed: frozenset[str], withheld: frozenset[str]) -> Plan:
-    """Columns that hold what is needed, nothing that is withheld, and others as chance has it."""
+    """Draw the columns: the needed columns, no withheld column, and others at random."""
     mode = choose(g, MODES, MODE_SHARES)
     lucky = frozenset(name for name, share in PRESENT.items() if happens(g, share))
     driver = next(iter(sorted(needed | withheld)), "")
@@ -49,9 +49,9 @@ def draw_plan(g: Generator, needed: frozenset[str], withheld: frozenset[str]) ->
 
 
 def draw_columns(g: Generator, plan: Plan, scene: Scene, noise: Noise) -> dict[str, Float[Tensor, " N"]]:
-    """The columns, but for time and magnetometer.
+    """Return the columns without time and magnetometer.
 
-    The recorded attitude's errors are part of the columns: they reach the residual through the attitude.
+    The attitude has errors, which enter the residual.
     """
     columns: dict[str, Tensor] = {}
     count = len(scene.time)
@@ -76,7 +76,7 @@ def draw_columns(g: Generator, plan: Plan, scene: Scene, noise: Noise) -> dict[s
 
 
 def rounded(columns: Mapping[str, Float[Tensor, " N"]]) -> dict[str, Float[Tensor, " N"]]:
-    """As a logger would print them."""
+    """Round the columns as a logger prints them."""
     return {name: values.round(decimals=_DECIMALS.get(name.split("_")[0], 4)) for name, values in columns.items()}
 
 
@@ -90,7 +90,7 @@ def _vector(name: str, values: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
 
 
 def _recorded_attitude(g: Generator, scene: Scene, noise: Noise) -> Float[Tensor, "N 4"]:
-    """Turned away from the truth by the noise's process about each world axis, and by a constant error."""
+    """Return the attitude with a random error about each world axis, and a constant error."""
     if noise.attitude is None:
         return scene.motion.attitude
     errors = torch.stack([noise.attitude.sample(g, len(scene.time)) for _ in range(3)], -1)

@@ -1,4 +1,4 @@
-"""Columns that drive nothing: trends, walks, and copies of the true driver that are not quite it."""
+"""Columns without effect: trends, random walks, and inexact copies of the true driver."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COPY_SHARES = (0.3, 0.3, 0.1, 0.15, 0.15)
 
 @dataclass(frozen=True)
 class Decoy:
-    """What a column is, and the unit it comes in."""
+    """The kind of a column, and its unit."""
 
     kind: str
     scale: float
@@ -32,7 +32,7 @@ class Decoy:
 
 
 def draw_decoys(g: Generator, *, copies: bool) -> list[Decoy]:
-    """One to five columns of no role; with ``copies`` some may resemble the driver."""
+    """Draw one to five decoys; with ``copies`` some may resemble the driver."""
     kinds = [choose(g, ("trend", "walk", "wave")) for _ in range(whole(g, 1, 3))]
     if copies and happens(g, COPY_SHARE):
         kinds += [choose(g, COPIES, COPY_SHARES) for _ in range(whole(g, 1, 2))]
@@ -43,7 +43,7 @@ def draw_decoys(g: Generator, *, copies: bool) -> list[Decoy]:
 def decoy_column(
     g: Generator, decoy: Decoy, time: Float[Tensor, " N"], driver: Float[Tensor, " N"] | None
 ) -> Float[Tensor, " N"]:
-    """The column in its unit."""
+    """Return the column in its unit."""
     if decoy.kind in COPIES and driver is not None:
         values = copy(g, decoy.kind, time, driver)
     else:
@@ -52,7 +52,7 @@ def decoy_column(
 
 
 def plain(g: Generator, kind: str, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """A column that has nothing to do with anything, about 1 in size."""
+    """Draw an unrelated column of size about 1."""
     count, step = len(time), float(time[1] - time[0])
     if kind == "trend":
         way = choose(g, (-1.0, 1.0))
@@ -63,7 +63,7 @@ def plain(g: Generator, kind: str, time: Float[Tensor, " N"]) -> Float[Tensor, "
 
 
 def copy(g: Generator, kind: str, time: Float[Tensor, " N"], driver: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """A column that resembles the driver: by a correlation, under white noise, or late."""
+    """Draw a column that resembles the driver: correlated, with white noise, or delayed."""
     count, step = len(time), float(time[1] - time[0])
     x = (driver - driver.mean()) / driver.std().clamp(min=1e-12)
     if kind == "noisy":

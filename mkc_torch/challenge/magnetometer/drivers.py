@@ -1,4 +1,4 @@
-"""What drives effects from outside: the temperature and the current, as they are and as they are recorded."""
+"""External drivers: the true and the recorded temperature and current."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def draw_temperature(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """°C: a warm-up, a trend, slow weather, or a heater switched on and off."""
+    """Draw a temperature in °C: a warm-up, a trend, slow weather, or a switched heater."""
     x = time - time[0]
     step = float(x[1])
     start, span = uniform(g, 10.0, 35.0), log_uniform(g, 3.0, 20.0)
@@ -34,14 +34,14 @@ def draw_temperature(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, "
 
 
 def draw_current(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """A, as a throttle makes it: steps, ramps and rests between 0.3 A and a peak of 4-30 A."""
+    """Draw a current in A, as from a throttle: steps, ramps and rests between 0.3 A and a peak of 4-30 A."""
     count, step = len(time), float(time[1] - time[0])
     peak = log_uniform(g, 4.0, 30.0)
     level = 0.0
     values: list[float] = []
     while len(values) < count:
         hold = max(round(uniform(g, 1.0, 9.0) / step), 1)
-        # never a whole recording at rest
+        # no recording has a constant current
         rests = bool(values) and happens(g, 0.25)
         target = 0.0 if rests else uniform(g, 0.1, 1.0)
         rise = max(round(choose(g, (0.05, uniform(g, 0.5, 4.0))) / step), 1)
@@ -53,19 +53,19 @@ def draw_current(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]
 
 
 def recorded_temperature(g: Generator, true: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """With 0.02-0.1 K of noise, in steps of a sixteenth of a kelvin or a hundredth."""
+    """Add noise of 0.02-0.1 K, and round to 1/16 K or 1/100 K."""
     noisy = true + uniform(g, 0.02, 0.1) * normal(g, len(true))
     return quantised(noisy, choose(g, (0.0625, 0.01)))
 
 
 def recorded_current(g: Generator, true: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """With noise of 0.3-1 % of the range, in steps of 0.01-0.1 A."""
+    """Add noise of 0.3-1 % of the range, and round to 0.01-0.1 A."""
     spread = uniform(g, 0.003, 0.01) * float(true.max())
     return quantised(true + spread * normal(g, len(true)), choose(g, (0.01, 0.05, 0.1)))
 
 
 def recorded_voltage(g: Generator, current: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """V: a battery that sags under the current and runs down."""
+    """Return the voltage in V of a battery that sags under the current and discharges."""
     cells = whole(g, 2, 6)
     used = torch.linspace(0.0, uniform(g, 0.0, 0.15), len(current), dtype=torch.float64)
     sag = uniform(g, 0.004, 0.03) * current
@@ -73,7 +73,7 @@ def recorded_voltage(g: Generator, current: Float[Tensor, " N"]) -> Float[Tensor
 
 
 def lagged(values: Float[Tensor, " N"], step: float, constant: float) -> Float[Tensor, " N"]:
-    """First-order lag with a time constant in s, at rest at the first value.
+    """Apply a first-order lag with a time constant in s, starting from the first value.
 
     Example:
         >>> lagged(torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64), 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""What a diagnosis could say instead: families of traces, each a few columns in the measurement's axes."""
+"""Rival explanations: families of traces, each with a few columns in the measurement's axes."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 ONSET_GRID = 1.0
-"""Seconds between the onsets that a step may have."""
+"""Spacing of the onsets of a step, s."""
 
 TIME_CONSTANTS = (3.0, 10.0, 30.0, 100.0)
-"""Of the exponential drifts, in s."""
+"""Time constants of the exponential drifts, s."""
 
 POSITION = ("position_x", "position_y", "position_z")
 ROLES: Mapping[str, str] = {"temperature": "temperature_offset", "current": "current_field"}
-"""The offset's name for a column whose role is known; for others it is ``driver_offset``."""
+"""Name of the offset effect by the role of its column; other columns have ``driver_offset``."""
 
 _NO_DRIVER = ("time", "mag_x", "mag_y", "mag_z")
 
 
 @dataclass(frozen=True)
 class EffectFamily:
-    """The traces an effect could have, up to linear coefficients; µT in the measurement's axes."""
+    """Columns that span the traces of an effect; µT in the measurement's axes."""
 
     effect: str
     drivers: tuple[str, ...]
@@ -42,19 +42,19 @@ def step_family(time: Float[Tensor, " N"], onset: float) -> EffectFamily:
 
 
 def column_family(name: str, values: Float[Tensor, " N"]) -> EffectFamily:
-    """An offset that follows a recorded column."""
+    """Return an offset that follows a recorded column."""
     return EffectFamily(ROLES.get(name, "driver_offset"), (name,), _offset(values - values.mean()))
 
 
 def drift_families(time: Float[Tensor, " N"]) -> Iterable[EffectFamily]:
-    """Linear and exponential in time."""
+    """Return drifts that are linear and exponential in time."""
     x = time - time[0]
     for shape in (x / x[-1], *(torch.exp(-x / constant) for constant in TIME_CONSTANTS)):
         yield EffectFamily("offset_drift", (), _offset(shape))
 
 
 def cubic_family(scene: Scene, *, about_zero: bool = False) -> EffectFamily:
-    """The cube of the field on each axis, or with ``about_zero`` of the field and the hard iron together."""
+    """Return the cube of the field on each axis; with ``about_zero`` that of field plus hard iron."""
     core = scene.field @ scene.sensor.soft.mT
     return EffectFamily(
         "cubic_nonlinearity", (), torch.diag_embed((core + scene.sensor.hard if about_zero else core) ** 3)
@@ -62,7 +62,7 @@ def cubic_family(scene: Scene, *, about_zero: bool = False) -> EffectFamily:
 
 
 def gradient_family(scene: Scene, position: Float[Tensor, "N 3"], *, vector: bool) -> EffectFamily:
-    """A field that is linear in position: its length alone (3), or free of curl and divergence (5)."""
+    """Return a field that is linear in position: of its length (3), or without curl and divergence (5)."""
     place = position - position.mean(0)
     if not vector:
         return EffectFamily("field_gradient", POSITION, scene.along[:, :, None] * place[:, None])
@@ -71,7 +71,7 @@ def gradient_family(scene: Scene, position: Float[Tensor, "N 3"], *, vector: boo
 
 
 def traceless() -> Float[Tensor, "5 3 3"]:
-    """A basis of the symmetric matrices without a trace."""
+    """Return a basis of the traceless symmetric matrices."""
     basis = torch.zeros(5, 3, 3, dtype=torch.float64)
     for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
         basis[k, i, j] = basis[k, j, i] = 1.0
@@ -81,11 +81,11 @@ def traceless() -> Float[Tensor, "5 3 3"]:
 
 
 def families(scene: Scene, columns: Mapping[str, Float[Tensor, " N"]], *, vector: bool) -> list[EffectFamily]:
-    """All that the recorded columns allow.
+    """Return all families that the recorded columns allow.
 
     Args:
-        columns: the recording's.
-        vector: the attitude is known, so that the whole vector counts and not its length alone.
+        columns: columns of the recording.
+        vector: whether the attitude is known, so that the vector is compared and not its length.
     """
     time = scene.time
     found = [column_family(name, values) for name, values in columns.items() if name not in _NO_DRIVER]

@@ -1,4 +1,4 @@
-"""A case of the blind proof: a recording with something hidden in it or nothing, a second one, and the key."""
+"""Draw a case of the blind proof: a recording with or without hidden physics, a second one, and the key."""
 
 from __future__ import annotations
 
@@ -48,22 +48,22 @@ if TYPE_CHECKING:
 KINDS = ("single", "double", "outside")
 KIND_SHARES = (0.86, 0.07, 0.07)
 WITHHELD_SHARE = 0.12
-"""Share of the effects of temperature and current whose column is not in the recording."""
+"""Share of the effects of temperature and current whose driver is not recorded."""
 
 STRONG_SHARE = 0.7
-"""Share of the single effects whose size is drawn by z_sep; that of the others by z."""
+"""Share of the single effects whose size is drawn by z_sep; the others are drawn by z."""
 
 STRONG_Z_SEP = (10.5, 100.0)
 FREE_Z = (3.0, 60.0)
 DOUBLE_Z_SEP = (12.0, 80.0)
 OUTSIDE_Z = (10.0, 60.0)
 MOST_Z = 300.0
-"""No effect is larger: one that anybody can see is not concealed."""
+"""Limit of the size of an effect; a larger effect would be obvious."""
 
 MOST_MISSED = 3.0
-"""Up to this z of what the linear form misses its best coefficients are held to be what an interval should cover.
+"""Largest z of the residual of the linear form for which its best coefficients are scored as true values.
 
-What is missed is orthogonal to the form, and so leaves the estimate where it is; but not for every weighting.
+The residual is orthogonal to the form and does not shift the estimate, but only with the same weights.
 """
 
 PAUSE = 10.0
@@ -74,7 +74,7 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class Contaminated:
-    """A measurement, and what went into it beside the truth: errors of the length in µT, and which samples are bad."""
+    """A measurement with its errors: those of the length in µT, and the mask of outliers."""
 
     measured: Float[Tensor, "N 3"]
     errors: Float[Tensor, "N 3"]
@@ -84,17 +84,17 @@ class Contaminated:
 def draw(
     seed: int, index: int, *, empty: bool = False, duration: float = DURATION, rate: float = RATE, name: str = ""
 ) -> Case:
-    """The case at that address; the same address gives the same case.
+    """Draw the case at an address. The same address gives the same case.
 
-    An empty case is drawn as any other, columns and all, and its effect has the size zero.
+    An empty case is drawn in the same way, with the same columns, and an effect of size 0.
 
     Args:
-        seed: of the proof.
-        index: of the case.
-        empty: hide nothing.
-        duration: of the recording in s.
+        seed: seed of the proof.
+        index: number of the case.
+        empty: hide no physics.
+        duration: length of the recording in s.
         rate: samples per second.
-        name: of the recording; default ``case_<index>``.
+        name: name of the recording; default ``case_<index>``.
     """
 
     def stream(what: str) -> Generator:
@@ -141,13 +141,13 @@ def draw(
 
 
 def draw_scene(g: Generator, duration: float = DURATION, rate: float = RATE) -> Scene:
-    """A motion, a sensor and its surroundings."""
+    """Draw a motion, a sensor and its surroundings."""
     motion = tumble(g, duration=duration, rate=rate)
     return Scene(motion, draw_sensor(g), draw_field(g), draw_temperature(g, motion.time), draw_current(g, motion.time))
 
 
 def later_scene(g: Generator, scene: Scene) -> Scene:
-    """The same sensor in the same place, later and in another motion; drivers stay in the range they had."""
+    """Draw a later scene of the same sensor at the same place with another motion; drivers keep their range."""
     time = scene.time
     length, rate = len(time) * scene.step, 1.0 / scene.step
     motion = tumble(g, duration=length, rate=rate, start=float(time[-1]) + PAUSE)
@@ -157,7 +157,7 @@ def later_scene(g: Generator, scene: Scene) -> Scene:
 
 
 def draw_effects(g: Generator, scene: Scene) -> tuple[str, list[Hidden]]:
-    """What is hidden, its size apart: the kind of case and one effect, or two."""
+    """Draw the kind of case and its effects, without sizes."""
     kind = draws.choose(g, KINDS, KIND_SHARES)
     inside, outside = list(hidden.CATALOGUE), list(hidden.OUTSIDE)
     if kind == "outside":
@@ -179,7 +179,7 @@ def size_effects(
     plan: Plan,
     columns: Mapping[str, Float[Tensor, " N"]],
 ) -> list[tuple[float, Power]]:
-    """The size of each effect, as large as its z or z_sep is to be but plausible, and its power at that size."""
+    """Return the size of each effect, for a drawn z or z_sep within plausible limits, and its power."""
     vector = plan.mode == "attitude"
     known = families(scene, columns, vector=vector)
     questions = [_question(effect, scene, plan, columns, known, vector=vector) for effect in effects]
@@ -215,7 +215,7 @@ def _question(
     unseen = effect.driver != "" and not drivers
     right = {(effect.effect, drivers)}
     if unseen:
-        # the time course of a driver that nobody recorded is all there is to name
+        # without its driver, only the time course of the effect can be named
         right |= {("offset_drift", ()), ("hard_iron_step", ())}
     rivals = [family for family in known if (family.effect, family.drivers) not in right]
     own = None if unseen else _own_family(effect, scene, columns, vector=vector)
@@ -225,7 +225,7 @@ def _question(
 def _own_family(
     effect: Hidden, scene: Scene, columns: Mapping[str, Float[Tensor, " N"]], *, vector: bool
 ) -> EffectFamily | None:
-    """The linear form of the effect with the true onset and the recorded driver."""
+    """Return the linear form of the effect with the true onset and the recorded driver."""
     if effect.effect == "hard_iron_step" and effect.onset is not None:
         return step_family(scene.time, effect.onset)
     if effect.effect in ("temperature_offset", "current_field"):
@@ -240,7 +240,7 @@ def _own_family(
 def contaminate_scene(
     g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]
 ) -> Contaminated:
-    """The measurement of a scene with an effect, noise and outliers, µT."""
+    """Return the measurement of a scene with an effect, noise and outliers, µT."""
     count = len(scene.time)
     errors = axis_errors(g, noise, count) + ambient_errors(g, noise, count)[:, None] * scene.along
     direction = torch.nn.functional.normalize(scene.field, dim=-1)
@@ -250,7 +250,7 @@ def contaminate_scene(
 
 
 def total_of(effects: Sequence[Hidden], sizes: Sequence[float], scene: Scene) -> Float[Tensor, "N 3"]:
-    """What effects of those sizes add to the measurement, µT."""
+    """Return the sum of the effects in the measurement, µT."""
     total = torch.zeros_like(scene.field)
     for effect, size in zip(effects, sizes, strict=True):
         total = total + size * effect.trace(scene)
@@ -310,7 +310,7 @@ def key_of(
 
 def key_effect(effect: Hidden, size: float, power: Power, plan: Plan) -> KeyEffect:
     drivers = _drivers(effect, plan)
-    told = [KeyRival(rival.effect, rival.drivers, rival.z_sep) for rival in power.rivals]
+    rivals = [KeyRival(rival.effect, rival.drivers, rival.z_sep) for rival in power.rivals]
     return KeyEffect(
         effect=effect.effect,
         form=effect.form,
@@ -321,8 +321,8 @@ def key_effect(effect: Hidden, size: float, power: Power, plan: Plan) -> KeyEffe
         parameters=_key_parameters(effect, power),
         z=power.z,
         z_sep=power.z_sep,
-        rival=told[0] if told else None,
-        inseparable=tuple(rival for rival in told if rival.z_sep < INSEPARABLE_BELOW),
+        rival=rivals[0] if rivals else None,
+        inseparable=tuple(rival for rival in rivals if rival.z_sep < INSEPARABLE_BELOW),
     )
 
 

@@ -1,6 +1,6 @@
-"""The physics that is hidden: each effect's trace in the measurement's axes, µT, for a size of one.
+"""The hidden physics: the trace of each effect in the measurement's axes, µT, for size 1.
 
-The forms are those of a workbench, not of a catalogue: a step takes its time and creeps, a nonlinearity saturates, a
+The forms are realistic and differ from the catalogue: a step takes time and creeps, a nonlinearity saturates, a
 gradient comes from a magnet a few metres away.
 """
 
@@ -28,11 +28,10 @@ MU0_4PI = 0.1
 
 @dataclass(frozen=True)
 class Hidden:
-    """An effect before its size is known.
+    """An effect without its size.
 
-    ``trace(scene)`` is what it adds to the measurement at size 1; it is linear in the size. ``most`` is the largest
-    departure of a measurement that is still plausible, in µT. ``driver`` is the column, or group of columns, that
-    drives it, empty where there is none.
+    ``trace(scene)`` is the effect on the measurement at size 1; it is linear in the size. ``most`` is the largest
+    plausible change of a measurement, µT. ``driver`` is the column, or group of columns, that drives it, "" for none.
     """
 
     effect: str
@@ -44,7 +43,7 @@ class Hidden:
 
 
 def hard_iron_step(g: Generator, scene: Scene) -> Hidden:
-    """The offset jumps within 0.02-0.3 s and creeps on by a few per cent."""
+    """A step of the offset within 0.02-0.3 s, followed by creep of a few per cent."""
     way, time = direction(g), scene.time
     first, last = float(time[0]), float(time[-1])
     onset = uniform(g, first + 0.15 * (last - first), last - 0.15 * (last - first))
@@ -61,7 +60,7 @@ def hard_iron_step(g: Generator, scene: Scene) -> Hidden:
 
 
 def offset_drift(g: Generator, scene: Scene) -> Hidden:
-    """The offset wanders off: two exponentials of their own directions, a stretched one, or a curve of Gompertz."""
+    """A drift of the offset: two exponentials with different directions, a stretched one, or a Gompertz curve."""
     way, time = direction(g), scene.time
     first, length = float(time[0]), float(time[-1] - time[0])
     form = choose(g, ("two exponentials", "stretched exponential", "Gompertz"))
@@ -85,17 +84,17 @@ def offset_drift(g: Generator, scene: Scene) -> Hidden:
 
 
 def _bend(g: Generator) -> tuple[float, float, float]:
-    """Lag of the die in s, logarithm of how much steeper it ends, temperature around which it was trimmed in °C."""
+    """Draw the lag of the die in s, the log ratio of its slopes, and its trimming temperature in °C."""
     return uniform(g, 0.0, 0.5), choose(g, (-1.0, 1.0)) * uniform(g, 0.01, 0.1), 25.0
 
 
 def _warmed(temperature: Tensor, step: float, lag: float) -> Tensor:
-    """Behind two thermal masses in a row, case and die, that lag by as much together."""
+    """Return the temperature behind two thermal masses in series, case and die, with this total lag."""
     return lagged(lagged(temperature, step, 0.6 * lag), step, 0.4 * lag)
 
 
 def temperature_offset(g: Generator, scene: Scene) -> Hidden:
-    """Exponential in T − T0, at its end a tenth steeper at most, of a die that lags behind by half a second at most."""
+    """An offset exponential in T − T0, at most a tenth steeper at its end; the die lags by at most 0.5 s."""
     way = direction(g)
     lag, bend, center = _bend(g)
     span = float((scene.temperature - center).abs().max())
@@ -108,7 +107,7 @@ def temperature_offset(g: Generator, scene: Scene) -> Hidden:
 
 
 def temperature_gain(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
-    """The gain follows the die's temperature."""
+    """A gain that follows the temperature of the die."""
     lag, _, center = _bend(g)
 
     def trace(at: Scene) -> Tensor:
@@ -119,7 +118,7 @@ def temperature_gain(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - on
 
 
 def current_field(g: Generator, scene: Scene) -> Hidden:
-    """A loop of two straight wires of finite length beside the sensor, by Biot and Savart."""
+    """A loop of two straight wires of finite length next to the sensor, by Biot-Savart."""
     unit = two_wire_field(g)
 
     def trace(at: Scene) -> Tensor:
@@ -130,7 +129,7 @@ def current_field(g: Generator, scene: Scene) -> Hidden:
 
 
 def two_wire_field(g: Generator) -> Float[Tensor, " 3"]:
-    """µT/A at the origin of a wire there and a wire back, some centimetres away."""
+    """Return the field at the origin of two opposite wires some centimetres away, µT/A."""
     along, aside = direction(g), direction(g)
     distance, spacing, half = uniform(g, 0.03, 0.1), uniform(g, 0.005, 0.03), uniform(g, 0.05, 0.2)
     place = distance * torch.nn.functional.normalize(torch.linalg.cross(along, aside), dim=0)
@@ -139,7 +138,7 @@ def two_wire_field(g: Generator) -> Float[Tensor, " 3"]:
 
 
 def wire_field(place: Float[Tensor, " 3"], along: Float[Tensor, " 3"], half: float) -> Float[Tensor, " 3"]:
-    """µT/A at the origin of a straight wire of length ``2 half`` about ``place``.
+    """Return the field at the origin of a straight wire of length ``2 half`` about ``place``, µT/A.
 
     Example:
         >>> x, y = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.1, 0.0])
@@ -155,7 +154,7 @@ def wire_field(place: Float[Tensor, " 3"], along: Float[Tensor, " 3"], half: flo
 
 
 def field_gradient(g: Generator, scene: Scene) -> Hidden:
-    """A magnet or a long iron bar beyond the hand's reach: the surrounding field changes with position."""
+    """A distant magnet or long iron bar: the surrounding field changes with position."""
     middle = scene.motion.position.mean(0)
     reach = float(torch.linalg.vector_norm(scene.motion.position - middle, dim=-1).max())
     source = middle + (reach + log_uniform(g, 1.0, 8.0)) * direction(g)
@@ -171,7 +170,7 @@ def field_gradient(g: Generator, scene: Scene) -> Hidden:
 
 
 def dipole_field(place: Float[Tensor, "N 3"], moment: Float[Tensor, "*N 3"]) -> Float[Tensor, "N 3"]:
-    """µT of a moment in A m² at the origin, at places in m.
+    """Return the field of a dipole in A m² at the origin, at places in m, µT.
 
     Example:
         >>> z = torch.tensor([0.0, 0.0, 1.0])
@@ -184,7 +183,7 @@ def dipole_field(place: Float[Tensor, "N 3"], moment: Float[Tensor, "*N 3"]) -> 
 
 
 def bar_field(place: Float[Tensor, "N 3"], moment: Float[Tensor, " 3"], axis: Float[Tensor, " 3"]) -> Tensor:
-    """µT of a line of dipoles, 1 A m² a metre, along ``axis`` through the origin."""
+    """Return the field of a line of dipoles, 1 A m² per metre, along ``axis`` through the origin, µT."""
     across = place - (place @ axis)[..., None] * axis
     turned = moment - (moment @ axis) * axis
     rho = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
@@ -193,9 +192,9 @@ def bar_field(place: Float[Tensor, "N 3"], moment: Float[Tensor, " 3"], axis: Fl
 
 
 def cubic_nonlinearity(g: Generator, scene: Scene) -> Hidden:
-    """A core that saturates as tanh or as Langevin's function under a part of the sensor; µT lost at 50 µT.
+    """A core that saturates like tanh or the Langevin function; the size is the loss in µT at 50 µT.
 
-    The hard iron is a magnet beside the core, which the core feels, or an offset of the electronics, which it does not.
+    The hard iron is a magnet that acts on the core, or an offset of the electronics that does not.
     """
     form = choose(g, ("tanh", "langevin"))
     knee, magnet = log_uniform(g, 80.0, 250.0), happens(g, 0.3)
@@ -223,7 +222,7 @@ def _langevin_loss(x: Tensor, knee: float) -> Tensor:
 
 
 def mains_interference(g: Generator, scene: Scene) -> Hidden:
-    """A sinusoid at an alias of the mains."""
+    """A sinusoid at an alias of the mains frequency."""
     way, frequency, phase = direction(g), uniform(g, 0.3, 20.0), uniform(g, 0.0, 2.0 * math.pi)
 
     def trace(at: Scene) -> Tensor:
@@ -234,7 +233,7 @@ def mains_interference(g: Generator, scene: Scene) -> Hidden:
 
 
 def hysteresis(g: Generator, scene: Scene) -> Hidden:
-    """The play operator on each axis: a core that follows only when pulled by more than its width."""
+    """The play operator on each axis: magnetic hysteresis of a core."""
     width = uniform(g, 3.0, 15.0)
     share = torch.tensor([uniform(g, 0.3, 1.0) for _ in range(3)], dtype=torch.float64)
 
@@ -247,7 +246,7 @@ def hysteresis(g: Generator, scene: Scene) -> Hidden:
 
 
 def play(x: Float[Tensor, "N k"], width: float) -> Float[Tensor, "N k"]:
-    """The play operator with half-width ``width``, at rest at the first value.
+    """Apply the play operator with half-width ``width``, starting at the first value.
 
     Example:
         >>> play(torch.tensor([[0.0], [3.0], [2.5], [-1.0]]), 1.0).ravel()
@@ -260,7 +259,7 @@ def play(x: Float[Tensor, "N k"], width: float) -> Float[Tensor, "N k"]:
 
 
 def magnetic_disturbance(g: Generator, scene: Scene) -> Hidden:
-    """A telephone, say, carried past the sensor in a straight line."""
+    """A dipole, such as a telephone, carried past the sensor in a straight line."""
     time = scene.time
     first, last = float(time[0]), float(time[-1])
     when, speed = uniform(g, first + 0.15 * (last - first), last - 0.15 * (last - first)), uniform(g, 0.15, 0.8)
@@ -286,7 +285,7 @@ CATALOGUE: Mapping[str, Callable[[Generator, Scene], Hidden]] = MappingProxyType
         "cubic_nonlinearity": cubic_nonlinearity,
     }
 )
-"""The effects that a diagnosis is held to name."""
+"""The effects that a diagnosis has to name."""
 
 OUTSIDE: Mapping[str, Callable[[Generator, Scene], Hidden]] = MappingProxyType(
     {
@@ -296,4 +295,4 @@ OUTSIDE: Mapping[str, Callable[[Generator, Scene], Hidden]] = MappingProxyType(
         "temperature_gain": temperature_gain,
     }
 )
-"""Effects reported apart: a diagnosis with a short catalogue can at best call them unknown."""
+"""Effects that are scored separately, because a short catalogue may not contain them."""

@@ -1,4 +1,4 @@
-"""A hand that tumbles a sensor, standing or walking."""
+"""Motions of a sensor that is turned by hand, standing or walking."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ DURATION = 90.0
 """Seconds."""
 
 WALKING_SHARE = 0.3
-"""Share of the motions in which the hand is carried a few metres."""
+"""Share of motions in which the sensor is carried a few metres."""
 
 STIFF_SHARE = 0.1
-"""Share of the motions that turn little about one body axis, and so leave directions poorly covered."""
+"""Share of motions with little rotation about a body axis, which cover directions poorly."""
 
 REST_SHARE, LONGEST_REST = 0.15, 0.4
 """Share of the motions in which the sensor lies still for a while, and the longest such while, as a share of the
@@ -35,7 +35,7 @@ _GRAVITY = torch.tensor([0.0, 0.0, 9.81], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Motion:
-    """Where a sensor was and how it was turned: time in s, position in m, rates in rad/s."""
+    """Positions and orientations of a sensor: time in s, position in m, rates in rad/s."""
 
     time: Float[Tensor, " N"]
     attitude: Float[Tensor, "N 4"]  # unit quaternion, world from body
@@ -56,15 +56,15 @@ class Motion:
         return self.into_body(torch.gradient(velocity, spacing=step, dim=0)[0] + _GRAVITY)
 
     def into_body(self, vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """World vectors in body axes."""
+        """Return world vectors in body axes."""
         return torch.einsum("nij,ni->nj", self.rotation, vectors)
 
 
 def tumble(g: Generator, *, duration: float = DURATION, rate: float = RATE, start: float = 0.0) -> Motion:
-    """A random motion: turning at 1-3 rad/s (root mean square), hands within about half a metre, walking or not.
+    """Draw a motion: rotation at 1-3 rad/s (RMS), positions within about half a metre, walking or not.
 
     Args:
-        duration: in s.
+        duration: length in s.
         rate: samples per second.
         start: time of the first sample in s.
     """
@@ -82,13 +82,13 @@ def tumble(g: Generator, *, duration: float = DURATION, rate: float = RATE, star
     walks = happens(g, WALKING_SHARE)
     hand = 0.5 * torch.tanh(0.5 * smooth(g, count, 3, step, 3.0))
     body = smooth(g, count, 3, step, 25.0) * torch.tensor([2.0, 2.0, 0.05]) if walks else torch.zeros(count, 3)
-    # where it lies it stays
+    # a resting sensor does not move
     position = (hand + body)[(moves.cumsum(0) - 1).clamp(min=0)]
     return Motion(time, attitude, position, gyro, walks)
 
 
 def _moves(g: Generator, count: int) -> Int[Tensor, " N"]:
-    """1 where a sensor moves, 0 where it lies still: at the beginning, say, before it is picked up."""
+    """Return 1 where a sensor moves and 0 where it rests, such as before it is picked up."""
     moves = torch.ones(count, dtype=torch.int64)
     if happens(g, REST_SHARE):
         length = int(uniform(g, 0.05, LONGEST_REST) * count)
@@ -98,7 +98,7 @@ def _moves(g: Generator, count: int) -> Int[Tensor, " N"]:
 
 
 def within(motion: Motion, other: Motion) -> Motion:
-    """The motion carried to where the other was, and held within its reach."""
+    """Move the motion to the place of another, and limit it to the other's range."""
     place, middle = motion.position.mean(0), other.position.mean(0)
     reach = [float(torch.linalg.vector_norm(m.position - m.position.mean(0), dim=-1).max()) for m in (motion, other)]
     return replace(motion, position=middle + min(1.0, reach[1] / reach[0]) * (motion.position - place))

@@ -1,4 +1,4 @@
-"""What the sensor adds of itself: white and coloured errors, slow walks, outliers."""
+"""Errors of the sensor: white and coloured noise, random walks, outliers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KINDS = ("white", "ar1", "ar2", "offset walk", "ar1 and offset walk", "ambient a
 KIND_SHARES = (0.35, 0.16, 0.12, 0.12, 0.09, 0.08, 0.08)
 FAMILIES = ("gaussian", "laplace", "student")
 SIGMA = (0.2, 0.8)
-"""Range of the standard deviation of an axis, in µT."""
+"""Range of the standard deviation of an axis, µT."""
 
 CLEAN_SHARE = 0.15
 """Share of the recordings without outliers."""
@@ -46,13 +46,13 @@ class Noise:
     attitude: Process | None = None
 
     def numbers(self) -> dict[str, Any]:
-        """The same as JSON would have it."""
+        """Return the noise as JSON data."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """How samples are spoilt: their share, the mean length of a burst (1: isolated), the side, the sizes in sigmas."""
+    """Outliers: their share, the mean length of a burst (1: isolated), the side, and the sizes in sigmas."""
 
     share: float
     burst: float
@@ -61,7 +61,7 @@ class Outliers:
 
 
 def draw_noise(g: Generator, samples: int, rate: float) -> Noise:
-    """A random noise model for recordings of that many samples."""
+    """Draw a noise model for recordings of this many samples."""
     kind, family = choose(g, KINDS, KIND_SHARES), choose(g, FAMILIES)
     sigma = uniform(g, *SIGMA)
     deviations = [sigma * uniform(g, 0.8, 1.25) for _ in range(3)]
@@ -96,7 +96,7 @@ def _coloured(g: Generator, kind: str, deviation: float, family: str) -> Process
 
 
 def axis_errors(g: Generator, noise: Noise, samples: int) -> Float[Tensor, "N 3"]:
-    """Errors of the three axes in µT; walks have their mean taken off, which the offset of the sensor holds."""
+    """Draw errors of the three axes in µT. The mean of a walk is removed, because it is part of the offset."""
     errors = unit_variance(g, noise.family, samples, 3) * torch.tensor(noise.white, dtype=torch.float64)
     for known in (noise.axes, noise.walks):
         if known is not None:
@@ -105,7 +105,7 @@ def axis_errors(g: Generator, noise: Noise, samples: int) -> Float[Tensor, "N 3"
 
 
 def ambient_errors(g: Generator, noise: Noise, samples: int) -> Float[Tensor, " N"]:
-    """Changes of the length of the field in µT."""
+    """Draw changes of the length of the field in µT."""
     if noise.ambient is None:
         return torch.zeros(samples, dtype=torch.float64)
     return _centred(noise.ambient, noise.ambient.sample(g, samples))
@@ -116,7 +116,7 @@ def _centred(process: Process, values: Tensor) -> Tensor:
 
 
 def draw_outliers(g: Generator) -> Outliers:
-    """A random way of spoiling samples."""
+    """Draw a model of outliers."""
     share = 0.0 if happens(g, CLEAN_SHARE) else uniform(g, 0.0, MOST_OUTLIERS)
     burst = 1.0 if happens(g, 0.5) else log_uniform(g, 3.0, 40.0)
     return Outliers(share, burst, happens(g, 0.5), (5.0, log_uniform(g, 10.0, 100.0)))
@@ -125,7 +125,7 @@ def draw_outliers(g: Generator) -> Outliers:
 def contaminate(
     g: Generator, outliers: Outliers, sigma: float, directions: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
-    """What outliers add in µT, and where: True in the mask.
+    """Draw outliers in µT, and their mask.
 
     Args:
         directions: unit vectors of the field in the sensor's axes; a one-sided outlier leans towards them.

@@ -1,4 +1,4 @@
-"""What a fit that knows the effect's form, the noise and the good samples leaves on a second recording."""
+"""Residual on a second recording of a fit that knows the effect's form, the noise and the inliers."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def second_residual(
     errors: tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]],
     good: tuple[Float[Tensor, " N"], Float[Tensor, " N"]],
 ) -> float:
-    """Root mean square, in µT, of the calibrated length on the second recording's good samples, about its mean.
+    """Return the RMS of the calibrated length about its mean, on the inliers of the second recording, µT.
 
-    Generalised least squares on the first recording's good samples estimates the calibration and the effects' sizes;
-    its error carries over to the second. All to first order about the truth.
+    Generalised least squares on the inliers of the first recording estimates the calibration and the effects' sizes.
+    Its error propagates to the second. All to first order about the truth.
 
     Args:
-        metrics: of the calibrated length, for the first recording and the second.
-        traces: of the effects, for each recording.
-        errors: of the measurement.
-        good: samples that are no outliers.
+        metrics: metric of the calibrated length, for the first and the second recording.
+        traces: traces of the effects, for each recording.
+        errors: errors of the measurement.
+        good: masks of inliers.
     """
     tangents = [
         torch.cat([metric.nuisance(), *(metric.residual(trace[..., None]) for trace in group)], -1)
@@ -45,5 +45,5 @@ def second_residual(
 
 
 def _for_the_mean(metric: Metric) -> Metric:
-    """Without walks of the offset: the best fit to those would seek the offset they began with, not their mean."""
+    """Remove random walks of the offset: generalised least squares would estimate their start, not their mean."""
     return replace(metric, noise=replace(metric.noise, walks=None))

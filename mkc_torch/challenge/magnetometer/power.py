@@ -1,4 +1,4 @@
-"""The oracle: how well the best possible test would see a hidden effect, and tell it from its best rival.
+"""The oracle: power of the best possible test to detect a hidden effect, and to separate it from its best rival.
 
 ``z² = (1 − ε) δᵀ M δ`` with δ the effect's trace in the residual, M the inverse of the noise's true covariance with the
 calibration's tangents projected out in its metric, and ε the share of outliers; for ``z_sep`` the best rival's
@@ -31,7 +31,7 @@ _RANK = 1e-9
 
 @dataclass(frozen=True)
 class Rival:
-    """Another explanation, and how well the hidden effect is told from it."""
+    """Another explanation, and its separability from the hidden effect."""
 
     effect: str
     drivers: tuple[str, ...]
@@ -40,10 +40,10 @@ class Rival:
 
 @dataclass(frozen=True)
 class Power:
-    """Numbers of standard deviations: ``z`` against nothing, ``z_sep`` against the best of ``rivals``, hardest first.
+    """Standard errors: ``z`` against no effect, ``z_sep`` against the best of ``rivals``, sorted, best first.
 
-    ``coefficients`` are those of the effect's own linear family that come nearest to it, and ``missed`` the z of what
-    they leave; without such a family, nothing and infinity.
+    ``coefficients`` are the best coefficients of the effect's own linear family, and ``missed`` the z of their
+    residual; without such a family, None and infinity.
     """
 
     z: float
@@ -53,7 +53,7 @@ class Power:
     missed: float = math.inf
 
     def scaled(self, size: float) -> Power:
-        """For an effect of another size."""
+        """Return the power for another size of the effect."""
         rivals = tuple(Rival(rival.effect, rival.drivers, size * rival.z_sep) for rival in self.rivals)
         coefficients = tuple(size * value for value in self.coefficients)
         missed = size * self.missed if self.coefficients else math.inf
@@ -62,7 +62,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Question:
-    """An effect's trace (N, 3) in the measurement's axes, what it is to be told from, and its own linear family."""
+    """An effect's trace (N, 3) in the measurement's axes, its rivals, and its own linear family."""
 
     trace: Float[Tensor, "N 3"]
     rivals: Sequence[EffectFamily]
@@ -71,20 +71,20 @@ class Question:
 
 @dataclass(frozen=True)
 class Metric:
-    """The residual's space: how a trace of the measurement shows in it, and the noise there."""
+    """The metric of the residual: the projection of a trace of the measurement to it, and its noise."""
 
     scene: Scene
     noise: Noise
     vector: bool
 
     def residual(self, traces: Float[Tensor, "N 3 p"]) -> Float[Tensor, "N c p"]:
-        """Of the calibrated length (c = 1), or of the measured vector (c = 3), µT."""
+        """Return the residual of the calibrated length (c = 1), or of the measured vector (c = 3), µT."""
         if self.vector:
             return traces
         return torch.einsum("ni,nip->np", self.scene.sensitivity, traces)[:, None]
 
     def nuisance(self) -> Float[Tensor, "N c q"]:
-        """Tangents of the calibration: offset, gains and couplings, and with attitude the field in the world."""
+        """Return tangents of the calibration: offset, gains and couplings, and with attitude the world's field."""
         field, eye = self.scene.field, torch.eye(3, dtype=torch.float64)
         count = len(field)
         offset = eye.expand(count, 3, 3)
@@ -101,7 +101,7 @@ class Metric:
         return (self.scene.sensitivity.square() @ variance)[:, None]
 
     def coloured(self) -> tuple[Float[Tensor, "N c s"], list[Process]]:
-        """The processes of the noise and how they enter the residual."""
+        """Return the noise processes and their gains in the residual."""
         count = len(self.scene.time)
         gains = torch.zeros(count, 3, 0, dtype=torch.float64)
         processes: list[Process] = []
@@ -118,28 +118,28 @@ class Metric:
         return self.residual(gains), processes
 
     def whitened(self, traces: Float[Tensor, "N c p"], keep: Float[Tensor, " N"] | None = None) -> Float[Tensor, "M p"]:
-        """Columns whose inner products are those of the inverse covariance."""
+        """Return whitened columns; their inner products are those of the inverse covariance."""
         gains, processes = self.coloured()
         return whitened(traces, self.white_variance(), gains, processes, keep)
 
 
 def attitude_gains(scene: Scene) -> Float[Tensor, "N 3 3"]:
-    """What a small turn of the recorded attitude about each world axis adds to the residual, µT/rad."""
+    """Return the change of the residual by a small rotation of the attitude about each world axis, µT/rad."""
     eye = torch.eye(3, dtype=torch.float64)
     turned = torch.linalg.cross(eye, scene.field_world.expand(3, 3))  # rows: e_k × h
     return scene.sensor.soft @ scene.motion.rotation.mT @ turned.mT
 
 
 def powers(metric: Metric, questions: Sequence[Question], share: float) -> list[Power]:
-    """Of several effects at once, each with the traces of the others taken as known in form.
+    """Return the power of several effects at once; for each effect the forms of the others are known.
 
     Args:
-        metric: the residual's space.
-        questions: one for each effect; families are compared by identity.
-        share: of outliers.
+        metric: metric of the residual.
+        questions: a question for each effect; families are compared by identity.
+        share: share of outliers.
     """
-    asked = [family for question in questions for family in (*question.rivals, question.own) if family is not None]
-    union = list({id(family): family for family in asked}.values())
+    families = [family for question in questions for family in (*question.rivals, question.own) if family is not None]
+    union = list({id(family): family for family in families}.values())
     place = {id(family): k for k, family in enumerate(union)}
     projection = Projection(metric, [q.trace[..., None] for q in questions], [family.traces for family in union])
     kept = math.sqrt(1.0 - share)
@@ -147,13 +147,13 @@ def powers(metric: Metric, questions: Sequence[Question], share: float) -> list[
     for k, question in enumerate(questions):
         others = [j for j in range(len(questions)) if j != k]
         z = kept * projection.left(k, others, ())
-        told = _best_of_each(
+        ranked = _best_of_each(
             [
                 Rival(family.effect, family.drivers, kept * projection.left(k, others, (place[id(family)],)))
                 for family in question.rivals
             ]
         )
-        power = Power(z, min([z, *(rival.z_sep for rival in told)]), tuple(told))
+        power = Power(z, min([z, *(rival.z_sep for rival in ranked)]), tuple(ranked))
         if question.own is not None:
             coefficients, missed = projection.coefficients(k, place[id(question.own)])
             power = replace(power, coefficients=tuple(coefficients.tolist()), missed=kept * missed)
@@ -162,7 +162,7 @@ def powers(metric: Metric, questions: Sequence[Question], share: float) -> list[
 
 
 def _best_of_each(rivals: Sequence[Rival]) -> list[Rival]:
-    """The best member of each family of rivals, hardest first."""
+    """Return the best rival of each family, sorted, best first."""
     best: dict[tuple[str, tuple[str, ...]], Rival] = {}
     for rival in sorted(rivals, key=lambda rival: rival.z_sep):
         best.setdefault((rival.effect, rival.drivers), rival)
@@ -170,7 +170,7 @@ def _best_of_each(rivals: Sequence[Rival]) -> list[Rival]:
 
 
 class Projection:
-    """Whitened effects and families with the calibration projected out, ready to be compared in any combination."""
+    """Whitened effects and families with the calibration projected out."""
 
     def __init__(
         self, metric: Metric, effects: Sequence[Float[Tensor, "N 3 p"]], families: Sequence[Float[Tensor, "N 3 p"]]
@@ -178,7 +178,7 @@ class Projection:
         blocks = [metric.residual(block) for block in (*effects, *families)]
         nuisance = metric.nuisance()
         columns = torch.cat([nuisance, *blocks], -1)
-        # columns of very different size would spoil the rank decision
+        # scaled, because the rank decision needs columns of similar size
         size = torch.linalg.vector_norm(columns, dim=(0, 1)).clamp(min=1e-300)
         white = metric.whitened(columns.div_(size))
         q = nuisance.shape[-1]
@@ -192,7 +192,7 @@ class Projection:
         self._effects = len(effects)
 
     def left(self, effect: int, others: Sequence[int], families: Sequence[int]) -> float:
-        """Length of the effect's trace, one column, when others and families are projected out too."""
+        """Return the length of the effect's trace, with other effects and families projected out."""
         target = self._parts[effect]
         out = [c for k in others for c in self._parts[k]]
         out += [c for k in families for c in self._parts[self._effects + k]]
@@ -203,7 +203,7 @@ class Projection:
         return math.sqrt(max(float(own), 0.0)) * float(self._size[target])
 
     def coefficients(self, effect: int, family: int) -> tuple[Float[Tensor, " p"], float]:
-        """The family's coefficients that come nearest to the effect, and the length of what they miss."""
+        """Return the best coefficients of a family for the effect, and the length of the residual."""
         target, block = self._parts[effect], self._parts[self._effects + family]
         inside, cross = self._gram[block][:, block], self._gram[block][:, target]
         scaled = (torch.linalg.pinv(inside, hermitian=True, rtol=1e-10) @ cross)[:, 0]
@@ -211,6 +211,6 @@ class Projection:
 
 
 def range_of(columns: Float[Tensor, "M q"]) -> Float[Tensor, "M r"]:
-    """An orthonormal basis of the columns' span."""
+    """Return an orthonormal basis of the span of columns."""
     u, s, _ = torch.linalg.svd(columns, full_matrices=False)
     return u[:, s > _RANK * s[0]]

@@ -1,4 +1,4 @@
-"""Autoregressive processes and random walks: their numbers, samples and state space."""
+"""Autoregressive processes and random walks: coefficients, draws and state space."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class Process:
         return torch.tensor(values[lead:], dtype=torch.float64)
 
     def transition(self) -> np.ndarray:
-        """The companion matrix (p, p); the state's first entry is the process."""
+        """Return the companion matrix (p, p); the first entry of the state is the process."""
         order = len(self.coefficients)
         companion = np.eye(order, k=-1)
         companion[0] = self.coefficients
         return companion
 
     def start(self) -> np.ndarray:
-        """Covariance (p, p) of the state before the first sample."""
+        """Return the covariance (p, p) of the state before the first sample."""
         order = len(self.coefficients)
         drive = np.zeros((order, order))
         drive[0, 0] = self.innovation**2
@@ -63,7 +63,7 @@ class Process:
 
 
 def autoregressive(coefficients: tuple[float, ...], deviation: float, family: str = "gaussian") -> Process:
-    """The stationary process of that standard deviation.
+    """Return the stationary process with a standard deviation.
 
     Example:
         >>> round(autoregressive((0.6,), 2.0).innovation, 6)
@@ -74,5 +74,5 @@ def autoregressive(coefficients: tuple[float, ...], deviation: float, family: st
 
 
 def resonance(radius: float, frequency: float) -> tuple[float, float]:
-    """Coefficients of the AR(2) with poles at ``radius · exp(±2πi frequency)``, frequency in cycles per sample."""
+    """Return AR(2) coefficients with poles at ``radius · exp(±2πi frequency)``, frequency in cycles per sample."""
     return 2.0 * radius * math.cos(2.0 * math.pi * frequency), -radius * radius

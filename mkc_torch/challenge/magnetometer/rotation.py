@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def product(p: Float[Tensor, "*batch 4"], q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Hamilton's product: first the turn ``q``, then ``p``."""
+    """Return the Hamilton product: first the rotation ``q``, then ``p``."""
     a, u = p[..., :1], p[..., 1:]
     b, v = q[..., :1], q[..., 1:]
     scalar = a * b - (u * v).sum(-1, keepdim=True)
@@ -20,7 +20,7 @@ def product(p: Float[Tensor, "*batch 4"], q: Float[Tensor, "*batch 4"]) -> Float
 
 
 def from_vector(turn: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """The turn by ``|turn|`` radians about ``turn``."""
+    """Return the rotation by ``|turn|`` radians about ``turn``."""
     half = 0.5 * torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
     return torch.cat([half.cos(), 0.5 * turn * torch.sinc(half / torch.pi)], -1)
 
@@ -42,7 +42,7 @@ def matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def running_product(turns: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    """``turns[0] * … * turns[k]`` for each k, by doubling."""
+    """Return ``turns[0] * … * turns[k]`` for each k, by doubling."""
     q, reach = turns.clone(), 1
     while reach < len(q):
         q = torch.cat([q[:reach], product(q[:-reach], q[reach:])])

@@ -1,4 +1,4 @@
-"""What is true in one recording: motion, sensor, surroundings."""
+"""The truth of a recording: motion, sensor, surroundings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SensorTruth:
 
 @dataclass(frozen=True)
 class Scene:
-    """One recording's truth. ``settled``: it was taken later, when all that happens once has happened."""
+    """The truth of a recording. ``settled``: a later recording, in which transients have ended."""
 
     motion: Motion
     sensor: SensorTruth
@@ -50,7 +50,7 @@ class Scene:
 
     @property
     def along(self) -> Float[Tensor, "N 3"]:
-        """What one µT more of field length adds to the measurement."""
+        """Change of the measurement by 1 µT of field length."""
         return torch.nn.functional.normalize(self.field, dim=-1) @ self.sensor.soft.mT
 
     @property
@@ -59,18 +59,18 @@ class Scene:
         return torch.nn.functional.normalize(self.field, dim=-1) @ torch.linalg.inv(self.sensor.soft)
 
     def measured(self, world: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """What a field in world axes adds to the measurement."""
+        """Return the change of the measurement by a field in world axes."""
         return self.motion.into_body(world) @ self.sensor.soft.mT
 
 
 def draw_sensor(g: Generator) -> SensorTruth:
-    """Hard iron up to 40 µT, soft iron up to ±10 %."""
+    """Draw hard iron up to 40 µT and soft iron up to ±10 %."""
     a = torch.randn((3, 3), generator=g, dtype=torch.float64).clamp(-2.0, 2.0) / 2.0
     soft = torch.eye(3, dtype=torch.float64) + 0.1 * 0.5 * (a + a.mT)
     return SensorTruth(soft, uniform(g, 0.0, 40.0) * direction(g))
 
 
 def draw_field(g: Generator) -> Float[Tensor, " 3"]:
-    """25-65 µT, any direction."""
+    """Draw a field of 25-65 µT in any direction."""
     size = uniform(g, 25.0, 65.0)
     return size * torch.nn.functional.normalize(normal(g, 3), dim=0)

@@ -1,4 +1,4 @@
-"""How well a diagnosis corrects the same sensor's second recording."""
+"""Error of a diagnosis on the second recording of the same sensor."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 def ratio_to_oracle(corrected: Mapping[str, Float[Tensor, " N"]], key: Key) -> float:
-    """Spread of the corrected field's length on good samples, relative to what the oracle leaves.
+    """Return the spread of the corrected field's length on inliers, relative to the oracle's residual.
 
-    The scale of a calibrated field is the user's choice: the mean length of the good samples is set to the true one.
+    The scale of a calibrated field is free: the mean length of the inliers is set to the true length.
 
     Args:
         corrected: ``field_x``, ``field_y``, ``field_z`` of the second recording.
-        key: of the case, with its ``oracle_rms`` and the second recording's outliers.
+        key: key of the case, with its ``oracle_rms`` and the second recording's outliers.
 
     Returns:
-        The ratio; infinite where the corrected field is not finite.
+        The ratio; infinite if the corrected field is not finite.
     """
     length = torch.stack([corrected[f"field_{axis}"].double() for axis in "xyz"], -1).norm(dim=-1)
     good = torch.ones(len(length), dtype=torch.bool)

@@ -25,14 +25,14 @@ def whitened(
     processes: Sequence[Process],
     keep: Float[Tensor, " N"] | None = None,
 ) -> Float[Tensor, "N*c K"]:
-    """``L⁻¹ values`` with ``L Lᵀ`` the covariance.
+    """Return ``L⁻¹ values``, where ``L Lᵀ`` is the covariance.
 
     Args:
         values: columns to whiten, each a series of N samples of c channels.
         white: variance of the independent part.
         gains: how each process enters each channel.
-        processes: the s processes, one of another independent.
-        keep: samples in use; the rows of the others are zero and tell nothing.
+        processes: the s independent processes.
+        keep: mask of samples in use; the rows of the others are 0.
 
     Returns:
         Columns whose inner products are those of the inverse covariance.
@@ -67,7 +67,7 @@ def whitened(
 def dense_covariance(
     white: Float[Tensor, "N c"], gains: Float[Tensor, "N c s"], processes: Sequence[Process]
 ) -> Float[Tensor, "N*c N*c"]:
-    """The covariance itself, for short series."""
+    """Return the covariance, for short series."""
     count = len(white)
     total = torch.diag(white.reshape(-1))
     for k, process in enumerate(processes):
@@ -92,7 +92,7 @@ def _series_covariance(process: Process, count: int) -> np.ndarray:
 
 
 def _stacked(processes: Sequence[Process]) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
-    """Transition, covariance of the drive, covariance at the start, and where each process stands in the state."""
+    """Return the transition, the process noise, the initial covariance, and the place of each process in the state."""
     size = sum(len(process.coefficients) for process in processes)
     transition, drive, start = np.zeros((3, size, size))
     places, at = [], 0

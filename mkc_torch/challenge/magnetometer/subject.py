@@ -20,7 +20,7 @@ from mkc_torch.recording.recording import Recording
 
 
 def magnetometer(duration: float = DURATION) -> Subject:
-    """Recordings of a magnetometer, each so many seconds long."""
+    """Return the subject: recordings of a magnetometer with a duration in s."""
     return Subject(
         name="magnetometer",
         cases=240,

@@ -77,7 +77,9 @@ def scenarios_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(share=share_text, measured=measured_text, held=held)
-    asked = [measured for scenario in _rows(score) for measured in scenario.measured if held(measured) != NOT_MEASURED]
+    aims = [
+        measured for scenario in _rows(score) for measured in scenario.measured if held(measured) != NOT_MEASURED
+    ]
     return environment.get_template("worlds.html.j2").render(
         score=score,
         rows=_rows(score),
@@ -86,8 +88,8 @@ def scenarios_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
         named=NAMED_COLUMNS,
         counted=APART_COLUMNS,
         apart=[scenario for scenario in _rows(score) if scenario.apart],
-        passed=sum(m.holds for m in asked),
-        asked=len(asked),
+        passed=sum(m.holds for m in aims),
+        asked=len(aims),
         settings=settings,
         failed=[name for scenario in score.scenarios for name in scenario.failed],
         verdicts=VERDICTS,

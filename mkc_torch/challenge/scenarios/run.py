@@ -72,8 +72,8 @@ def run_scenarios(
     Raises:
         ValueError: an unknown scenario, or no recordings.
     """
-    asked = chosen(scenarios, only)
-    addresses = _addresses(asked, seed, per_scenario, hidden)
+    selected = chosen(scenarios, only)
+    addresses = _addresses(selected, seed, per_scenario, hidden)
     if not addresses:
         raise ValueError("Expected per_scenario or hidden to be at least 1 but both are 0.")
     started = time.perf_counter()
@@ -93,10 +93,10 @@ def run_scenarios(
     result = score_scenarios(scenarios, keys, diagnoses)
     settings = {
         "family": scenarios.family,
-        "scenarios": ", ".join(scenario.name for scenario in asked),
+        "scenarios": ", ".join(scenario.name for scenario in selected),
         "seed": seed,
         "empty_per_scenario": per_scenario,
-        "hidden_per_scenario": _hidden_text(asked, per_scenario, hidden),
+        "hidden_per_scenario": _hidden_text(selected, per_scenario, hidden),
         **scenarios.settings,
         "workers": workers,
         "key_sha256": digest(text),
@@ -127,21 +127,21 @@ def chosen(scenarios: Scenarios, only: Sequence[str]) -> list[Scenario]:
 
 def count(scenarios: Scenarios, only: Sequence[str], per_scenario: int, hidden: int | None) -> int:
     """Return the number of recordings of a run."""
-    asked = chosen(scenarios, only)
-    return sum(per_scenario + scenario.hidden(per_scenario, hidden) for scenario in asked)
+    selected = chosen(scenarios, only)
+    return sum(per_scenario + scenario.hidden(per_scenario, hidden) for scenario in selected)
 
 
-def _hidden_text(asked: Sequence[Scenario], per_scenario: int, hidden: int | None) -> int | str:
+def _hidden_text(selected: Sequence[Scenario], per_scenario: int, hidden: int | None) -> int | str:
     """Return the number of recordings with hidden physics in a scenario; "20 or 60" if scenarios differ."""
-    numbers = sorted({scenario.hidden(per_scenario, hidden) for scenario in asked if scenario.hides} or {0})
+    numbers = sorted({scenario.hidden(per_scenario, hidden) for scenario in selected if scenario.hides} or {0})
     return numbers[0] if len(numbers) == 1 else " or ".join(map(str, numbers))
 
 
-def _addresses(asked: Sequence[Scenario], seed: int, per_scenario: int, hidden: int | None) -> list[_Address]:
+def _addresses(selected: Sequence[Scenario], seed: int, per_scenario: int, hidden: int | None) -> list[_Address]:
     """Return all cases in a random order, so that names reveal nothing."""
     plain = [
         (scenario, index, hides)
-        for scenario in asked
+        for scenario in selected
         for hides, total in ((False, per_scenario), (True, scenario.hidden(per_scenario, hidden)))
         for index in range(total)
     ]

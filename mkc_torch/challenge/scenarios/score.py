@@ -123,30 +123,31 @@ class ScoredCase:
 
 @dataclass(frozen=True)
 class ScenarioScore:
-    """One scenario. Shares are of recordings with nothing hidden, or of useless ones, but for those after ``hidden``.
+    """The score of a scenario. Shares before ``hidden`` are of recordings without hidden physics or usable simulation.
 
     Attributes:
-        name, sentence, right_to_say, wrong_to_say, apart: of the scenario.
-        empty: how many of those there were.
-        verdicts: what was said of them, and what failed.
-        false_alarms: physics claimed to be missing, of those that were diagnosed.
-        alarms: what was claimed.
-        adequate, unfit: that verdict, of all.
-        unexplained_located: that verdict at the pushed state, of those with a push of at least twice the noise.
-        located: the pushed state, whatever the verdict, of the same.
-        sensor_told: said that a sensor errs slowly, of those whose sensor does so by at least twice its white noise.
-        alone: a name beside which no other is possible and which is not the hidden one's, of all, hidden or not.
-        undecided: "it cannot be cases", unexplained or with alternatives, of the same.
-        useful_unfit: that verdict, of those of use with nothing hidden, or an effect at z of at least ten.
-        reasons: of useless ones, why to what was said.
-        hidden: how many recordings had something hidden, ``strong`` of them an effect of the catalogue with z and z_sep
-            of at least ten.
-        named: of the strong; ``named_disturbed`` with a disturbance beside it, ``named_undisturbed`` without.
-        wrong: of the strong, those with a wrong name claimed first; ``nearest`` with nothing but a nearest name.
-        outside_wrong: of the effects outside the catalogue at z of at least ten, those with a wrong name claimed;
-            ``outside_nearest`` with nothing but a nearest name or none.
+        name, sentence, right_to_say, wrong_to_say, apart: those of the scenario.
+        empty: number of recordings without hidden physics.
+        verdicts: their verdicts and failures.
+        false_alarms: share with claims of missing physics, of the diagnosed recordings.
+        alarms: the claimed effects.
+        adequate, unfit: shares of these verdicts.
+        unexplained_located: share of ``unexplained`` at the disturbed state, of recordings with a disturbance of at
+            least twice the noise.
+        located: share of the right state with any verdict, of the same recordings.
+        sensor_reported: share of reported drifts, of recordings whose sensor drifts by at least twice its white noise.
+        alone: share of a wrong name without alternatives, of all recordings.
+        undecided: share of ``unexplained`` or of names with alternatives, of all recordings.
+        useful_unfit: share of ``unfit``, of usable simulations without hidden physics, or with z of at least ten.
+        reasons: verdicts of unusable simulations, by the reason why they are unusable.
+        hidden: number of recordings with hidden physics; ``strong`` of them have an effect of the catalogue with z and
+            z_sep of at least ten.
+        named: share of right names of the strong; ``named_disturbed`` with, ``named_undisturbed`` without disturbance.
+        wrong: share of a wrong first name of the strong; ``nearest`` share with only a nearest name.
+        outside_wrong: share of a wrong name, of effects outside the catalogue with z of at least ten;
+            ``outside_nearest`` share with only a nearest name or none.
         failed: names of recordings without a diagnosis.
-        measured: the aims.
+        measured: the aims with their measured values.
     """
 
     name: str

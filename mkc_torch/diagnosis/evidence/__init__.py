@@ -1,7 +1,7 @@
-"""Tests of evidence: what speaks for and against a finding, and what is left over; one test a file.
+"""Tests of evidence for findings and of the residual, one test per file.
 
-A new one is a file with ``test(case) -> EvidenceResult`` and a line in :data:`TESTS`. What it says then stands in the report, on
-the terminal and in ``diagnosis.json``, there under ``evidence`` by its id. It informs: verdict and findings stay.
+A new test is a file with ``test(case) -> EvidenceResult`` and a line in :data:`TESTS`. Its result appears in the report, on
+the terminal and in ``diagnosis.json`` under ``evidence``, by its id. It does not change the verdict or the findings.
 """
 
 from mkc_torch.diagnosis.evidence import (
@@ -22,7 +22,7 @@ from mkc_torch.diagnosis.evidence.base import EvidenceTest
 __all__ = ["TESTS"]
 
 TESTS: tuple[EvidenceTest, ...] = (
-    EvidenceTest(held_out_gain.test, ahead=held_out_gain.beside_the_others, each_finding=True),
+    EvidenceTest(held_out_gain.test, ahead=held_out_gain.without_finding, each_finding=True),
     EvidenceTest(onset.test, ahead=onset.of_finding, each_finding=True),
     EvidenceTest(intermittency.test, each_finding=True),
     EvidenceTest(remaining.test, ahead=remaining.within_reach),

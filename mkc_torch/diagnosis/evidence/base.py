@@ -1,4 +1,4 @@
-"""A test of evidence: what it may look at, what it says, and how it is listed."""
+"""Interface of a test of evidence: its input, its result and its entry in the list of tests."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ __all__ = ["EvidenceContext", "EvidenceResult", "EvidenceTest", "Row", "SmoothCo
 
 @dataclass(frozen=True)
 class EvidenceContext:
-    """What a test may look at. It changes nothing of it.
+    """Input of a test; read only.
 
     Attributes:
-        base: the simulation alone.
-        first: what the first search located, whether it counts or not; None where there was nothing to search.
-        found: the findings as their searches located them, in order.
-        held_out: the simulation alone, and with one finding more each, on blocks that its fit has not seen.
-        blocks: those blocks.
+        base: the simulation without findings.
+        first: result of the first search, significant or not; None without candidates.
+        found: the search results of the findings, in order.
+        held_out: scores on held-out blocks of the simulation without findings, and with 1, 2, ... findings.
+        blocks: the held-out blocks.
         drivers: the recorded columns.
-        seed: of draws; a test begins with a generator of its own.
-        settings: the numbers that decide.
-        number: of the finding, for a test that is asked of each.
-        estimate: the final parameters; None ahead of them.
-        ahead: what the test's own ``ahead`` gave.
-        pairs: without and with each finding under the same pushes, by which it was confirmed.
+        seed: of random draws; each test creates its own generator.
+        settings: thresholds.
+        number: of the finding, in a test of each finding.
+        estimate: the final parameters; None in ``ahead`` functions.
+        ahead: result of the test's ``ahead`` function.
+        pairs: scores without and with each finding under the same process noise, by which it was confirmed.
     """
 
     base: FittedModel
@@ -63,7 +63,7 @@ class EvidenceContext:
 
     @property
     def of_states(self) -> bool:
-        """Whether a trajectory is simulated, which may be lost."""
+        """Whether the simulation integrates states, so that it can diverge."""
         return (
             self.prepared.ports.get("output") is not None
             and self.prepared.ports["output"].clock is None
@@ -72,73 +72,73 @@ class EvidenceContext:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the channels."""
+        """Units of the channels."""
         return units_of(self.prepared)
 
     @property
     def final(self) -> FinalEstimate:
-        """The final parameters, which a test has and what goes ahead of it has not."""
+        """The final parameters; not available in ``ahead`` functions."""
         assert self.estimate is not None
         return self.estimate
 
     @property
     def fits(self) -> tuple[FittedModel, ...]:
-        """The simulation alone, and with one finding more each."""
+        """The fits without findings, and with 1, 2, ... findings."""
         return self.base, *(located.fit for located in self.found)
 
     @property
     def fit(self) -> FittedModel:
-        """The simulation with all findings, as the searches left it."""
+        """The fit with all findings, as the search returned it."""
         return self.fits[-1]
 
     @property
     def located(self) -> SearchResult:
-        """The finding's search."""
+        """The search result of the finding."""
         return self.found[self.number]
 
     @property
     def term(self) -> Term:
-        """The finding in the final model."""
+        """The term of the finding in the final model."""
         return self.fit.model.terms[self.number]
 
     @property
     def overlaid(self) -> bool:
-        """Whether findings came later that belong to the models with and without this one alike."""
+        """Whether the models with and without this finding both include later findings."""
         clock = self.prepared.ports[self.term.port].clock
         return self.number < len(self.found) - 1 and clock is None
 
     @property
     def without_and_with(self) -> tuple[FittedModel, FittedModel]:
-        """The models that differ by the finding alone; of the one without it perhaps only where to start."""
+        """The models without and with the finding; the first may only be a start for a fit."""
         if self.overlaid:
             return without_term(self.fit, self.number), self.fit
         return self.fits[self.number], self.located.fit
 
     @property
     def inliers(self) -> Bool[Tensor, "N m"]:
-        """The samples that both the final fit and the model on held-out blocks believe."""
+        """The inliers of both the final fit and the model on held-out blocks."""
         last, settings = self.held_out[-1], self.settings.evidence
         return (last.residual.abs() <= settings.inlier * last.d) & (self.final.fit.weights > settings.believed)
 
     def rms(self, model: Evidence) -> float:
-        """Root mean square of a model's held-out residuals over the inliers."""
+        """Return the RMSE of a model on held-out blocks, over the inliers."""
         return float(model.residual[self.inliers].square().mean().sqrt())
 
     def spread(self, model: Evidence) -> HeldOutScore:
-        """A model on held-out blocks."""
+        """Return the score of a model on held-out blocks."""
         mean = float(model.log_likelihood.mean())
         return HeldOutScore(mean, self.rms(model), tuple(model.sigma.tolist()), tuple(model.d.tolist()))
 
 
 @dataclass(frozen=True)
 class EvidenceTest:
-    """A test as it is listed in :data:`mkc_torch.diagnosis.evidence.TESTS`.
+    """An entry of :data:`mkc_torch.diagnosis.evidence.TESTS`.
 
     Attributes:
-        test: what it says of a case.
-        ahead: for a test that takes long, what of it needs no final parameters: done beside their estimate and the next
-            search, in a process of its own, from the fit with all findings.
-        each_finding: whether it is asked of each finding, and not once of the whole diagnosis.
+        test: the test.
+        ahead: expensive part of the test that does not need the final parameters; computed in a separate process, in
+            parallel with their estimate and the next search.
+        each_finding: whether it tests each finding instead of the whole diagnosis.
     """
 
     test: Callable[[EvidenceContext], EvidenceResult]
@@ -147,7 +147,7 @@ class EvidenceTest:
 
 
 def gain_of(final: FinalEstimate, number: int) -> Float[Tensor, " N"]:
-    """What one effect gains at each sample, in nats, all else as it is."""
+    """Return the gain of an effect at each sample, in nats, with all other parameters fixed."""
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()
     start = model.base + sum(model.sizes[:number])

@@ -1,4 +1,4 @@
-"""The ceiling of any fit: what a smooth correction by all columns and by time would gain on blocks it has not seen."""
+"""Score of a smooth correction by all columns and time, on held-out blocks: a ceiling for comparison."""
 
 from __future__ import annotations
 
@@ -25,57 +25,55 @@ if TYPE_CHECKING:
 __all__ = ["Ceiling", "ceiling"]
 
 _MOST = 4
-"""Columns taken up, one after the other; a column counts once for each port."""
+"""Largest number of selected columns; a column counts once per port."""
 
 _PENALTIES = (1e-3, 3e-2, 1.0)
-"""Strengths tried of the pull on a quadratic, over that of the training samples; on steeper curves it is stronger."""
+"""Ridge penalties of a quadratic curve, relative to the training samples; higher degrees have larger penalties."""
 
 _MIDDLE = 3e-2
-"""The strength that columns are taken up with."""
+"""Ridge penalty during the selection of columns."""
 
 _REACH = 3.0
-"""Robust standard deviations of the residual that the domain of its density holds at least."""
+"""Minimum half-width of the density's domain, in robust standard deviations of the residual."""
 
 _ROUNDS = 2
-"""Rounds of reweighting, by the density that the round before has left."""
+"""Number of reweighting iterations."""
 
 _ALIKE = 0.02
-"""Share of the loss that is not worth another column, if it is within the error."""
+"""Share of the loss below which a further column is not selected, if it is within the standard error."""
 
 _TINY = 1e-9
-"""Least root mean square of a tangent, and the precision, a sample, of directions that nothing is known of."""
+"""Minimum RMS of a tangent, and minimum precision per sample of a direction."""
 
 _ROUNDING = 1e-12
-"""Share of its own that is added to the products of each tangent, for of two that are one rounding would decide."""
+"""Relative jitter of the Gram matrix; without it, rounding would decide between collinear tangents."""
 
 
 @dataclass(frozen=True)
 class Ceiling:
-    """A smooth correction on held-out blocks, and the recorded columns that most of its fits take up."""
+    """Score of a smooth correction on held-out blocks, and the columns that most folds select."""
 
     evidence: Evidence
     columns: tuple[str, ...]
 
 
 def ceiling(model: JointModel, fit: FittedModel, drivers: Sequence[Driver], blocks: HeldOutBlocks) -> Ceiling:
-    """How far a smooth correction beside a model comes, on the blocks, the bound and the density of the other models.
+    """Score a smooth correction of a model on held-out blocks, with the bound and density of the other models.
 
-    At every port the correction adds Legendre curves of every column and of time, by ridge regression on roughness. For
-    each fold, on the samples of the others, columns are taken up one after the other, whichever gains most; how many
-    and how smooth is what predicts best on average in the *other* held-out folds, so that noise with a memory does not
-    pass for a curve as it does by generalised cross-validation. Two rounds of reweighting and a density of its own
-    follow.
+    At every port the correction adds Legendre curves of every column and slow courses of time, by ridge regression.
+    For each fold, columns are selected forward on the training samples. Number of columns and penalty are those that
+    predict the *other* held-out folds best, so that coloured noise is not fitted as a curve, as generalised
+    cross-validation does. Two reweighting iterations and a density fit follow.
 
-    It is what a fit *could* reach and no evidence that something is missing: noise that wanders for longer than a block
-    is smooth in time, and in every column that wanders too, so a ceiling above the simulation is to be expected there.
-    What it cannot follow is a jump, or what depends on the measured signal itself.
+    The score is no evidence of missing physics: a drift longer than a block is smooth in time, and in every column that
+    drifts too, so the ceiling can exceed the simulation. The correction cannot fit jumps, or dependences on the measured
+    signal itself.
 
     Args:
-        model: what the correction stands beside, such as the simulation alone.
-        fit: the likeliest model; the residual is taken for linear around its parameters, and samples that it rejects
-            do not choose the columns.
+        model: the model to correct, such as the simulation without findings.
+        fit: the most likely model; the residual is linearised at its parameters, and its outliers do not select columns.
         drivers: the columns.
-        blocks: to predict.
+        blocks: held-out blocks.
     """
     parameters = fit.parameters[: model.size]
     residual = model.residual(parameters).detach()
@@ -84,17 +82,17 @@ def ceiling(model: JointModel, fit: FittedModel, drivers: Sequence[Driver], bloc
     problem = _problem(model, parameters, residual, smooth, fit.d)
     paths = _paths(problem, smooth, fit.weights, blocks)
     chosen = _chosen(paths)
-    taken = [{smooth.names[k] for k in item.groups} for item in chosen]
+    taken = [{smooth.names[k] for k in step.groups} for step in chosen]
     common = [name for name in curves if name != TIME and 2 * sum(name in names for names in taken) > len(taken)]
     return Ceiling(_judged(problem, chosen, fit, blocks), tuple(common))
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """Residuals on the scale of the noise, ``residual + tangents @ δ``, and a quadratic that pulls at δ.
+    """Linear model ``residual + tangents @ δ`` in units of the noise, with a quadratic penalty on δ.
 
-    Tangents have a mean square of one, those of the model's own parameters stand first; ``rough`` is for a strength of
-    one, ``prior`` and ``pull`` are of the parameters.
+    Tangents have unit mean square; those of the model's parameters are first. ``rough`` is the penalty at strength 1;
+    ``prior`` and ``pull`` are precision and gradient of the parameters' prior.
     """
 
     residual: Tensor  # (N, m)
@@ -104,8 +102,8 @@ class _Problem:
     pull: Tensor  # (p,)
 
     def penalised(self, gram: Float[Tensor, "q q"], index: Tensor, strength: float) -> Float[Tensor, "q q"]:
-        """Products of the tangents in ``index``, which begin with the parameters', with the penalty on them."""
-        # of two tangents that are one, rounding alone would tell what is whose
+        """Return the penalised Gram matrix of the tangents ``index``, the parameters' tangents first."""
+        # jitter: rounding alone would decide between collinear tangents
         out = gram + torch.diag(strength * self.rough[index] + _ROUNDING * gram.diagonal())
         out[: len(self.pull), : len(self.pull)] += self.prior
         return out
@@ -117,12 +115,12 @@ class _Problem:
 def _problem(
     model: JointModel, parameters: Tensor, residual: Float[Tensor, "N m"], smooth: Smooth, d: Float[Tensor, " m"]
 ) -> _Problem:
-    # in their place: of a long recording they are most of what there is, and nobody asks for them again
+    # in place: they need most of the memory of a long recording and are not used again
     tangents = smooth.tangents.div_(d.unsqueeze(-1)).flatten(0, 1)
     samples = len(tangents)
     size = (torch.linalg.vector_norm(tangents, dim=0) / math.sqrt(samples)).clamp(min=_TINY)
     own = size[: smooth.own]
-    # directions that nothing is known of stay where they are
+    # a small precision keeps undetermined directions fixed
     prior, pull = torch.diag(torch.full_like(own, _TINY * samples)), torch.zeros_like(own)
     known = model.prior
     if known is not None:
@@ -134,7 +132,7 @@ def _problem(
 
 @dataclass(frozen=True)
 class _Step:
-    """One of a fold's fits: the groups and tangents in it, δ, the penalty's strength, and its loss on the fold."""
+    """A fit without a fold: selected groups, their tangents, δ, the penalty, and the loss on the fold."""
 
     groups: tuple[int, ...]
     index: Tensor
@@ -146,9 +144,9 @@ class _Step:
 def _paths(
     problem: _Problem, smooth: Smooth, weights: Float[Tensor, "N m"], blocks: HeldOutBlocks
 ) -> list[list[list[_Step]]]:
-    """For each fold, for each number of columns, for each penalty, the fit to the other folds."""
+    """Return the fits without each fold, for each number of columns and each penalty."""
     folds = len(blocks.train)
-    # samples that the same folds train on go into one product
+    # accumulate a common product of samples with the same training folds
     kind = torch.cat([torch.stack(blocks.train, -1), blocks.fold.unsqueeze(-1)], -1)
     kinds, number = kind.unique(dim=0, return_inverse=True)
     number = number.repeat_interleave(problem.residual.shape[1])
@@ -162,14 +160,14 @@ def _paths(
 
 
 def _product(problem: _Problem, weights: Float[Tensor, " Nm"], rows: Bool[Tensor, " Nm"]) -> Float[Tensor, "P1 P1"]:
-    """Weighted products of tangents and residual, which comes last."""
+    """Return the weighted Gram matrix of tangents and residual, the residual last."""
     part = torch.cat([problem.tangents[rows], problem.residual.reshape(-1, 1)[rows]], -1)
     part.mul_(weights[rows].sqrt().unsqueeze(-1))
     return part.mT @ part
 
 
 def _path(problem: _Problem, smooth: Smooth, train: Tensor, held: Tensor, allowed: Sequence[bool]) -> list[list[_Step]]:
-    """Take up one column after the other, whichever gains most by Akaike's criterion."""
+    """Select columns forward by Akaike's criterion."""
     P = len(problem.rough)
     gradient = problem.pulled(train[:P, P])
     everything = problem.penalised(train[:P, :P], torch.arange(P), _MIDDLE)
@@ -177,22 +175,22 @@ def _path(problem: _Problem, smooth: Smooth, train: Tensor, held: Tensor, allowe
     groups: tuple[int, ...] = ()
     path: list[list[_Step]] = []
     while True:
-        path.append([_fit(problem, train, held, gradient, groups, index, item) for item in _PENALTIES])
+        path.append([_fit(problem, train, held, gradient, groups, index, penalty) for penalty in _PENALTIES])
         free = [k for k in range(len(smooth.groups)) if allowed[k] and k not in groups]
         if len(groups) == _MOST or not free:
             return path
-        # beside what is in already
+        # Schur complement of the selected tangents
         across = everything[:, index]
         solved = torch.linalg.solve(across[index], torch.cat([across.mT, gradient[index, None]], -1))
-        beside, left = everything - across @ solved[:, :-1], gradient - across @ solved[:, -1]
-        gain = [_gain(beside, left, smooth.groups[k]) for k in free]
+        reduced, slope = everything - across @ solved[:, :-1], gradient - across @ solved[:, -1]
+        gain = [_gain(reduced, slope, smooth.groups[k]) for k in free]
         best = free[max(range(len(free)), key=gain.__getitem__)]
         groups, index = (*groups, best), torch.cat([index, smooth.groups[best]])
 
 
-def _gain(beside: Tensor, left: Tensor, group: Tensor) -> float:
-    step = torch.linalg.solve(beside[group.unsqueeze(-1), group], left[group])
-    return 0.5 * float(left[group] @ step) - len(group)
+def _gain(reduced: Tensor, slope: Tensor, group: Tensor) -> float:
+    step = torch.linalg.solve(reduced[group.unsqueeze(-1), group], slope[group])
+    return 0.5 * float(slope[group] @ step) - len(group)
 
 
 def _fit(
@@ -206,15 +204,15 @@ def _fit(
 ) -> _Step:
     gram = train[index.unsqueeze(-1), index]
     delta = -torch.linalg.solve(problem.penalised(gram, index, strength), gradient[index])
-    one = torch.cat([delta, delta.new_ones(1)])
+    weights = torch.cat([delta, delta.new_ones(1)])
     seen = torch.cat([index, index.new_tensor([len(held) - 1])])
-    return _Step(groups, index, delta, strength, float(one @ held[seen.unsqueeze(-1), seen] @ one))
+    return _Step(groups, index, delta, strength, float(weights @ held[seen.unsqueeze(-1), seen] @ weights))
 
 
 def _chosen(paths: Sequence[Sequence[Sequence[_Step]]]) -> list[_Step]:
-    """Of each fold the fit of as many columns and of that penalty which do best on the other folds.
+    """Return each fold's fit with the number of columns and the penalty that score best on the other folds.
 
-    As few columns as are within a standard error of the best, if that is a small share of the loss.
+    The smallest number of columns within a standard error of the best, if that error is a small share of the loss.
 
     Hastie, Tibshirani & Friedman, "The Elements of Statistical Learning" (2009), 7.10.
     """
@@ -233,7 +231,7 @@ def _chosen(paths: Sequence[Sequence[Sequence[_Step]]]) -> list[_Step]:
 
 
 def _judged(problem: _Problem, chosen: Sequence[_Step], fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
-    """Reweighted by densities of their own, on the shared domain, and scored on the fold that was left out."""
+    """Reweight each fit by its density, on the common domain, and score it on its held-out fold."""
     residual, bound = problem.residual, fit.bound / fit.d
     used = torch.stack(blocks.train).unsqueeze(-1).to(residual)
     columns = [problem.tangents[:, step.index] for step in chosen]
@@ -243,7 +241,7 @@ def _judged(problem: _Problem, chosen: Sequence[_Step], fit: FittedModel, blocks
         weights = used * mkc_weight(left, sigma.unsqueeze(1), d.unsqueeze(1)) / d.square().unsqueeze(1)
         left = torch.stack([_reweighted(problem, c, s, w) for c, s, w in zip(columns, chosen, weights, strict=True)])
         weight = used.expand_as(left)
-        # a curve that runs away on one fold leaves more than the domain holds
+        # the residual of a curve that diverges on a fold exceeds the domain
         room = bound.maximum(_REACH * robust_scale(left, weight).amax(0))
         density = fit_density(left, bound=room, weight=weight, tol=1e-6)
         sigma, d = density.sigma, density.d

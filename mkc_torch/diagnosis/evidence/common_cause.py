@@ -1,4 +1,4 @@
-"""Whether noise that wanders in several channels is one course along one direction: a cause that was not recorded."""
+"""Whether the drifts of several channels have a common cause: one course along one direction."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 __all__ = ["CommonCause", "common_cause"]
 
 _ROUNDS, _SETTLED = 40, 1e-2
-"""Steps at most towards the likeliest covariance, and the nats that a step has to bring for another."""
+"""Maximum number of MM iterations, and the gain in nats below which they stop."""
 
 _LEAST = 1e-6
-"""Smallest variance of a direction, over that of all channels together."""
+"""Minimum variance of a direction, relative to the trace of the covariance."""
 
 _ROUNDED = 1e-12
-"""Share of the largest eigenvalue below which one is lost in rounding."""
+"""Relative eigenvalue below which rounding dominates."""
 
-_TOLD = 1e-2
-"""Courses whose amplitude is a smaller share of the largest one are not told."""
+_LEAST_AMPLITUDE = 1e-2
+"""Relative amplitude below which a cosine is omitted from the course."""
 
 
 @dataclass(frozen=True)
 class CommonCause:
-    """What the channels of a wander have in common.
+    """Common cause of the drifts of channels.
 
     Attributes:
-        gain: nats by which channels that hang together make the noise likelier than channels that do not.
-        p_value: of that gain, were each channel to wander for itself.
-        direction: (c,), change of the channels at a course of 1, as it is in the residual.
-        shape: the course, which spans a range of 1.
+        gain: log-likelihood gain of correlated over independent drifts, in nats.
+        p_value: of that gain, if the drifts were independent.
+        direction: (c,), change of the residual channels at a course of 1.
+        shape: the course, of range 1.
     """
 
     gain: float
@@ -53,34 +53,34 @@ class CommonCause:
     shape: Shape
 
     def towards(self, direction: Float[Tensor, " c"]) -> CommonCause:
-        """The same, of two ways to say it the one whose direction is less than a right angle away from this one."""
+        """Return the cause with the sign for which its direction has a positive product with ``direction``."""
         if float(self.direction @ direction) >= 0.0:
             return self
         return replace(self, direction=-self.direction, shape={name: -value for name, value in self.shape.items()})
 
 
 def common_cause(linearised: LinearisedSearch, slow: SlowBasis | None) -> CommonCause | None:
-    """The likeliest covariance between the channels of a wander, against one that is diagonal.
+    """Compare a full covariance of the channels' drifts with a diagonal covariance.
 
-    A sensor's axes wander for themselves; what moves them together is one cause. Variance components are found by
-    minorisation and maximisation, Zhou, Hu, Zhou & Lange, "MM algorithms for variance components models", J. Comput.
-    Graph. Stat. 28 (2019); twice the gain has, were there none, a chi-square distribution with the number of
-    covariances as its degrees of freedom (Wilks 1938).
+    The axes of a sensor drift independently; a common cause correlates them. Variance components by minorisation and
+    maximisation, Zhou, Hu, Zhou & Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28
+    (2019). Without a common cause, twice the gain is chi-square distributed with the number of covariances as its
+    degrees of freedom (Wilks 1938).
 
     Args:
-        linearised: a fit and the series that it leaves.
-        slow: the courses of its wander.
+        linearised: a fit and its residual.
+        slow: the basis of its drift.
 
     Returns:
-        None where nothing wanders, or in one channel alone.
+        None without drift, or with drift in a single channel.
     """
     if slow is None or slow.channels < 2 or not linearised.has_drift:
         return None
     part = linearised.search.drift_statistics(linearised.series)
     c = slow.channels
     start = torch.diag(part.size * torch.ones(c, dtype=part.inner.dtype))
-    apart, alone, _ = _likeliest(part, start, _diagonal)
-    likely, together, courses = _likeliest(part, apart, _free)
+    apart, alone, _ = _most_likely_covariance(part, start, _diagonal)
+    likely, together, courses = _most_likely_covariance(part, apart, _free)
     gain = max(together - alone, 0.0)
     dof = likely.new_tensor(0.5 * c * (c - 1))
     p_value = float(log_survival(likely.new_tensor(2.0 * gain), dof).exp())
@@ -89,17 +89,17 @@ def common_cause(linearised: LinearisedSearch, slow: SlowBasis | None) -> Common
     amplitudes = part.scale[::c] * (courses @ along)
     course = course_of(amplitudes, len(slow.tangents))
     span = float(course.max() - course.min())
-    text = amplitudes.abs() > _TOLD * amplitudes.abs().max()
+    text = amplitudes.abs() > _LEAST_AMPLITUDE * amplitudes.abs().max()
     shape = {
         f"{COURSE}{k + 1}": math.sqrt(2.0) * float(amplitudes[k]) / span for k in text.nonzero().flatten().tolist()
     }
     return CommonCause(gain, p_value, span * relative * along, shape)
 
 
-def _likeliest(
+def _most_likely_covariance(
     part: DriftStatistics, start: Float[Tensor, "c c"], step: Callable[[Tensor, Tensor, Tensor], Tensor]
 ) -> tuple[Float[Tensor, "c c"], float, Float[Tensor, "K c"]]:
-    """Covariance of the channels, over the white part's variance; its log-likelihood; and the courses it predicts."""
+    """Return the covariance relative to the white variance, its log-likelihood, and the predicted courses."""
     covariance, (value, courses, seen, expected) = start, _at(part, start)
     for _ in range(_ROUNDS):
         moved = step(covariance, seen, expected)
@@ -114,7 +114,7 @@ def _likeliest(
 
 
 def _at(part: DriftStatistics, covariance: Float[Tensor, "c c"]) -> tuple[float, Tensor, Tensor, Tensor]:
-    """Log-likelihood, predicted courses (K, c), and the two sides of its slope: what is seen and what is expected."""
+    """Return log-likelihood, predicted courses (K, c), and observed and expected part of the gradient."""
     c, inverse = len(covariance), torch.linalg.inv(covariance)
     K = len(part.inner) // c
     precision = part.gram.clone()
@@ -137,7 +137,7 @@ def _diagonal(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
 
 
 def _free(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
-    # what is expected of a direction that hardly moves is a difference of large numbers, and may round below zero
+    # the expected part of a nearly constant direction is a difference of large numbers and may round below zero
     values, vectors = torch.linalg.eigh(0.5 * (expected + expected.mT))
     values = values.clamp(min=_ROUNDED * float(values.abs().max()))
     root, inverse = (vectors * values.sqrt()) @ vectors.mT, (vectors * values.rsqrt()) @ vectors.mT

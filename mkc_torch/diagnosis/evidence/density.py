@@ -1,4 +1,4 @@
-"""Whether the density of the residuals is right: their probability-integral transform, against a Student-t's."""
+"""Goodness of fit of the residuals' density, compared with a Student-t, by the probability-integral transform."""
 
 from __future__ import annotations
 
@@ -22,37 +22,36 @@ __all__ = [
     "density_checks",
     "density_warnings",
     "kolmogorov",
-    "said",
+    "as_result",
     "student_cdf",
     "student_fit",
     "test",
 ]
 
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
-"""Degrees of freedom that are tried."""
+"""Candidate degrees of freedom."""
 
 _ROUNDS, _NODES = 30, 2001
-"""Of the EM algorithm for a Student-t's scale, and nodes of the integral of its density."""
+"""EM iterations of a Student-t's scale, and nodes of the integral of its density."""
 
 _AT_ONCE = 10_000
-"""Samples whose distribution function is computed together: each takes an integral over tens of nodes."""
+"""Batch size of the distribution function, which integrates over tens of nodes per sample."""
 
-_COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "by chance up to", "")
+_COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "critical distance", "")
 _NOTE = (
-    "The largest distance between the distribution function of the residuals and that of the density fitted to them, "
-    "and of the likeliest Student-t; 0 is a perfect fit. A share of {chance:.1g} of recordings is "
-    "beyond what is given as chance."
+    "Kolmogorov distance of the residuals from the fitted density, and from the most likely Student-t; 0 is a perfect "
+    "fit. The critical distance has level {chance:.1g}."
 )
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """How far the density of each channel is off, and a warning where a Student-t is clearly closer."""
+    """Test the density of each channel; warn if a Student-t is clearly closer."""
     fit = case.final.fit
     channels, settings = case.prepared.channels, case.settings.evidence
-    return said(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
+    return as_result(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
 
 
-def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> EvidenceResult:
+def as_result(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> EvidenceResult:
     # the tail of Kolmogorov's distribution
     chance = 2.0 * math.exp(-2.0 * settings.density_off**2)
     table = Table(
@@ -78,15 +77,15 @@ def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> Evidence
 
 
 def _in_words(check: DensityCheck) -> tuple[str, ...]:
-    """How far a channel's density is off, how far a Student-t is, and what that says.
+    """Format the distances of a channel and their conclusion.
 
     Example:
         >>> _in_words(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
-        ('norm', '0.021', '0.034 (4 degrees of freedom)', '0.05', 'no more than chance')
+        ('norm', '0.021', '0.034 (4 degrees of freedom)', '0.05', 'not significant')
     """
-    verdict = "a Student-t is closer" if check.closer else "no more than chance"
+    verdict = "a Student-t is closer" if check.closer else "not significant"
     if not check.closer and check.distance > check.allowed:
-        verdict = "the density is off, and a Student-t clearly no better"
+        verdict = "significant, but a Student-t is not clearly better"
     freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
     student = f"{check.student_distance:.2g} ({freedom})"
     return check.channel, f"{check.distance:.2g}", student, f"{check.allowed:.2g}", verdict
@@ -100,18 +99,18 @@ def density_checks(
     channels: Sequence[str],
     settings: EvidenceSettings,
 ) -> tuple[DensityCheck, ...]:
-    """How far the residuals of each channel, outliers among them, are from their density, and from a Student-t.
+    """Return the Kolmogorov distances of each channel's residuals, with outliers, from their density and a Student-t.
 
-    Their sizes go through the density's distribution function (probability-integral transform), which makes them
-    uniform if it is theirs; the distance is Kolmogorov's from that. The other one is that of the likeliest Student-t
-    around zero. That one is the closer if the density's distance is beyond what so many samples allow, as many as their
-    autocorrelation leaves, while the Student-t is likelier, at half the distance, and within what they allow.
+    The density's distribution function (probability-integral transform) makes the absolute residuals uniform if the
+    density is correct. A Student-t around zero is closer if the density's distance exceeds the critical distance for
+    the effective number of samples, and the Student-t is more likely, at half the distance, and below the critical
+    distance.
 
     Args:
         residual: of the final model.
         sigma, d, bound: of the density.
         channels: their names.
-        settings: what so many samples allow, and what is closer.
+        settings: critical distance and ratio of the distances.
 
     Example:
         >>> order = torch.randperm(4000, generator=torch.Generator().manual_seed(0)).double()
@@ -124,7 +123,7 @@ def density_checks(
     size = residual.abs()
     density = MKCDistribution(sigma, d, bound, validate_args=False)
     uniform = torch.cat([2.0 * density.cdf(part) - 1.0 for part in size.split(_AT_ONCE)])
-    # beyond the domain it is as on its edge
+    # beyond the domain: the value at its edge
     likelihood = density.log_prob(torch.minimum(size, bound)).mean(0)
     found = []
     for k, channel in enumerate(channels):
@@ -139,9 +138,9 @@ def density_checks(
 
 
 def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
-    """A sentence on the channels whose residuals are clearly not of the density fitted to them, and of a Student-t.
+    """Return a warning for channels whose residuals a Student-t describes clearly better than the density.
 
-    Outliers that neither of the two describes are not told of.
+    Outliers that neither describes cause no warning.
 
     Example:
         >>> density_warnings([DensityCheck("norm", 0.12, 0.01, 2.0, 0.05, True)])[0].partition(":")[0]
@@ -153,14 +152,13 @@ def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
     worst = max(misfit, key=lambda check: check.distance)
     return (
         f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
-        f"distribution function is off by up to {worst.distance:.2g}, that of a Student-t with "
-        f"{worst.degrees_of_freedom:g} degrees of freedom by {worst.student_distance:.2g}. A misfit of the tail must "
-        "not be read as physics.",
+        f"Kolmogorov distance is {worst.distance:.2g}, that of a Student-t with {worst.degrees_of_freedom:g} degrees of "
+        f"freedom {worst.student_distance:.2g}. A misfit of the tail is not evidence of physics.",
     )
 
 
 def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
-    """Largest distance of the empirical distribution function from that of the uniform distribution on [0, 1].
+    """Return the Kolmogorov distance of a sample from the uniform distribution on [0, 1].
 
     Example:
         >>> round(kolmogorov(torch.tensor([0.1, 0.3, 0.5, 0.9])), 2)
@@ -173,14 +171,14 @@ def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
 
 
 def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:
-    """Degrees of freedom, scale and mean log-likelihood of the likeliest Student-t around zero.
+    """Return degrees of freedom, scale and mean log-likelihood of the most likely Student-t around zero.
 
-    The scale by the EM algorithm of Lange, Little & Taylor, "Robust statistical modeling using the t distribution",
+    Scale by the EM algorithm of Lange, Little & Taylor, "Robust statistical modeling using the t distribution",
     JASA 84 (1989).
     """
     freedom = error.new_tensor(_FREEDOM).unsqueeze(-1)
     square = error.square()
-    least = torch.finfo(error.dtype).tiny  # of residuals that are all zero
+    least = torch.finfo(error.dtype).tiny  # all residuals may be zero
     variance = square.median().clamp(min=least).expand(len(freedom), 1)
     for _ in range(_ROUNDS):
         weight = (freedom + 1.0) / (freedom + square / variance)
@@ -196,9 +194,9 @@ def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:
 
 
 def student_cdf(size: Float[Tensor, " N"], freedom: float) -> Float[Tensor, " N"]:
-    """Probability that the absolute value of a Student-t of scale one is at most ``size``.
+    """Return the probability that the absolute value of a Student-t of unit scale is at most ``size``.
 
-    With ``x = √ν tan θ`` it is the integral of ``cos^(ν-1)``, here by trapezoids.
+    With ``x = √ν tan θ`` it is the integral of ``cos^(ν-1)``, by the trapezoidal rule.
 
     Example:
         >>> student_cdf(torch.tensor([1.0, 12.706], dtype=torch.float64), 1.0)

@@ -1,4 +1,4 @@
-"""Whether an effect follows the course of its driver as recorded: the same driver, shifted in time, as a null."""
+"""Placebo test of a driver: copies of the driver, shifted in time."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["of_finding", "said", "shifted", "test"]
+__all__ = ["of_finding", "as_result", "shifted", "test"]
 
 _COPIES = 19
-"""Shifted copies to either side."""
+"""Shifted copies in each direction."""
 
 _AT_ONCE = 19
-"""Copies that are laid out together."""
+"""Batch size of the copies."""
 
 _FEWEST = 200
-"""With fewer samples in the middle there is nothing to compare."""
+"""Minimum number of samples in the middle of the recording."""
 
 _AS_MUCH = 0.999
-"""Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
+"""Share of the gain from which a copy counts as good; shifted ramps differ only by rounding."""
 
 
 def of_finding(case: EvidenceContext) -> DriverShift | None:
@@ -42,11 +42,11 @@ def of_finding(case: EvidenceContext) -> DriverShift | None:
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """How many shifted copies of the finding's driver gain as much, and a warning where many do."""
-    return said(case.ahead, case.term, case.settings.evidence)
+    """Count the shifted copies of the finding's driver with at least its gain; warn if there are many."""
+    return as_result(case.ahead, case.term, case.settings.evidence)
 
 
-def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
+def as_result(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
     if shift is None:
         return EvidenceResult("driver_shift")
     some = {0: "none", 1: "one"}.get(shift.as_good, str(shift.as_good))
@@ -55,8 +55,8 @@ def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> E
     columns = ", ".join(term.columns)
     sentence = (
         f"{shift.as_good} of {shift.copies} copies of {columns}, shifted by up to {shift.reach:.3g} s, gain as much "
-        f"for {term.effect.id} as the column itself: its timing does not show that it is the driver, rather than "
-        "something else that changes as slowly."
+        f"for {term.effect.id} as the column itself: its timing does not distinguish it from other quantities that change "
+        "as slowly."
     )
     many = shift.as_good > settings.shift_many * shift.copies
     return EvidenceResult(
@@ -65,11 +65,10 @@ def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> E
 
 
 def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
-    """Compare the gain of an effect with its gains when its driver comes earlier or later.
+    """Compare the gain of an effect with its gains for a shifted driver.
 
-    The motion, the parameters and the noise stay where they are, only the driver moves, and all shifts are judged on
-    the same samples in the middle, so that no end of the driver meets its beginning. What a model of the noise misses
-    is in all of these gains alike.
+    Only the driver is shifted; motion, parameters and noise are unchanged. All shifts are scored on the same samples in
+    the middle, so that the driver needs no wrap-around. Errors of the noise model affect all gains alike.
 
     Harris, "Nonsense correlations in neuroscience", bioRxiv 2020.11.29.402719 (2020), the linear shift.
 
@@ -78,8 +77,8 @@ def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
         located: the effect.
 
     Returns:
-        None where the effect has no recorded driver, or acts where a shift would take a simulation of its own, or the
-        recording is short.
+        None without a recorded driver, for a port at which each shift needs its own simulation, or for a short
+        recording.
     """
     term = located.term
     pointwise = located.scene.tangents.pointwise[term.port]
@@ -109,7 +108,7 @@ def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
 
 
 def _moved(term: Term, by: int) -> Term:
-    """The same with its driver so many samples later, held at its ends."""
+    """Delay the driver by ``by`` samples, constant beyond its ends."""
     assert term.driver is not None
     values = term.driver.values
     rows = (torch.arange(len(values)) - by).clamp(0, len(values) - 1)
@@ -121,6 +120,6 @@ def _cut(tangents: ModelTangents, rows: slice) -> ModelTangents:
     return ModelTangents(
         tangents.nuisance[rows],
         (),
-        {name: None if item is None else item[rows] for name, item in tangents.pointwise.items()},
+        {name: None if jacobian is None else jacobian[rows] for name, jacobian in tangents.pointwise.items()},
         None if slow is None else replace(slow, tangents=slow.tangents[rows]),
     )

@@ -1,4 +1,4 @@
-"""Whether a finding holds beyond what it was fitted to: fitted where its driver is low, judged where it is high."""
+"""Extrapolation test: fit a finding at low values of its driver, and score it at high values."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Extrapolation
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
-__all__ = ["extrapolated", "of_finding", "said", "test"]
+__all__ = ["extrapolated", "of_finding", "as_result", "test"]
 
 _BLOCKS, _FEWEST = 25, 5
-"""Blocks of the recording for the interval of the gain, and how many of them the high values have to be in."""
+"""Blocks of the bootstrap, and the minimum number of blocks with high values."""
 
 
 def of_finding(case: EvidenceContext) -> Extrapolation | None:
@@ -25,17 +25,17 @@ def of_finding(case: EvidenceContext) -> Extrapolation | None:
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """What the finding is worth where its driver is high, and a warning where it makes it clearly worse."""
-    return said(case.ahead, case.term, case.settings.evidence)
+    """Score the finding at high values of its driver; warn if it makes the prediction clearly worse."""
+    return as_result(case.ahead, case.term, case.settings.evidence)
 
 
-def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
+def as_result(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
     if extrapolation is None:
         return EvidenceResult("extrapolation")
     low, high = extrapolation.confidence_interval
-    verb = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
+    verb = "improves the prediction" if low > 0.0 else "degrades the prediction" if high < 0.0 else "is not significant"
     gain = _in_words(extrapolation)
-    row = Row("beyond its range", f"fitted where its driver is low, it {verb} where that is high: {gain}", False)
+    row = Row("beyond its range", f"fitted at low values of its driver, it {verb} at high values: {gain}", False)
     sentence = (
         f"{term.effect.id} does not extrapolate: fitted to the {100.0 * settings.low_share:.0f} % of samples where "
         f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
@@ -45,36 +45,35 @@ def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSett
 
 
 def _in_words(extrapolation: Extrapolation) -> str:
-    """The gain with its interval, to two digits of its standard error.
+    """Format the gain with its interval, to two digits of its standard error.
 
     Example:
         >>> _in_words(Extrapolation(-0.0212, (-0.12, 0.09)))
-        '-0.021 nats a sample (95 %: -0.120 to 0.090)'
+        '-0.021 nats per sample (95 %: -0.120 to 0.090)'
     """
     low, high = extrapolation.confidence_interval
     places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
     gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
-    return f"{gain:+.{places}f} nats a sample (95 %: {low:.{places}f} to {high:.{places}f})"
+    return f"{gain:+.{places}f} nats per sample (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
 def extrapolated(
     without: FittedModel, fit: FittedModel, term: Term, seed: int, settings: EvidenceSettings
 ) -> Extrapolation | None:
-    """Fit with and without an effect to the low values of its driver, and compare on the high ones.
+    """Fit with and without an effect to low values of its driver, and compare the scores at high values.
 
-    A driver of several columns is high where it is far from its mean. The shapes of effects stay as they are, and so
-    does the bound.
+    A driver of several columns is high if it is far from its mean. The shapes of effects and the bound are fixed.
 
     Args:
         without: the model without the effect.
-        fit: the same with it.
+        fit: the model with the effect.
         term: the effect.
-        seed: of the bootstrap of blocks.
-        settings: which values are low.
+        seed: of the block bootstrap.
+        settings: definition of low values.
 
     Returns:
-        None where the driver was not recorded, or where its low values hardly vary, as those of a switch, or the high
-        ones are all in one place in time.
+        None without a recorded driver, if its low values hardly vary (a switch), or if the high values are in too few
+        blocks.
     """
     reach = _reach(term)
     if reach is None:

@@ -1,4 +1,4 @@
-"""Held-out evidence: with and without the findings, on blocks of the recording that the fit has not seen."""
+"""Cross-validation on blocks of consecutive samples."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out"
 
 @dataclass(frozen=True)
 class HeldOutBlocks:
-    """Blocks of consecutive samples, one fold each: block and fold of every sample, and what training leaves out."""
+    """Block and fold of each sample (N,), and the training samples of each fold."""
 
     block: Tensor
     fold: Tensor
@@ -34,9 +34,9 @@ class HeldOutBlocks:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,).
+    """Scores on held-out samples: log-likelihood (N,), residual (N, m), and the density's σ and d (m,).
 
-    ``parameters`` are those of the fits without each fold, (folds, p), which leave out this share of the samples.
+    ``parameters`` (folds, p) are those of the fits without each fold; ``left_out`` is the mean share of excluded samples.
     """
 
     log_likelihood: Float[Tensor, " N"]
@@ -48,10 +48,10 @@ class Evidence:
 
     @property
     def jackknife(self) -> Float[Tensor, " p"]:
-        """Standard errors of the parameters by leaving one fold out at a time.
+        """Jackknife standard errors of the parameters, over folds.
 
-        Each fold is made of blocks all over the recording, so they see what a model of the noise, or of the effect's
-        form, does not. Efron & Tibshirani, "An Introduction to the Bootstrap" (1993), (11.5).
+        Each fold has blocks from the whole recording, so the errors include misfits of the noise model and of the
+        effect's shape. Efron & Tibshirani, "An Introduction to the Bootstrap" (1993), (11.5).
         """
         return ((1.0 - self.left_out) / self.left_out * self.parameters.var(0, correction=0)).sqrt()
 
@@ -59,30 +59,30 @@ class Evidence:
 def blocks_of(
     N: int, correlation: int, settings: ConfirmationSettings, always: Bool[Tensor, " N"] | None = None
 ) -> HeldOutBlocks:
-    """Blocks in folds, twenty-five in five unless set otherwise.
+    """Return blocks and folds; by default 25 blocks in 5 folds.
 
-    Between training and held-out samples lies a correlation time at least, but no more than half a block, so that
-    training blocks are left: noise that wanders for longer leans both ways.
+    The gap between training and held-out samples is at least a correlation time, but at most half a block; a longer
+    drift affects both sides.
 
     Args:
         N: number of samples.
         correlation: integrated correlation time in samples.
-        settings: how many, and what is left out beside them.
-        always: samples that all fits have, such as the first ones of each run, without which nobody knows the states
-            that it begins in; None for none.
+        settings: number of blocks and folds, and the gap.
+        always: samples that all fits use, such as the first samples of each run, which determine the initial states;
+            None for none.
     """
     folds = settings.folds
     count = folds * settings.blocks_per_fold
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")
     fold = block % folds
-    # never so much that training blocks of an ordinary recording are left empty
+    # at most half a block, so that training blocks are not empty
     gap = max(1, min(max(math.ceil(settings.gap * N), correlation), N // (2 * count)))
     train = []
     for k in range(folds):
         near = (fold == k).to(torch.float64).reshape(1, 1, -1)
         widened = torch.nn.functional.max_pool1d(near, 2 * gap + 1, stride=1, padding=gap)
-        one = widened.reshape(-1) == 0
-        train.append(one if always is None else one | always)
+        far = widened.reshape(-1) == 0
+        train.append(far if always is None else far | always)
     return HeldOutBlocks(block, fold, tuple(train))
 
 
@@ -91,13 +91,12 @@ def held_out(
     blocks: HeldOutBlocks,
     reread: Callable[[Bool[Tensor, " N"]], tuple[JointModel, Float[Tensor, " p"]]] | None = None,
 ) -> Evidence:
-    """Refit on all folds but one, judge on that one, for each fold.
+    """Refit without each fold, and score on the fold.
 
     Args:
         fit: on all folds.
-        blocks: of which a fold is made.
-        reread: the model to fit to these samples, and where to begin; default the fit's own, shapes of effects as they
-            are.
+        blocks: blocks and folds.
+        reread: returns model and start for the training samples; default those of ``fit``, with fixed shapes.
     """
     N = len(fit.residual)
     log_likelihood = fit.residual.new_zeros(N)
@@ -121,13 +120,13 @@ def held_out(
 
 
 def on_all(fit: FittedModel) -> Evidence:
-    """A fit on the samples that it has seen, in the place of blocks where nobody asked those; it leaves nothing out."""
+    """Score a fit on its training samples, in place of held-out blocks."""
     log_likelihood = scored(fit.residual, fit.sigma, fit.d, fit.bound)
     return Evidence(log_likelihood, fit.residual, fit.sigma, fit.d, fit.parameters.unsqueeze(0), 0.5)
 
 
 def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
-    """Log-likelihood of each sample, over its channels."""
+    """Return the log-likelihood of each sample, summed over channels."""
     return -mkc_nll(residual, sigma, d, bound).sum(-1)
 
 
@@ -139,7 +138,7 @@ def gain_interval(
     *,
     coverage: float = 0.95,
 ) -> tuple[float, tuple[float, float]]:
-    """Mean of paired differences, and its interval, of 95 % by default, by a bootstrap of whole blocks."""
+    """Return the mean of paired differences and its interval (95 % by default), by a block bootstrap."""
     count = int(block.max()) + 1
     total = difference.new_zeros(count).index_add(0, block, difference)
     size = difference.new_zeros(count).index_add(0, block, torch.ones_like(difference))

@@ -1,4 +1,4 @@
-"""What a finding gains on blocks that the fit has not seen; beside the others, where those may have hidden it."""
+"""Gain of a finding on held-out blocks; given the other findings, if those may have masked it."""
 
 from __future__ import annotations
 
@@ -9,52 +9,52 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, gain_interval, held_
 from mkc_torch.diagnosis.evidence.held_out_sizes import sizes_of
 from mkc_torch.diagnosis.result import HeldOut
 
-__all__ = ["beside_the_others", "test"]
+__all__ = ["test", "without_finding"]
 
-_BESIDE = "Judged beside the other findings: while those are left out, they hide it."
-_TOO_SHORT = "one side of the step is shorter than two of the held-out blocks"
+_GIVEN_OTHERS = "Scored given the other findings; without them, it is masked."
+_TOO_SHORT = "a side of the step is shorter than two held-out blocks"
 
 
-def beside_the_others(case: EvidenceContext) -> Evidence | None:
-    """The final model without the finding, on held-out blocks, where what was found later may have hidden its gain."""
+def without_finding(case: EvidenceContext) -> Evidence | None:
+    """Score the final model without the finding, if later findings may have masked its gain."""
     if not case.overlaid or _confirmed(case):
         return None
     return held_out(case.without_and_with[0], case.blocks)
 
 
 def _confirmed(case: EvidenceContext) -> bool:
-    """Whether unseen blocks are surely better with it, before anything else was found."""
+    """Whether held-out blocks confirm the finding without the later findings."""
     before, after = case.pairs[case.number] if case.pairs else case.held_out[case.number : case.number + 2]
     difference = after.log_likelihood - before.log_likelihood
     return gain_interval(difference, case.blocks.block, torch.Generator().manual_seed(case.seed))[1][0] > 0.0
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """The gain in log-likelihood with its interval, and the residuals before and after."""
+    """Return the log-likelihood gain with its interval, and the residuals before and after."""
     if not _long_enough(case, case.number):
-        return said(None, _TOO_SHORT)
+        return as_result(None, _TOO_SHORT)
     before, after = case.held_out[case.number : case.number + 2]
     worse, better = case.pairs[case.number] if case.pairs else (before, after)
     note = ""
     if case.ahead is not None:
-        before, after, note = case.ahead, case.held_out[-1], _BESIDE
+        before, after, note = case.ahead, case.held_out[-1], _GIVEN_OTHERS
         worse, better = before, after
     gain, interval = gain_interval(better.log_likelihood - worse.log_likelihood, case.blocks.block, _draws(case))
     outputs, diverged = sizes_of(case.prepared, case.units, before, after, case.blocks)
-    one = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
-    sizes = (case.rms(before), case.rms(after)) if one is None else (one.before, one.after)
+    only = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
+    sizes = (case.rms(before), case.rms(after)) if only is None else (only.before, only.after)
     count, decides = int(case.blocks.block.max()) + 1, not case.located.with_noise
     held = HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, diverged, count, decides)
-    return said(held, note)
+    return as_result(held, note)
 
 
-def said(held: HeldOut | None, note: str) -> EvidenceResult:
-    """The gain, or why there is none."""
+def as_result(held: HeldOut | None, note: str) -> EvidenceResult:
+    """Return the gain, or the reason why it was not measured."""
     return EvidenceResult("held_out", (held, note), keys={"held_out": held, "held_out_note": note})
 
 
 def _long_enough(case: EvidenceContext, number: int) -> bool:
-    """Whether both sides of a finding that sets in can be held out."""
+    """Whether both sides of a finding's onset can be held out."""
     onset, time = case.found[number].term.shape.get("onset"), case.prepared.time
     if onset is None:
         return True
@@ -63,7 +63,7 @@ def _long_enough(case: EvidenceContext, number: int) -> bool:
 
 
 def _draws(case: EvidenceContext) -> torch.Generator:
-    """Draws of blocks that go on where those of the findings before stopped."""
+    """Return the generator after the draws of the previous findings."""
     generator = torch.Generator().manual_seed(case.seed)
     for number in range(case.number):
         if _long_enough(case, number):

@@ -1,4 +1,4 @@
-"""The tests of evidence that take no time, for a quick look and for a search that was stopped."""
+"""The fast tests of evidence, for a quick look and for a stopped search."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ __all__ = ["in_short"]
 
 
 def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
-    """The tests.
+    """Return the fast tests.
 
     Args:
-        held_out: whether findings were judged on blocks that their fits have not seen.
+        held_out: whether findings were scored on held-out blocks.
     """
     blocks = held_out_gain.test if held_out else _not_judged
     return (
@@ -24,4 +24,4 @@ def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
 
 
 def _not_judged(_: EvidenceContext) -> EvidenceResult:
-    return held_out_gain.said(None, "nobody asked unseen blocks, in a quick look or before the search was stopped")
+    return held_out_gain.as_result(None, "no held-out blocks in a quick look, or the search was stopped before")

@@ -1,4 +1,4 @@
-"""Whether a step comes and goes after its onset, as what is switched does."""
+"""Whether a step is intermittent after its onset, as of a switched cause."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["comes_and_goes", "memory_of", "said", "test"]
+__all__ = ["comes_and_goes", "memory_of", "as_result", "test"]
 
 _FREQUENCIES = 4001
-"""Frequencies at which a spectrum is summed."""
+"""Number of frequencies of the spectrum."""
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """Whether the finding is such a step."""
+    """Test whether the finding is an intermittent step."""
     onset = case.term.shape.get("onset")
     if onset is None:
-        return said(False)
+        return as_result(False)
     memory = memory_of(case.final.spectrum.coefficients)
     gain = gain_of(case.final, case.number)
-    return said(comes_and_goes(gain, case.prepared.time, onset, case.settings.evidence, memory))
+    return as_result(comes_and_goes(gain, case.prepared.time, onset, case.settings.evidence, memory))
 
 
-def said(switched: bool) -> EvidenceResult:
+def as_result(switched: bool) -> EvidenceResult:
     return EvidenceResult("switched", switched, keys={"comes_and_goes": True} if switched else {})
 
 
@@ -41,17 +41,17 @@ def comes_and_goes(
     settings: EvidenceSettings,
     memory: float = 1.0,
 ) -> bool:
-    """Whether the recording is much less likely with the step than without it in some stretch after the onset.
+    """Whether the step makes the recording much less likely in some interval after its onset.
 
-    Of a step that lasts, a stretch of independent samples loses c nats by chance with a probability below exp(−c); of
-    noise that is taken for white and is not, with one below exp(−c / memory).
+    For a permanent step, an interval of independent samples loses c nats with probability below exp(−c); for coloured
+    noise in a white-noise model, below exp(−c / memory).
 
     Args:
-        gain: log-likelihood in nats with the step less that without it.
+        gain: log-likelihood gain of the step per sample, in nats.
         time: of the samples, ascending.
         onset: of the step.
-        settings: what it has to lose.
-        memory: samples that tell as much as one independent one; see :func:`memory_of`.
+        settings: thresholds of the loss.
+        memory: number of samples per independent sample; see :func:`memory_of`.
 
     Example:
         >>> time = torch.arange(100.0)
@@ -67,7 +67,7 @@ def comes_and_goes(
 
 
 def memory_of(coefficients: Sequence[Float[Tensor, " order"]]) -> float:
-    """Long-run variance of autoregressive noise over its variance, of the channel where that is largest; 1 at least.
+    """Return the largest ratio of long-run variance to variance over the channels; at least 1.
 
     Example:
         >>> round(memory_of([torch.tensor([0.5]), torch.zeros(0)]), 3)

@@ -1,4 +1,4 @@
-"""Whether the strongest candidate is there in one stretch of the recording alone, where others are off too."""
+"""Warning for a strongest candidate that acts in a single interval, while other intervals misfit too."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ __all__ = ["called", "test"]
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """A warning of the stretch."""
+    """Return a warning with the interval."""
     located, time = case.first, case.prepared.time
     if located is None or located.stretch is None:
         return EvidenceResult("one_stretch")
     begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
     sentence = (
-        f"From {begin:.1f} to {end:.1f} s the recording is off as {called(located.term)} would have it, but hardly "
-        "elsewhere. Other stretches are off too and no effect explains them, so this one counts as another burst of "
-        "outliers. Record again, for longer."
+        f"From {begin:.1f} to {end:.1f} s the residual fits {called(located.term)}, but hardly elsewhere. Other intervals "
+        "misfit too and no effect explains them, so this interval counts as a burst of outliers. Record again, for longer."
     )
     return EvidenceResult("one_stretch", (begin, end), warnings=(sentence,))
 
 
 def called(term: Term) -> str:
-    """A candidate in a sentence."""
+    """Return the name of a candidate in a sentence."""
     if term.effect.unrecorded:
-        return "a cause that no column recorded"
+        return "an unrecorded cause"
     along = "a curve along" if term.effect.is_curve else f"{term.effect.id} by"
     if term.columns:
         return f"{along} {', '.join(term.columns)}"
-    return "a curve without a name" if term.effect.is_curve else term.effect.id
+    return "an unnamed curve" if term.effect.is_curve else term.effect.id

@@ -1,4 +1,4 @@
-"""How surely an onset is known: the moments that the noise of the search does not tell from it."""
+"""Confidence interval of an onset."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from mkc_torch.diagnosis.search.run import SearchResult
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["of_finding", "onset_interval", "said", "test"]
+__all__ = ["of_finding", "onset_interval", "as_result", "test"]
 
 _CRITICAL = -2.0 * math.log(1.0 - math.sqrt(0.95))
-"""Twice the nats by which the true onset falls short of the likeliest one in no more than 5 % of recordings."""
+"""95 % quantile of the likelihood ratio of the onset."""
 
 _RISE = 1
-"""Samples to either side: a change takes its time, and its middle can lie off where an instant one fits best."""
+"""Margin in samples: a change takes time, and its middle can differ from the best instantaneous change."""
 
 _GROWTH = 1.3
-"""Growth of the distance from one sample that is tried to the next."""
+"""Growth factor of the spacing of the tried samples."""
 
 _BETWEEN = 12
-"""Samples that are tried between the last one within and the first one beyond."""
+"""Samples tried between the last sample inside the interval and the first sample outside."""
 
 
 def of_finding(case: EvidenceContext) -> tuple[float, float] | None:
@@ -38,19 +38,19 @@ def of_finding(case: EvidenceContext) -> tuple[float, float] | None:
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """The interval of the finding's onset."""
-    return said(case.ahead)
+    """Return the confidence interval of the finding's onset."""
+    return as_result(case.ahead)
 
 
-def said(interval: tuple[float, float] | None) -> EvidenceResult:
+def as_result(interval: tuple[float, float] | None) -> EvidenceResult:
     return EvidenceResult("onset", interval, keys={} if interval is None else {"onset_interval": interval})
 
 
 def onset_interval(model: JointModel, located: SearchResult) -> tuple[float, float] | None:
-    """The 95 % confidence interval of an effect's onset, in s.
+    """Return the 95 % confidence interval of an effect's onset, in s.
 
-    The likelihood ratio of a change point is no chi-square: it is the larger of two exponential variables, one for each
-    side, with ``P(ratio <= x) = (1 - exp(-x / 2))²``.
+    The likelihood ratio of a change point is not chi-square distributed: it is the maximum of two exponential
+    variables, one per side, with ``P(ratio <= x) = (1 - exp(-x / 2))²``.
 
     Hansen, "Sample splitting and threshold estimation", Econometrica 68 (2000), theorem 2.
 
@@ -59,7 +59,7 @@ def onset_interval(model: JointModel, located: SearchResult) -> tuple[float, flo
         located: the effect.
 
     Returns:
-        None where it has no onset, or acts where each onset would take a trajectory of its own.
+        None without an onset, or at a port at which each onset needs its own trajectory.
     """
     term, pointwise = located.fit.model.terms[-1], located.scene.tangents.pointwise
     if "onset" not in term.shape or pointwise[term.port] is None:
@@ -69,7 +69,7 @@ def onset_interval(model: JointModel, located: SearchResult) -> tuple[float, flo
     parameters = located.fit.parameters[: model.size]
 
     def ratios(numbers: Sequence[int]) -> Float[Tensor, " n"]:
-        """Of a change that comes with the sample of each number."""
+        """Return the likelihood ratio of an onset at each sample."""
         shapes = [replace(term, shape={**term.shape, "onset": float(time[number])}) for number in numbers]
         tangents = Candidates(model, parameters, shapes, pointwise)
         return located.look.linearised.gains_of(tangents, located.scene.counts).ratio[:, 0]
@@ -83,12 +83,12 @@ def onset_interval(model: JointModel, located: SearchResult) -> tuple[float, flo
     closer = sorted({*_between(before, first), *_between(last, after)})
     if closer:
         within += [number for number, ratio in zip(closer, ratios(closer).tolist(), strict=True) if ratio >= least]
-    # a change that is seen with a sample came after the one before; and none is over at once
+    # a change seen at a sample happened after the previous sample, and takes time
     return float(time[max(min(within) - 1 - _RISE, 0)]), float(time[min(max(within) + _RISE, len(time) - 1)])
 
 
 def _spread(place: int, count: int) -> list[int]:
-    """Numbers of samples around one, ever farther apart, to both ends of the recording.
+    """Return sample numbers around ``place``, with growing distances, to both ends of the recording.
 
     Example:
         >>> _spread(3, 9)
@@ -98,10 +98,10 @@ def _spread(place: int, count: int) -> list[int]:
     while away[-1] < count:
         away.append(away[-1] + math.ceil(step))
         step *= _GROWTH
-    numbers = {place - element for element in away} | {place + item for item in away}
+    numbers = {place - distance for distance in away} | {place + distance for distance in away}
     return sorted({min(max(number, 1), count - 1) for number in numbers})
 
 
 def _between(low: int, high: int) -> list[int]:
-    """Some whole numbers between two."""
+    """Return up to ``_BETWEEN`` integers between two integers."""
     return sorted({low + (high - low) * k // _BETWEEN for k in range(1, _BETWEEN)} - {low, high})

@@ -1,4 +1,4 @@
-"""What was found beside noise, as a free run: what residuals are computed from, and pictures show."""
+"""Open-loop simulations with findings that were fitted with process noise; residuals and figures use them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["OpenLoop", "open_loop_evidence", "running_unjudged"]
 
 
 _REACH = 3.0
-"""Robust scales of a residual that the domain of its density reaches to at least."""
+"""Minimum half-width of the density's domain, in robust scales of the residual."""
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """The simulation alone and with one finding more each, on all samples and on blocks that each fit has not seen."""
+    """Fits without findings and with 1, 2, ... findings, and their scores on held-out blocks."""
 
     base: FittedModel
     found: tuple[SearchResult, ...]
@@ -42,47 +42,47 @@ def open_loop_evidence(
     evidence: tuple[Evidence, ...],
     blocks: HeldOutBlocks,
 ) -> OpenLoop:
-    """The free runs; what was found as it is, where one of them loses the recording.
+    """Return the open-loop fits; the given fits if an open-loop simulation diverges.
 
     Args:
-        base: the simulation alone, perhaps under process noise.
-        alone: as it runs freely; None where that loses the recording.
-        found: with one finding more each, under the noise that is left.
-        evidence: of these on blocks.
-        blocks: the blocks.
+        base: fit without findings, possibly with process noise.
+        alone: its open-loop fit; None if it diverges.
+        found: fits with 1, 2, ... findings, with the remaining process noise.
+        evidence: their scores on held-out blocks.
+        blocks: the held-out blocks.
     """
-    as_it_is = OpenLoop(base, found, evidence)
-    if not any(has_process_noise(fit) for fit in (base, *(one.fit for one in found))) or alone is None:
-        return as_it_is
+    unchanged = OpenLoop(base, found, evidence)
+    if not any(has_process_noise(fit) for fit in (base, *(located.fit for located in found))) or alone is None:
+        return unchanged
     works = [
-        partial(_released if _of_sensors(element.fit) else _refitted, element.fit, known, blocks, alone)
-        for element, known in zip(found, evidence[1:], strict=True)
+        partial(_released if _of_sensors(located.fit) else _refitted, located.fit, known, blocks, alone)
+        for located, known in zip(found, evidence[1:], strict=True)
     ]
     runs = run_parallel([partial(_judged, alone, evidence[0], blocks), *works], alone.model.prepared)
     known_runs = [run for run in runs if run is not None]
     if len(known_runs) < len(runs):
-        return as_it_is
-    again = tuple(replace(item, fit=fit) for item, (fit, _) in zip(found, known_runs[1:], strict=True))
+        return unchanged
+    again = tuple(replace(located, fit=fit) for located, (fit, _) in zip(found, known_runs[1:], strict=True))
     return OpenLoop(alone, again, tuple(judged for _, judged in known_runs))
 
 
 def running_unjudged(base: FittedModel, alone: FittedModel | None, found: tuple[SearchResult, ...]) -> OpenLoop:
-    """The same on all samples, where nobody asks blocks that the fits have not seen.
+    """Return the open-loop fits with scores on all samples, without held-out blocks.
 
     Args:
         base, alone, found: as of :func:`open_loop_evidence`.
     """
-    fits = [base, *(one.fit for one in found)]
+    fits = [base, *(located.fit for located in found)]
     if any(has_process_noise(fit) for fit in fits) and alone is not None:
-        free = [alone, *(refit_open_loop(element.fit) for element in found)]
+        free = [alone, *(refit_open_loop(located.fit) for located in found)]
         known = [run for run in free if run is not None]
         fits = known if len(known) == len(free) else fits
-    again = tuple(replace(item, fit=fit) for item, fit in zip(found, fits[1:], strict=True))
+    again = tuple(replace(located, fit=fit) for located, fit in zip(found, fits[1:], strict=True))
     return OpenLoop(fits[0], again, tuple(on_all(fit) for fit in fits))
 
 
 def _of_sensors(fit: FittedModel) -> bool:
-    """Whether only errors of sensors are left beside a fit: its parameters are then those of a free run."""
+    """Whether a fit has drift but no process noise, so that its parameters are those of an open-loop fit."""
     prepared = fit.model.prepared
     observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
     return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
@@ -92,7 +92,7 @@ _Run = tuple[FittedModel, Evidence]
 
 
 def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
-    """The free run at a fit's own parameters, on all samples and, at each fold's, on blocks."""
+    """Simulate open loop with a fit's parameters, and on each fold with the parameters without it."""
     model = JointModel(open_loop(fit.model.prepared), fit.model.terms, fit.model.near)
     residual = model.residual(fit.parameters).detach()
     if not bool(residual.isfinite().all()):
@@ -121,10 +121,10 @@ def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: F
 
 
 def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
-    """A fit of the free run: from the parameters beside process noise, which may need it, and from those without."""
+    """Fit open loop, starting from the parameters with process noise and from those without findings."""
     ways = [partial(refit_open_loop, fit), partial(_from_alone, fit, alone)]
-    tried = [model_fit for model_fit in run_parallel(ways, alone.model.prepared, fit.model.terms) if model_fit is not None]
-    return _judged(max(tried, key=lambda one: one.log_likelihood), None, blocks) if tried else None
+    tried = [result for result in run_parallel(ways, alone.model.prepared, fit.model.terms) if result is not None]
+    return _judged(max(tried, key=lambda result: result.log_likelihood), None, blocks) if tried else None
 
 
 def _from_alone(fit: FittedModel, alone: FittedModel) -> FittedModel | None:

@@ -1,4 +1,4 @@
-"""Whether a column of unknown role only goes much as the cause does: what it leaves goes on the same way."""
+"""Whether a column of unknown role is a proxy of an unrecorded cause: the residual drift has the same direction."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ __all__ = ["goes_on", "test"]
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """A warning, where the last finding's column follows its cause in part: it may stand in for one not recorded."""
+    """Warn if the column of the last finding may be a proxy of an unrecorded cause."""
     if not case.ahead:
         return EvidenceResult("stand_in", False)
     name = ", ".join(case.fit.model.terms[-1].columns)
     sentence = (
-        f"What {name} leaves of the offset goes on along the same direction: {name} follows the cause in part, and may "
-        "only stand in for one that was not recorded. Look for it, and record it."
+        f"With {name} as driver, the offset still drifts along the same direction: {name} may be a proxy of an unrecorded "
+        "cause. Find the cause and record it."
     )
     return EvidenceResult("stand_in", True, warnings=(sentence,))
 
 
 def goes_on(case: EvidenceContext) -> bool:
-    """Whether what the last finding leaves wanders along its own direction."""
+    """Whether the residual drift has the direction of the last finding."""
     fit, settings = case.fit, case.settings
     last = fit.model.terms[-1] if fit.model.terms else None
     if last is None or last.driver is None or last.driver.role != ANY or last.port != Unrecorded.port:

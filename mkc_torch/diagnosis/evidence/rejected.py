@@ -1,4 +1,4 @@
-"""Stretches of a recording in which a final fit rejects most samples: what no effect follows is not to go unseen."""
+"""Warning for intervals in which the final fit rejects most samples."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 __all__ = ["rejected_warning", "test"]
 
-_TOLD = 3
-"""Stretches that are told by their times, the longest ones."""
+_MOST_LISTED = 3
+"""Largest number of intervals that are listed, the longest."""
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """A warning that names them; of a recording without times there is none."""
+    """Return a warning with the intervals; none for a recording without times."""
     if case.prepared.recording.time is None:
         return EvidenceResult("rejected")
     return EvidenceResult(
@@ -29,12 +29,12 @@ def test(case: EvidenceContext) -> EvidenceResult:
 
 
 def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings) -> tuple[str, ...]:
-    """A sentence that names the longest stretches of rejected samples; none where there are none.
+    """Return a warning with the longest intervals of rejected samples; empty if there are none.
 
     Args:
         time: in s.
         weights: of the residuals in the final fit, in [0, 1].
-        settings: below which weight a sample is rejected, and how long a stretch has to be.
+        settings: weight below which a sample is rejected, and minimum length of an interval.
 
     Example:
         >>> import torch
@@ -48,11 +48,11 @@ def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], s
     found = sorted(long, key=_length, reverse=True)
     if not found:
         return ()
-    text = ", ".join(f"from {item.start:.1f} to {item.end:.1f} s" for item in sorted(found[:_TOLD]))
-    more = f" and in {len(found) - _TOLD} shorter stretches" if len(found) > _TOLD else ""
+    text = ", ".join(f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED]))
+    more = f" and in {len(found) - _MOST_LISTED} shorter intervals" if len(found) > _MOST_LISTED else ""
     return (
-        f"Most samples were rejected {text}{more}. Something disturbed the measurement there that no effect follows: "
-        "something that passed by, say, or a burst of outliers.",
+        f"Most samples were rejected {text}{more}. A disturbance of the measurement that no effect explains, such as a "
+        "passing object or a burst of outliers.",
     )
 
 

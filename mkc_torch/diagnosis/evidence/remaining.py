@@ -1,4 +1,4 @@
-"""Whether a smooth correction by recorded columns finds what no effect accounts for."""
+"""Smooth trend test: whether a smooth correction by recorded columns improves the final model."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
-__all__ = ["nameless", "remaining", "remaining_warning", "said", "test", "within_reach"]
+__all__ = ["nameless", "remaining", "remaining_warning", "as_result", "test", "within_reach"]
 
 _RUNS_AWAY = 100.0
-"""Half-widths of the domain of residuals beyond which a simulation is lost."""
+"""Residual, in half-widths of the density's domain, beyond which a simulation has diverged."""
 
 
 def within_reach(case: EvidenceContext) -> tuple[Ceiling, tuple[str, ...]]:
-    """The ceiling of any fit, and the columns along which something smooth remains."""
+    """Return the ceiling, and the columns along which the residual has a smooth trend."""
     base, fit = case.base, case.fit
     reach = ceiling(base.model, _answerable(base, fit), case.drivers, case.blocks)
     if nameless(fit):
@@ -29,24 +29,24 @@ def within_reach(case: EvidenceContext) -> tuple[Ceiling, tuple[str, ...]]:
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """How far a smooth correction comes, and a warning of the columns along which something remains."""
+    """Return the score of a smooth correction, and a warning with the columns of a smooth trend."""
     reach, columns = case.ahead
-    return said(SmoothCorrection(case.spread(reach.evidence), columns))
+    return as_result(SmoothCorrection(case.spread(reach.evidence), columns))
 
 
-def said(smooth: SmoothCorrection) -> EvidenceResult:
+def as_result(smooth: SmoothCorrection) -> EvidenceResult:
     return EvidenceResult(
         "remaining", smooth, keys={"ceiling": smooth.reached}, warnings=remaining_warning(smooth.columns)
     )
 
 
 def nameless(fit: FittedModel) -> bool:
-    """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
+    """Whether a finding is an unnamed curve."""
     return any(term.effect.is_curve for term in fit.model.terms)
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
-    """The final fit; that of the simulation alone, if it has none at the other's parameters, or runs away."""
+    """Return the final fit; the fit without findings if the simulation diverges at the final parameters."""
     alone = base.model.residual(final.parameters[: base.model.size])
     return final if bool((alone.abs() < _RUNS_AWAY * final.bound).all()) else base
 
@@ -60,21 +60,21 @@ def remaining(
     seed: int,
     settings: EvidenceSettings,
 ) -> tuple[str, ...]:
-    """The columns along which something smooth remains in a model that passed for complete.
+    """Return the columns along which the residual of the final model has a smooth trend.
 
-    A ceiling above the model is no evidence by itself: noise that wanders for longer than a block is tracked by any
-    slow course, on unseen blocks too. So, beside the whole model, columns have to be taken up without most of the
-    folds, and to add to what courses of time reach alone. What goes so slowly that time does as well is not told of; a
-    column that happens to wander as the noise does can still pass.
+    A ceiling above the model is no evidence by itself: any slow course follows a drift longer than a block, on held-out
+    blocks too. Therefore most folds must select the columns in a correction of the final model, and the columns must
+    improve on courses of time alone. A trend that time describes as well is not reported; a column that drifts like the
+    noise by chance can still pass.
 
     Args:
-        alone: the ceiling beside the simulation alone.
-        corrected: the model on held-out blocks.
+        alone: the ceiling for the simulation without findings.
+        corrected: score of the model on held-out blocks.
         fit: the model.
         drivers: the columns.
-        blocks: to predict.
+        blocks: held-out blocks.
         seed: of the bootstraps.
-        settings: how surely, and by how much, the correction has to be better.
+        settings: confidence and minimum gain of the correction.
     """
 
     def gain(better: Evidence, worse: Evidence, coverage: float) -> tuple[float, float]:
@@ -86,26 +86,26 @@ def remaining(
     if gain(alone.evidence, corrected, 0.95)[1] <= 0.0:
         return ()
     sure = settings.remaining_coverage
-    beside = ceiling(fit.model, fit, drivers, blocks) if fit.model.terms else alone
-    mean, low = gain(beside.evidence, corrected, sure)
-    if not beside.columns or mean < settings.remaining_gain or low <= 0.0:
+    smooth = ceiling(fit.model, fit, drivers, blocks) if fit.model.terms else alone
+    mean, low = gain(smooth.evidence, corrected, sure)
+    if not smooth.columns or mean < settings.remaining_gain or low <= 0.0:
         return ()
     time = ceiling(fit.model, fit, (), blocks)
-    return beside.columns if gain(beside.evidence, time.evidence, sure)[1] > 0.0 else ()
+    return smooth.columns if gain(smooth.evidence, time.evidence, sure)[1] > 0.0 else ()
 
 
 def remaining_warning(columns: Sequence[str]) -> tuple[str, ...]:
-    """The sentence that says so.
+    """Return the warning of a smooth trend.
 
     Example:
         >>> remaining_warning(["temperature"])
-        ('Something smooth remains along temperature that no effect of the catalogue accounts for: ...',)
+        ('The residual has a smooth trend along temperature that no effect of the catalogue explains: ...',)
         >>> remaining_warning([])
         ()
     """
     if not columns:
         return ()
     return (
-        f"Something smooth remains along {', '.join(columns)} that no effect of the catalogue accounts for: a smooth "
-        "correction by recorded columns is clearly better on blocks that it has not seen.",
+        f"The residual has a smooth trend along {', '.join(columns)} that no effect of the catalogue explains: a smooth "
+        "correction by recorded columns is clearly better on held-out blocks.",
     )

@@ -1,4 +1,4 @@
-"""What all tests of evidence say, once nothing more is searched; what takes long of them goes ahead, in parts."""
+"""Run the tests of evidence after the search; their expensive parts run in parallel before."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["EvidenceReport", "precompute", "run_tests"]
 
 @dataclass(frozen=True)
 class EvidenceReport:
-    """What the tests say of the whole diagnosis and of each finding, and the case with the final parameters."""
+    """Results of the tests of the whole diagnosis and of each finding, and the context with the final parameters."""
 
     case: EvidenceContext
     of_all: tuple[EvidenceResult, ...]
@@ -25,15 +25,12 @@ class EvidenceReport:
 
 
 def precompute(case: EvidenceContext, tests: Sequence[EvidenceTest] = TESTS) -> list[Callable[[], Any]]:
-    """Works that need nothing of one another: what goes ahead of each test, and the final parameters.
-
-    The last one takes longest.
-    """
+    """Return independent tasks: the ``ahead`` function of each test, and last the final estimate, which takes longest."""
     return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(_final, case)]
 
 
 def run_tests(case: EvidenceContext, done: Sequence[Any], tests: Sequence[EvidenceTest] = TESTS) -> EvidenceReport:
-    """What the tests say, in their order, once the parts are done."""
+    """Run the tests in their order, with the results of :func:`precompute`."""
     *ahead, final = done
     case = replace(case, estimate=final)
     known = dict(zip(_long(case, tests), ahead, strict=True))
@@ -46,13 +43,13 @@ def run_tests(case: EvidenceContext, done: Sequence[Any], tests: Sequence[Eviden
             said = test.test(replace(test_case, ahead=done_ahead))
             (of_findings[test_case.number] if test.each_finding else of_all).append(said)
             warnings += said.warnings
-    return EvidenceReport(case, tuple(of_all), tuple(tuple(said) for said in of_findings), tuple(warnings))
+    return EvidenceReport(case, tuple(of_all), tuple(tuple(results) for results in of_findings), tuple(warnings))
 
 
 def _long(case: EvidenceContext, tests: Sequence[EvidenceTest]) -> list[EvidenceTest]:
-    """Those with something to go ahead; what is asked of the whole diagnosis takes longer than what is of a finding."""
-    asked = [test for test in tests if test.ahead is not None and _cases(test, case)]
-    return sorted(asked, key=lambda test: not test.each_finding)
+    """Return the tests with an ``ahead`` function; first the tests of the whole diagnosis, which take longer."""
+    found = [test for test in tests if test.ahead is not None and _cases(test, case)]
+    return sorted(found, key=lambda test: not test.each_finding)
 
 
 def _cases(test: EvidenceTest, case: EvidenceContext) -> list[EvidenceContext]:

@@ -1,4 +1,4 @@
-"""Simpler forms of what was found, where blocks that the fit has not seen are predicted as well by them."""
+"""Replacement of findings by simpler forms that predict held-out blocks equally well."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ Holds = Callable[[FittedModel, Evidence], bool]
 def simplified(
     fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds, settings: NamingSettings
 ) -> tuple[FittedModel, Evidence]:
-    """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
+    """Replace each effect by its simpler form unless held-out blocks reject it; return the fit and its scores.
 
-    They do where they are clearly less likely by it, with their noise taken for white, and it leaves more that is new
-    in their samples, with it taken for coloured.
+    Held-out blocks reject a form if it makes them clearly less likely under white noise, and increases the innovations
+    under coloured noise.
 
-    All effects are asked again with each that is found: what one needed while another was missing, it may not need any
+    All effects are tested again after each finding: a form that was needed without the new effect may not be needed any
     more.
 
     Args:
-        fit: with all effects that were found.
-        evidence: of it, on the blocks.
-        blocks: held out.
-        holds: whether a fit, with its evidence, still makes a finding of the last effect.
-        settings: what is clearly less likely.
+        fit: with all findings.
+        evidence: scores of the fit on the blocks.
+        blocks: held-out blocks.
+        holds: whether a fit with these scores still confirms the last finding.
+        settings: threshold of "clearly less likely".
     """
     for number in range(len(fit.model.terms)):
         start = _simpler(fit, number)
@@ -60,15 +60,15 @@ def simplified(
 
 
 def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
-    """The fit with the simpler form of each effect that the recording does not tell from it.
+    """Replace each effect by its simpler form if the recording does not distinguish them.
 
-    Each form has the noise that it leaves; the recording tells them apart by more nats than the numbers between them
-    cost (Schwarz), and than rivals have to differ by.
+    Each form has its own noise fit. The recording distinguishes two forms by more nats than their Schwarz penalty, and
+    than the threshold for rivals.
 
     Args:
-        fit: with all effects that were found.
-        declared: standard deviation of the white noise of outputs that it is known of.
-        settings: the numbers that decide.
+        fit: with all findings.
+        declared: known standard deviations of the outputs' white noise.
+        settings: thresholds.
     """
     for number in range(len(fit.model.terms)):
         start = _simpler(fit, number, other=True)
@@ -86,12 +86,12 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
 
 
 def _simpler(fit: FittedModel, number: int, *, other: bool = False) -> tuple[JointModel, Float[Tensor, " p"]] | None:
-    """The model with the simpler form of one effect, and where to start; None where there is none.
+    """Return the model with the simpler form of an effect, and a start; None without a simpler form.
 
     Args:
         fit: with effects.
         number: of the effect.
-        other: also as another effect, that it is with fewer numbers.
+        other: whether another effect with fewer parameters counts as a simpler form.
     """
     terms = list(fit.model.terms)
     effect = terms[number].effect

@@ -1,4 +1,4 @@
-"""Smooth curves of every column and of time, as changes at a simulation's ports."""
+"""Smooth curves of every column and of time at the ports of a simulation."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ if TYPE_CHECKING:
 __all__ = ["Smooth", "curves_of", "legendre", "smooth_tangents"]
 
 DEGREE = 5
-"""Degree of the curves of columns."""
+"""Degree of the Legendre curves of columns."""
 
 COURSES = 10
-"""Slow courses of time; cosines, for a polynomial runs away in a block at either end."""
+"""Number of cosines of time; a polynomial would diverge in the first and last block."""
 
 TIME = ""
-"""Instead of a column's name, which no column has."""
+"""Name of time among the columns."""
 
 MOST_COLUMNS = 300
-"""Tangents that are made; of more columns of a recording, the ones that promise most."""
+"""Maximum number of tangents; with more columns, the most promising are selected."""
 
 _TINY = torch.finfo(torch.float64).tiny
 
 _FREE = 1e-3
-"""Roughness of a straight line, beside that of a curve of degree one."""
+"""Roughness that is added to every degree."""
 
 
 @dataclass(frozen=True)
 class Smooth:
-    """Tangents of the simulation's own parameters, then those of the curves, and what belongs to each.
+    """Tangents of the simulation's parameters and of the curves.
 
     Attributes:
         tangents: (N, m, P), of the residual.
-        own: how many of them are the parameters'.
+        own: number of the parameters' tangents.
         groups: for each column and port, the numbers of its tangents.
         names: of the groups' columns.
-        roughness: (P,), what a tangent is penalised by: the more, the higher the degree; 0 for the parameters.
-        allowed: (folds, groups), which of them training without a fold may take up.
+        roughness: (P,), penalty of each tangent, increasing with the degree; 0 for the parameters.
+        allowed: (folds, groups), groups that the fit without each fold may select.
     """
 
     tangents: Float[Tensor, "N m P"]
@@ -61,7 +61,7 @@ class Smooth:
 
 
 def legendre(values: Float[Tensor, "N k"], degree: int) -> Float[Tensor, "N k degree"]:
-    """Legendre polynomials P_1 to P_degree over the range of each column, less their means.
+    """Return Legendre polynomials P_1 to P_degree over the range of each column, minus their means.
 
     Example:
         >>> legendre(torch.tensor([[0.0], [1.0], [2.0]]), 2)[:, 0]
@@ -79,7 +79,7 @@ def legendre(values: Float[Tensor, "N k"], degree: int) -> Float[Tensor, "N k de
 
 
 def curves_of(drivers: Sequence[Driver], N: int) -> dict[str, Float[Tensor, "N degree"]]:
-    """The curves of time, which stands first, and of each column."""
+    """Return the curves of time, which is first, and of each column."""
     found = {TIME: cosines(COURSES, N)}
     if drivers:
         columns = [name for driver in drivers for name in driver.columns]
@@ -90,7 +90,7 @@ def curves_of(drivers: Sequence[Driver], N: int) -> dict[str, Float[Tensor, "N d
 
 @dataclass(frozen=True)
 class _Around:
-    """A model at some parameters: tangents of these, and of its ports where they are pointwise."""
+    """A model linearised at parameters: tangents of the parameters and of pointwise ports."""
 
     model: JointModel
     parameters: Tensor  # (p,)
@@ -110,14 +110,14 @@ class _Around:
 
     @property
     def ports(self) -> dict[str, Port]:
-        """Those where curves can enter, each place once."""
+        """Ports at which curves can act, without duplicates."""
         places: dict[tuple[tuple[str, ...], str], str] = {}
         for name, port in self.model.prepared.ports.items():
             places.setdefault((port.channels, port.unit), name)
         return {name: self.model.prepared.ports[name] for name in places.values()}
 
     def backward(self, port: str, left: Float[Tensor, "N m"]) -> Float[Tensor, "N c"]:
-        """What residuals say of a change at a port, by reverse mode where it is not pointwise."""
+        """Return the gradient of residuals by a change at a port, by reverse mode for a port that is not pointwise."""
         known = self.pointwise[port]
         if known is not None:
             return torch.einsum("nmc,nm->nc", known, left)
@@ -138,13 +138,13 @@ def smooth_tangents(
     weights: Float[Tensor, "N m"],
     blocks: HeldOutBlocks,
 ) -> Smooth:
-    """The tangents of curves at every port of a simulation.
+    """Return the tangents of curves at every port of a simulation.
 
     Args:
-        model, parameters: around which the residual is taken for linear.
+        model, parameters: point of the linearisation.
         curves: of each column.
         weights: of the residuals, over the squares of their scales.
-        blocks: without each fold of which the columns are chosen anew, where they are too many.
+        blocks: folds; the most promising columns are selected without each fold.
     """
     around = _Around.of(model, parameters)
     ports = around.ports
@@ -158,7 +158,7 @@ def smooth_tangents(
     for port in ports:
         c, known = len(ports[port].channels), around.pointwise[port]
         if known is not None and ports[port].clock is None:
-            # each course in each channel: a product, for which none is spread over all channels
+            # product of each course and each channel, without expanded copies
             tangents.append((known[:, :, None, :] * joined[:, None, :, None]).flatten(2))
         else:
             courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
@@ -182,9 +182,9 @@ def smooth_tangents(
 def _promising(
     around: _Around, curves: Mapping[str, Tensor], weights: Float[Tensor, "N m"], blocks: HeldOutBlocks, room: int
 ) -> Bool[Tensor, "folds curves"]:
-    """For each fold, the columns whose curves promise most by the residuals of the others; time always.
+    """Return for each fold the columns whose curves correlate most with the training residuals; time is always included.
 
-    As many as there is room for all that any fold chooses; they mostly agree.
+    The number of columns is limited by the union over the folds.
     """
     allowed = torch.ones(len(blocks.train), len(curves), dtype=torch.bool)
     columns = [k for k, name in enumerate(curves) if name != TIME]
@@ -203,11 +203,11 @@ def _promising(
 def _scores(
     around: _Around, basis: Float[Tensor, "D N degree"], weights: Sequence[Float[Tensor, "N m"]]
 ) -> Float[Tensor, "folds D"]:
-    """The square of what is left beside the parameters, along the curves of each column, over all ports."""
+    """Return the squared projection of the residual, after the parameters' fit, on each column's curves, over all ports."""
     left = [_left(around, weight) for weight in weights]
     total = basis.new_zeros(len(weights), len(basis))
     for port in around.ports:
-        back = torch.stack([around.backward(port, one) for one in left])
+        back = torch.stack([around.backward(port, series) for series in left])
         # ports have units of their own
         back = back / back.square().mean((1, 2), keepdim=True).sqrt().clamp(min=_TINY)
         total += torch.einsum("dnj,fnc->fdjc", basis, back).square().sum((2, 3))
@@ -215,7 +215,7 @@ def _scores(
 
 
 def _left(around: _Around, weights: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-    """Weighted residuals, less what the parameters take over."""
+    """Return the weighted residuals after a linear fit of the parameters."""
     residual = around.model.residual(around.parameters).detach()
     weighted = weights.unsqueeze(-1) * around.own
     gram = torch.einsum("nmp,nmq->pq", weighted, around.own)

@@ -1,4 +1,4 @@
-"""What is located where no candidate is: a cause that was not recorded, told by what a wander's channels share."""
+"""Finding of an unrecorded cause, from the common drift of several channels."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["course_without", "located_cause"]
 
 
 def located_cause(base: FittedModel, located: SearchResult, level: float, surrogates: int) -> SearchResult | None:
-    """A search that found nothing, with the cause that moves the channels of the wander together; None without one.
+    """Return the search result with a common cause of the channels' drifts; None without a common cause.
 
     Args:
-        base: the simulation alone.
-        located: what the search has, though it does not count.
-        level: of false alarms.
-        surrogates: draws of noise that other p-values are from, than which none can be smaller.
+        base: fit without findings.
+        located: result of a search without a significant candidate.
+        level: rate of false alarms.
+        surrogates: number of surrogates of the other p-values, which limits the smallest p-value.
     """
     slow, share = located.scene.tangents.slow, located.scene.settings.confirmation.unrecorded
     cause = common_cause(located.tested_search, slow)
@@ -56,12 +56,12 @@ def located_cause(base: FittedModel, located: SearchResult, level: float, surrog
 def course_without(
     base: FittedModel, located: SearchResult, train: Bool[Tensor, " N"]
 ) -> tuple[JointModel, Float[Tensor, " p"]]:
-    """The model with the course as these samples alone tell it, and where to begin.
+    """Return the model with the course estimated from training samples only, and a start.
 
     Args:
-        base: the simulation alone.
-        located: what :func:`located_cause` found.
-        train: the samples.
+        base: fit without findings.
+        located: result of :func:`located_cause`.
+        train: mask of the training samples.
     """
     counts = located.scene.counts * train.unsqueeze(-1)
     known = linearise(
@@ -83,5 +83,5 @@ def course_without(
 def _with_cause(
     base: FittedModel, direction: Float[Tensor, " c"], shape: Shape
 ) -> tuple[JointModel, Float[Tensor, " p"]]:
-    # the residual is what was recorded less the prediction
+    # the residual is recording minus prediction
     return base.model.with_term(Term(Unrecorded(), None, shape)), torch.cat([base.parameters, -direction])

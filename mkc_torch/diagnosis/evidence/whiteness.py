@@ -1,4 +1,4 @@
-"""Whether what the final model leaves over is white, and if not, up to which lag it is correlated."""
+"""Whiteness test of the final model's residual."""
 
 from __future__ import annotations
 
@@ -18,24 +18,23 @@ if TYPE_CHECKING:
 __all__ = ["Whiteness", "test", "whiteness"]
 
 _FIRST = 20
-"""Lags of the portmanteau statistic: enough for noise with a memory, few enough to see a short one."""
+"""Number of lags of the portmanteau statistic."""
 
 _FARTHEST = 0.25
-"""Share of the recording up to which lags are looked at one by one; beyond, too few samples are left to compare."""
+"""Largest lag that is tested on its own, as a share of the recording."""
 
-_TITLE = "Is what is left over white?"
+_TITLE = "Whiteness of the residual"
 _NOTE = (
-    "Autocorrelation of what the final model leaves over, rejected samples aside: the last lag at which it is beyond "
-    "chance, that of neighbours, and the p-value of all lags up to the {lags}th together. Of white channels "
-    "{level:.2g} are called correlated."
+    "Autocorrelation of the final model's residual, without rejected samples: the last significant lag, the correlation "
+    "of neighbours, and the p-value of the first {lags} lags together. The level is {level:.2g}."
 )
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Of one channel: the last lag at which it is correlated, 0 where it is white, in samples.
+    """Whiteness of a channel: the last significant lag in samples, 0 if white.
 
-    ``neighbours`` is its correlation from one sample to the next, ``p_value`` that of the first ``lags`` together.
+    ``neighbours`` is the correlation at lag 1, ``p_value`` that of the first ``lags`` lags together.
     """
 
     lag: int
@@ -45,7 +44,7 @@ class Whiteness:
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
-    """The channels of the final fit's pseudo-residual, each by itself."""
+    """Test each channel of the final fit's pseudo-residual."""
     settings = case.settings.evidence
     values, counts = case.final.fit.pseudo(case.settings.noise)
     time = case.prepared.time
@@ -78,13 +77,13 @@ def test(case: EvidenceContext) -> EvidenceResult:
         "whiteness",
         channels,
         content={"unit": unit, "channels": content},
-        rows=(Row("left over", _in_words(channels, step, unit)),),
+        rows=(Row("residual", _in_words(channels, step, unit)),),
         table=table,
     )
 
 
 def _in_words(channels: Mapping[str, Whiteness], step: float, unit: str) -> str:
-    """The channel that is correlated longest, and how many are white.
+    """Return the channel with the longest correlation, and the number of white channels.
 
     Example:
         >>> white, coloured = Whiteness(0, 0.01, 0.4, 20), Whiteness(20, 0.8, 0.0, 20)
@@ -104,23 +103,23 @@ def _in_words(channels: Mapping[str, Whiteness], step: float, unit: str) -> str:
 
 
 def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings: EvidenceSettings) -> Whiteness:
-    """Whether a series is white, where some of its samples do not count.
+    """Test whether a series with masked samples is white.
 
-    It is not if the squares of its first autocorrelations are too large together, or one is at any lag, by Bartlett's
-    error of it, which grows with those before.
+    It is rejected by the portmanteau statistic of the first autocorrelations, or by an autocorrelation at any lag, with
+    Bartlett's standard error, which includes the previous lags.
 
     Ljung & Box, "On a measure of lack of fit in time series models", Biometrika 65 (1978); with missing samples,
     Stoffer & Toloi, Statistics & Probability Letters 13 (1992). Bartlett, J. R. Stat. Soc. Suppl. 8 (1946).
 
     Args:
-        values: 0 where they do not count.
-        counts: 1 where they do, else 0.
-        settings: the share of white series that may be called correlated.
+        values: the series; 0 for masked samples.
+        counts: mask, 0 or 1.
+        settings: level of the test.
 
     Example:
         >>> draws = torch.randn(2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> sums, ones, usual = draws[1:] + draws[:-1], torch.ones_like(draws), EvidenceSettings()
-        >>> whiteness(draws, ones, usual).lag, whiteness(sums, ones[1:], usual).lag
+        >>> sums, mask, usual = draws[1:] + draws[:-1], torch.ones_like(draws), EvidenceSettings()
+        >>> whiteness(draws, mask, usual).lag, whiteness(sums, mask[1:], usual).lag
         (0, 1)
     """
     N = len(values)
@@ -146,6 +145,6 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings
 
 
 def _lagged_sums(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Sums of products with the series some samples later."""
+    """Return the lagged products of a series, summed over samples."""
     N = len(values)
     return torch.fft.irfft(torch.fft.rfft(values, n=2 * N).abs().square(), n=2 * N)[:N]

@@ -1,1 +1,1 @@
-"""What is told of a finding: its numbers, where it acts, what to do, what to record next."""
+"""Contents of a finding: parameters, place, grade, advice and experiment design."""

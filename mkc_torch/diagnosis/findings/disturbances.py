@@ -1,4 +1,4 @@
-"""What pushes a simulation that nobody recorded: which state, how strongly, when, and what it goes along with."""
+"""Process noise and estimated disturbances, with their dependence on states and inputs."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["forcing_of", "pushes_of"]
+__all__ = ["forcing_of", "process_noise_of"]
 
 _BINS = 20
-"""Parts of a range that a push is averaged over."""
+"""Number of bins of a disturbance over a variable."""
 
 _NORMAL_95 = 1.96
-"""Standard errors to either side that a 95 % interval reaches."""
+"""Half-width of a 95 % interval in standard errors."""
 
 _PLAIN = 0.3
-"""Correlation, of either sign, above which a push is said to go along with something, where it is beyond chance too."""
+"""Absolute correlation above which a significant dependence is reported."""
 
 
-def pushes_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tuple[ProcessNoise, ...]:
-    """The disturbances of a noise, strongest first, with their units."""
+def process_noise_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tuple[ProcessNoise, ...]:
+    """Return the process noise and drifts of a noise model, strongest first, with units."""
     found = noise.selected
     sentences = []
     for disturbance, error, gain in zip(found.disturbances, found.errors, found.gains, strict=True):
@@ -41,43 +41,43 @@ def pushes_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tuple[Proce
 
 
 def forcing_of(fit: FittedModel, noise: StateSpaceNoise) -> tuple[DisturbanceEstimate, ...]:
-    """The courses of the pushes by all samples, with what they go along with.
+    """Estimate each disturbance from all samples, with its dependences.
 
     Args:
-        fit: along whose trajectory.
-        noise: around it.
+        fit: gives the trajectory.
+        noise: noise model around it.
     """
     prepared, model = fit.model.prepared, fit.model
     assert isinstance(prepared, PreparedDynamics)
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
     courses = disturbance_paths(prepared, theta, changes, model.near, noise.selected)
     states = prepared.trajectory(theta, changes, model.near).states.detach()[prepared.rows]
-    beside = {
+    variables = {
         **dict(zip(prepared.system.states, states.unbind(-1), strict=False)),
         **dict(zip(prepared.system.inputs, prepared.inputs_at_rows.unbind(-1), strict=True)),
     }
     found = []
-    for push, course in zip(pushes_of(prepared, noise), courses, strict=False):
-        curves = tuple(_curve(name, values, course, push, prepared) for name, values in beside.items())
+    for process, course in zip(process_noise_of(prepared, noise), courses, strict=False):
+        curves = tuple(_curve(name, values, course, process, prepared) for name, values in variables.items())
         found.append(
             DisturbanceEstimate(
-                push.place,
-                push.at_rate,
-                push.unit,
+                process.place,
+                process.at_rate,
+                process.unit,
                 prepared.time,
                 course.value,
                 _NORMAL_95 * course.error,
                 tuple(curve for curve in curves if curve is not None),
-                _sentences(push, course, prepared),
+                _sentences(process, course, prepared),
             )
         )
     return tuple(found)
 
 
 def _curve(
-    name: str, values: Float[Tensor, " N"], course: DisturbancePath, push: ProcessNoise, prepared: PreparedDynamics
+    name: str, values: Float[Tensor, " N"], course: DisturbancePath, process: ProcessNoise, prepared: PreparedDynamics
 ) -> Curve | None:
-    """Mean of a push over parts of the range of what it may depend on, as many samples in each, with its band."""
+    """Return the mean of a disturbance over bins of a variable with equal counts, with its band."""
     if float(values.std()) <= 1e-12 * float(values.abs().max().clamp(min=1e-300)):
         return None
     parts = values.argsort().tensor_split(max(min(_BINS, len(values) // 10), 1))
@@ -85,15 +85,15 @@ def _curve(
     y = torch.stack([course.value[part].mean() for part in parts])
     band = _NORMAL_95 * _error_of_means(course.value, parts)
     unit = prepared.system.units.get(name, prepared.recording.units[name] if name in prepared.recording else "")
-    return Curve(name, unit, x, y.unsqueeze(-1), band.unsqueeze(-1), (f"rate of {push.place}",), push.unit)
+    return Curve(name, unit, x, y.unsqueeze(-1), band.unsqueeze(-1), (f"rate of {process.place}",), process.unit)
 
 
 def _error_of_means(values: Float[Tensor, " N"], parts: Sequence[Tensor]) -> Float[Tensor, " parts"]:
-    """Standard errors of the means of some samples of a series each: neighbours are alike, as the series has it."""
+    """Return standard errors of means over parts of an autocorrelated series."""
     N = len(values)
     inside = torch.stack([values.new_zeros(N).index_fill(0, part, 1.0) for part in parts])
     (alike, *pairs) = _lagged(torch.stack([values - values.mean(), *inside]))
-    # beyond where it first vanishes there is nothing but chance
+    # the autocorrelation after its first zero is noise
     memory = int((alike <= 0).long().argmax()) or N
     count = inside.sum(-1)
     of_pairs = torch.stack([pair[0] * alike[0] + 2.0 * (pair[1:memory] * alike[1:memory]).sum() for pair in pairs])
@@ -101,37 +101,37 @@ def _error_of_means(values: Float[Tensor, " N"], parts: Sequence[Tensor]) -> Flo
 
 
 def _lagged(series: Float[Tensor, "k N"]) -> Float[Tensor, "k N"]:
-    """Sums of the products of each series with itself, so many samples later."""
+    """Return the lagged products of each series, summed over samples."""
     N = series.shape[-1]
     return torch.fft.irfft(torch.fft.rfft(series, n=2 * N).abs().square(), n=2 * N)[..., :N]
 
 
-def _sentences(push: ProcessNoise, course: DisturbancePath, prepared: PreparedDynamics) -> tuple[str, ...]:
-    what = f"rate of {push.place}" if push.at_rate else push.place
+def _sentences(process: ProcessNoise, course: DisturbancePath, prepared: PreparedDynamics) -> tuple[str, ...]:
+    what = f"rate of {process.place}" if process.at_rate else process.place
     step = float(prepared.time.diff().median())
-    if push.correlation_time > 0.0:
-        sentences = [f"What pushes {what} is not white: it keeps its value for about {push.correlation_time:.2g} s."]
+    if process.correlation_time > 0.0:
+        sentences = [f"The disturbance of {what} is not white: its correlation time is about {process.correlation_time:.2g} s."]
     else:
-        sentences = [f"What pushes {what} is white: it is new at each sample."]
+        sentences = [f"The disturbance of {what} is white."]
     for name, values in zip(prepared.system.inputs, prepared.inputs_at_rows.unbind(-1), strict=True):
-        lag, size, chance = _strongest(course.value, values, push.correlation_time / step if step > 0 else 0.0)
+        lag, size, chance = _strongest(course.value, values, process.correlation_time / step if step > 0 else 0.0)
         if size > max(chance, _PLAIN):
-            when = "at once" if lag == 0 else f"{lag * step:.2g} s after it"
-            sentences.append(f"It goes along with {name}, {when} (correlation {size:.2f}).")
+            when = "without delay" if lag == 0 else f"with a delay of {lag * step:.2g} s"
+            sentences.append(f"It is correlated with {name} {when} (correlation {size:.2f}).")
         else:
-            sentences.append(f"It is independent of {name} at every lag.")
+            sentences.append(f"It is uncorrelated with {name} at all lags.")
     return tuple(sentences)
 
 
-def _strongest(push: Float[Tensor, " N"], given: Float[Tensor, " N"], memory: float) -> tuple[int, float, float]:
-    """The lag, in samples, by which a push follows an input most; that correlation, and what chance reaches."""
-    N = len(push)
-    one, other = push - push.mean(), given - given.mean()
-    size = torch.linalg.vector_norm(one) * torch.linalg.vector_norm(other)
+def _strongest(process: Float[Tensor, " N"], given: Float[Tensor, " N"], memory: float) -> tuple[int, float, float]:
+    """Return the lag in samples with the largest correlation to an input, that correlation, and its critical value."""
+    N = len(process)
+    first, other = process - process.mean(), given - given.mean()
+    size = torch.linalg.vector_norm(first) * torch.linalg.vector_norm(other)
     if not float(size) > 0.0:
         return 0, 0.0, 1.0
     farthest = min(N // 4, 200)
-    spectrum = torch.fft.rfft(one, n=2 * N) * torch.fft.rfft(other, n=2 * N).conj()
+    spectrum = torch.fft.rfft(first, n=2 * N) * torch.fft.rfft(other, n=2 * N).conj()
     correlation = torch.fft.irfft(spectrum, n=2 * N)[: farthest + 1] / size
     lag = int(correlation.abs().argmax())
     independent = max(N / max(1.0 + 2.0 * memory, 1.0), 2.0)

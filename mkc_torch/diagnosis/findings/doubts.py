@@ -1,4 +1,4 @@
-"""Why an estimate is to be doubted by its own numbers: at the end of a range, or far from what is plausible."""
+"""Doubts about an estimate: parameters at a bound, or far above the plausible size."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 __all__ = ["far_from_plausible", "shape_at_ends", "times_plausible"]
 
 FAR = 10.0
-"""Times the plausible size from which a finding does not count as confirmed."""
+"""Multiple of the plausible size above which a finding is unconfirmed."""
 
 _AT_END = 0.01
-"""Share of an end's own size within which a number is at that end."""
+"""Relative distance within which a number is at a bound."""
 
 
 def shape_at_ends(term: Term, prepared: PreparedSimulation, context: Context) -> tuple[str, ...]:
-    """A sentence for each number of a shape that was fitted to the end of its range.
+    """Return a sentence for each shape parameter at a bound.
 
     Args:
         term: the effect with its fitted shape.
         prepared: the simulation.
-        context: what the effect sees there.
+        context: context of the effect.
     """
     return tuple(_ended(term, prepared, context))
 
 
 def far_from_plausible(term: Term, gamma: Tensor, context: Context) -> str:
-    """Why the amplitude cannot be believed: at the end of its range, or :data:`FAR` times a plausible size; else empty.
+    """Return why the amplitude is impossible: at its bound, or above :data:`FAR` times a plausible size; else empty.
 
     Args:
         term: the effect.
         gamma: its amplitude.
-        context: what the effect sees.
+        context: context of the effect.
     """
     first = term.effect.quantities(term.shape, context)[0]
     largest, most = float(gamma[: first.size].abs().max()), term.effect.upper
     name = first.name.replace("_", " ")
-    # a share of one is all of it, and as good a value as any
+    # an upper bound of 1 is a share, which may be 1
     if 1.0 < most < math.inf and _near(largest, most):
-        return f"Its {name} ended at {sized(most, tidy(first.unit))}, the most that is tried: nothing holds it."
+        return f"Its {name} ended at {sized(most, tidy(first.unit))}, the upper bound: the recording does not limit it."
     times = times_plausible(term, gamma, context)
     if times is not None and times > FAR:
-        return f"Its {name} is {times:.2g} times the largest that is plausible ({term.effect.source})."
+        return f"Its {name} is {times:.2g} times the largest plausible size ({term.effect.source})."
     return ""
 
 
 def times_plausible(term: Term, gamma: Tensor, context: Context) -> float | None:
-    """The largest number of the first quantity as a multiple of the plausible size; None where that is not known."""
+    """Return the largest number of the first quantity as a multiple of the plausible size; None if that is unknown."""
     first, limit = term.effect.quantities(term.shape, context)[0], term.effect.plausible
     times = ratio(term.effect.plausible_unit or first.unit, first.unit)
     if not math.isfinite(limit) or times is None:
@@ -70,8 +70,8 @@ def _ended(term: Term, prepared: PreparedSimulation, context: Context) -> Iterat
                 continue
             text = sized(value, tidy(term.effect.unit_of_shape(name, context)))
             yield (
-                f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} that is tried, so this "
-                "recording does not tell it: something else may act there, or the recording is too short for it."
+                f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} bound: this recording "
+                "does not determine it. Other physics may act there, or the recording is too short."
             )
 
 

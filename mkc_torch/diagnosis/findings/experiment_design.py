@@ -1,4 +1,4 @@
-"""What to record to tell an effect from a rival: how much more and in which state, by the tangents of a recording."""
+"""Experiment design: how much to record, and in which state, to distinguish an effect from a rival."""
 
 from __future__ import annotations
 
@@ -18,27 +18,30 @@ if TYPE_CHECKING:
 
 __all__ = ["SAME", "distinguishing_state"]
 
-SAME = "Their courses are the same in this recording: only one in which they differ can tell them apart."
+SAME = "They are identical in this recording: a recording in which they differ can distinguish them."
 
 _NOTHING = 0.05
-"""Nats that tell an effect from a rival in all of a recording, below which no recording of this kind would do."""
+"""Expected gain in nats below which no similar recording distinguishes two effects."""
 
-_BETTER, _FEWEST = 1.5, 0.03
-"""Times that a sample has to tell more than one on average, and the share of samples that do, to be worth a word."""
+_BETTER = 1.5
+"""Minimum information of a sample, relative to the mean, for a state to be named."""
+
+_FEWEST = 0.03
+"""Minimum share of samples in that state."""
 
 _MAINLY = 0.8
-"""Share of a signal's length that an axis has to have for the signal to be mainly along it."""
+"""Minimum share of a signal's norm along its main axis."""
 
 _MOST = 20.0
-"""Times as many samples beyond which it is told as far more."""
+"""Ratio of samples above which "far more samples" is reported."""
 
 
 def distinguishing_state(located: SearchResult, own: int, rival: int) -> str:
-    """A sentence on what to record.
+    """Return a sentence on what to record.
 
-    The effect as it was found has a trace in the residual, and the rival with all of the simulation's own parameters
-    follows it as far as it can. Half the square of what is left, in the noise of the search, is what the data are
-    expected to tell them apart by, in nats; where in the recording it lies says which samples do it.
+    The trace of the effect is projected on the rival and the simulation's parameters. Half the squared residual of the
+    projection, in units of the noise, is the expected log-likelihood gain in nats; its distribution over the recording
+    shows the informative samples.
 
     Args:
         located: the search that named the effect.
@@ -55,30 +58,30 @@ def distinguishing_state(located: SearchResult, own: int, rival: int) -> str:
     often = f"about {more:.1f} times as many samples" if more > 1.0 else "as many samples again"
     if more > _MOST:
         often = "far more samples"
-    text = f"In a recording like this one {often} would tell them apart"
+    text = f"In a similar recording, {often} would distinguish them"
     left = _left(located, own, rival)
     times, words = max(((state.times(left), state.display_name) for state in _states(located)), default=(0.0, ""))
     if times < _BETTER:
         return f"{text}."
-    return f"{text}; those while {words} do it best, {times:.1f} times as well as one on average."
+    return f"{text}; best samples in which {words}, with {times:.1f} times the mean information."
 
 
 @dataclass(frozen=True)
 class _State:
-    """A state in which some of the samples were recorded."""
+    """A condition, and the samples that meet it."""
 
     display_name: str
     samples: Bool[Tensor, " N"]
 
     def times(self, left: Float[Tensor, " N"]) -> float:
-        """How many times as much a sample in this state tells as one on average."""
+        """Return the information of a sample in this state, relative to the mean."""
         share = float(self.samples.double().mean())
         mean = float(left.mean())
         return float(left[self.samples].mean()) / mean if share >= _FEWEST and mean > 0 else 0.0
 
 
 def _left(located: SearchResult, own: int, rival: int) -> Float[Tensor, " N"]:
-    """Of each sample, the square of what a rival does not follow, over the noise."""
+    """Return the squared residual of the projection at each sample, in units of the noise."""
     gamma = located.look.linearised.search.estimate(own, located.look.linearised.series)[0]
     weight = (located.scene.counts / located.fit.d).unsqueeze(-1)
     candidates = located.scene.tangents.candidates
@@ -91,7 +94,7 @@ def _left(located: SearchResult, own: int, rival: int) -> Float[Tensor, " N"]:
 
 
 def _states(located: SearchResult) -> Iterator[_State]:
-    """Low and high values of each recorded driver, and what passes through the port mainly along one of its axes."""
+    """Yield low and high values of each recorded driver, and main axes of the port's signal."""
     drivers = {t.driver.columns[0]: t.driver for t in located.scene.terms if t.driver and len(t.driver.columns) == 1}
     for name, driver in drivers.items():
         values = driver.values[:, 0]

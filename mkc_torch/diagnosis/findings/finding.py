@@ -1,4 +1,4 @@
-"""A located effect as a finding that a user reads."""
+"""Convert a located effect to a finding."""
 
 from __future__ import annotations
 
@@ -31,30 +31,35 @@ if TYPE_CHECKING:
 __all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
-"""Alternatives that are listed, unless more are not told apart."""
+"""Number of listed alternatives; inseparable ones are always listed."""
 
 _FARTHEST = 30.0
-"""Nats behind the finding beyond which an alternative is not listed."""
+"""Log-likelihood gap in nats above which an alternative is not listed."""
 
-_BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
-"""Blocks of the recording, the share of the gain that the best of them hold, and the share of them that they may be for
-the gain to be called concentrated there."""
+_BLOCKS = 60
+"""Number of blocks of the recording."""
+
+_MOST_GAIN = 0.9
+"""Share of the gain in the best blocks."""
+
+_CONCENTRATED = 0.35
+"""Largest share of best blocks for which the gain counts as concentrated."""
 
 _POINTS = 80
-"""Points of a curve."""
+"""Number of points of a curve."""
 
 _NORMAL_95 = 1.959964
-"""Standard errors to either side that a 95 % interval of a normal variable reaches."""
+"""Half-width of a 95 % interval in standard errors."""
 
 
 def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quick: bool = False) -> Finding:
-    """The finding for the effect ``number`` of the final model, without its evidence.
+    """Return the finding of effect ``number`` of the final model, without its evidence.
 
     Args:
-        located: the search that named it.
+        located: its search result.
         final: the final parameters.
         number: of the effect among the model's terms.
-        quick: whether no noise was drawn, so that there is no p-value.
+        quick: True for a quick look, without surrogates and p-values.
     """
     term = final.fit.model.terms[number]
     gamma, covariance = _own(final, number)
@@ -66,15 +71,15 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     curve = _curve(term, gamma, covariance, context)
     shape = _shape_parameters(term, context, final.shape_errors[number])
     of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
-    told_as = formulas(curve) if of_motion_or_driver and curve is not None else ()
-    moments = term.effect.moments(context)
+    approximations = formulas(curve) if of_motion_or_driver and curve is not None else ()
+    event_times = term.effect.moments(context)
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
         intervals=intervals_of(gain_of(final, number), final.fit.model.prepared.time),
-        onset=moments[0] if moments else term.shape.get("onset"),
-        equation="; ".join([term.effect.equation_of(term.shape, context), *told_as]),
+        onset=event_times[0] if event_times else term.shape.get("onset"),
+        equation="; ".join([term.effect.equation_of(term.shape, context), *approximations]),
         explanation=term.effect.explained(gamma.tolist(), term.shape, context),
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=None if quick else located.p_value,
@@ -87,7 +92,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),
-        event_times=moments,
+        event_times=event_times,
         references=_references(term),
         advice=term.effect.advised(gamma.tolist(), term.shape, context),
         recurrence=term.effect.recurrence,
@@ -100,18 +105,18 @@ def _references(term: Term) -> tuple[Reference, ...]:
     if term.driver is None:
         return ()
     values = term.driver.reference.tolist()
-    return tuple(Reference(*item) for item in zip(term.columns, values, term.driver.units, strict=True))
+    return tuple(Reference(*entry) for entry in zip(term.columns, values, term.driver.units, strict=True))
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
-    """Where a term acts, as a user reads it: channels of a residual, or the rates and inputs of a simulation."""
+    """Return the places on which a term acts: channels of a residual, or rates and inputs of a simulation."""
     if "rate of " in term.at or term.at.startswith("exchange of "):
         return tuple(f"rate of {name}" for name in channels)
     return tuple(f"input {name}" for name in channels) if term.at.startswith("input ") else tuple(channels)
 
 
 def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:
-    """γ of one effect and its covariance."""
+    """Return γ of an effect and its covariance."""
     model = final.fit.model
     start = model.base + sum(model.sizes[:number])
     mine = slice(start, start + model.sizes[number])
@@ -126,7 +131,7 @@ def _context(final: FinalEstimate, term: Term) -> Context:
 def parameters_of(
     term: Term, gamma: Float[Tensor, " q"], covariance: Float[Tensor, "q q"], context: Context
 ) -> tuple[EffectParameter, ...]:
-    """γ as named quantities with units and standard errors."""
+    """Return γ as named quantities with units and standard errors."""
     error = covariance.diagonal().clamp(min=0.0).sqrt()
     parameters, start = [], 0
     for quantity in term.effect.quantities(term.shape, context):
@@ -141,7 +146,7 @@ def parameters_of(
 
 
 def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
-    """What the numbers of a quantity are: as the effect says, or one for each channel."""
+    """Return the component names of a quantity: those of the effect, or the channels."""
     if size < 2:
         return ()
     own = term.effect.components(quantity, term.shape, context)
@@ -167,21 +172,21 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     first = term.effect.quantities(term.shape, context)[0]
     largest = float(gamma[: first.size].abs().max())
     if not math.isfinite(limit):
-        return True, "No plausible size is known for this effect; judge it by its equation."
+        return True, "No plausible size is known for this effect; check its equation."
     known = term.effect.plausible_unit or first.unit
     times = ratio(known, first.unit)
     if times is None:
-        return True, f"Its size is in {first.unit or 'no unit'}; what is plausible is known in {known} alone."
+        return True, f"Its size is in {first.unit or 'no unit'}; the plausible size is known only in {known}."
     limit *= times
     unit = f" {tidy(first.unit)}" if first.unit else ""
     text = f"Its largest value, {largest:.3g}{unit}, is"
     if largest <= limit:
-        return True, f"{text} within the {limit:g}{unit} that is plausible ({term.effect.source})."
-    return False, f"{text} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
+        return True, f"{text} within the plausible {limit:g}{unit} ({term.effect.source})."
+    return False, f"{text} above the plausible {limit:g}{unit} ({term.effect.source}): doubtful."
 
 
 def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
-    """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
+    """Return the rivals, nearest first: all inseparable rivals, and the next few."""
     found = []
     if term.driver is not None:
         found += [
@@ -204,9 +209,9 @@ def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
 
 
 def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[tuple[float, float], ...]:
-    """Where an effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
+    """Return the intervals in which an effect's gain is concentrated: the fewest blocks with 90 % of the gain.
 
-    Empty where that is more than a third of the recording, and where runs share their times.
+    Empty if these are more than a third of the recording, and if runs overlap in time.
     """
     N = len(time)
     count = min(_BLOCKS, N // 10)
@@ -232,7 +237,7 @@ def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[
 
 
 def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> Curve | None:
-    """The effect's change at its port along its driver, along the signal, or along time, with its 95 % band."""
+    """Return the effect's change at its port over its driver, signal or time, with its 95 % band."""
     made = _along(term, context)
     if made is None:
         return None
@@ -280,7 +285,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
 
 
 def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
-    """Over the range of the part of the signal that the effect mainly follows, the others at their medians."""
+    """Return the range of the effect's main component, with the other components at their medians."""
     part = term.effect.plot_axis
     if part not in context.parts:
         return None
@@ -295,7 +300,7 @@ def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context
 
 
 def labels(terms: Sequence[Term]) -> tuple[str, ...]:
-    """``effect (driver)`` of terms, and at which place of a simulation where several could be meant."""
+    """Return ``effect (driver)`` of terms, with the port if it is ambiguous."""
     places: dict[tuple[str, tuple[str, ...]], set[str]] = {}
     for term in terms:
         places.setdefault((term.effect.id, term.columns), set()).add(term.port)

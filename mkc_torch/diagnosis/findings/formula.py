@@ -1,4 +1,4 @@
-"""A curve without a name as a short formula, in the units of the data."""
+"""Approximate an unnamed curve by a short formula, in the units of the data."""
 
 from __future__ import annotations
 
@@ -16,8 +16,14 @@ if TYPE_CHECKING:
 
 __all__ = ["formulas"]
 
-_MOST_TERMS, _CLOSE, _INSIDE = 3, 0.02, 0.95
-"""Terms at most; and what a formula needs: so little misfit, over the curve's size, or so many points in its band."""
+_MOST_TERMS = 3
+"""Largest number of terms."""
+
+_CLOSE = 0.02
+"""Relative RMS error at which a formula is accepted."""
+
+_INSIDE = 0.95
+"""Share of points in the band at which a formula is accepted."""
 
 _EVEN: dict[str, Callable[[Tensor], Tensor]] = {"{}": lambda x: x, "{}²": torch.square, "{}³": lambda x: x**3}
 _SIGNED: dict[str, Callable[[Tensor], Tensor]] = {
@@ -30,21 +36,21 @@ _POSITIVE: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def formulas(curve: Curve) -> tuple[str, ...]:
-    """For each channel the sum of the fewest terms, beside a constant, that stays in the curve's band.
+    """Return, for each channel, a constant plus the fewest terms that stay in the curve's band.
 
     Args:
         curve: with its 95 % band.
 
     Returns:
-        Formulas such as ``δ(rate of speed) = 0.44 − 0.46 speed + 0.027 speed |speed| rad/s²``, and how far they are
-        from the curve, root mean square over that of the curve.
+        Formulas such as ``δ(rate of speed) = 0.44 − 0.46 speed + 0.027 speed |speed| rad/s²``, each with its relative
+        RMS error.
 
     Example:
         >>> x = torch.linspace(-2.0, 2.0, 81, dtype=torch.float64)
         >>> value = (-0.5 * x * x.abs()).unsqueeze(-1)
         >>> band = torch.full_like(value, 0.01)
         >>> formulas(Curve("speed", "m/s", x, value, band, ("rate of speed",), "m/s²"))
-        ('δ(rate of speed) = −0.5 speed |speed| m/s² (0 % off)',)
+        ('δ(rate of speed) = −0.5 speed |speed| m/s² (RMS error 0 %)',)
     """
     x = curve.x
     columns = {name: make(x) for name, make in _library(float(x.min()), float(x.max())).items()}
@@ -56,7 +62,7 @@ def formulas(curve: Curve) -> tuple[str, ...]:
 
 
 def _library(least: float, most: float) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Terms that are finite over a range."""
+    """Return the terms that are finite over a range."""
     if least < 0.0:
         return _SIGNED if most > 0.0 else _EVEN
     return _POSITIVE if least > 0.0 else _FROM_ZERO
@@ -82,16 +88,16 @@ def _formula(
     assert best is not None
     _, names, coefficients = best
     off = (_summed(names, columns, coefficients) - value).square().mean().sqrt()
-    text = _told(names, coefficients, driver, float(size))
+    text = _formula_text(names, coefficients, driver, float(size))
     return (
-        f"δ({channel}) = {text}{f' {unit}' if unit else ''} ({100.0 * float(off / size.clamp(min=1e-300)):.0f} % off)"
+        f"δ({channel}) = {text}{f' {unit}' if unit else ''} (RMS error {100.0 * float(off / size.clamp(min=1e-300)):.0f} %)"
     )
 
 
 def _fitted(
     names: tuple[str, ...], columns: dict[str, Tensor], value: Tensor, band: Tensor
 ) -> tuple[float, tuple[str, ...], Tensor]:
-    """Weighted misfit, terms and coefficients, the constant first."""
+    """Return weighted misfit, terms and coefficients, the constant first."""
     weight = (band + 0.01 * value.abs().max()).clamp(min=1e-300).reciprocal().unsqueeze(-1)
     design = torch.stack([torch.ones_like(value), *(columns[name] for name in names)], -1)
     scale = design.abs().amax(0)
@@ -104,7 +110,7 @@ def _summed(names: tuple[str, ...], columns: dict[str, Tensor], coefficients: Te
     return coefficients[0] + sum(c * columns[name] for c, name in zip(coefficients[1:], names, strict=True))
 
 
-def _told(names: tuple[str, ...], coefficients: Tensor, driver: str, size: float) -> str:
+def _formula_text(names: tuple[str, ...], coefficients: Tensor, driver: str, size: float) -> str:
     constant, *others = coefficients.tolist()
     terms = [(c < 0, f"{abs(c):.3g} {name.format(driver)}") for c, name in zip(others, names, strict=True)]
     if abs(constant) > 1e-3 * size:

@@ -1,4 +1,4 @@
-"""What a finding is worth: whether unseen blocks confirm it, and how large it is beside the noise."""
+"""Grade of a finding: confirmation on held-out blocks, and size relative to the noise."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ __all__ = [
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
 
 SMALL = 0.05
-"""Share by which a finding has to make the residual smaller to be more than small beside the noise."""
+"""Relative reduction of the residual below which a finding is small."""
 
 _NORMAL_95 = 1.96
-"""Standard errors to either side that a 95 % interval of a normal variable reaches."""
+"""Half-width of a 95 % interval in standard errors."""
 
 
 def confirmation(gain: float, interval: tuple[float, float]) -> Confirmation:
-    """Whether a gain on unseen blocks shows that a model is better, by its 95 % interval.
+    """Classify a gain on held-out blocks by its 95 % interval.
 
-    "probably" is a gain of more than one standard error whose interval reaches to 0.
+    "probably": a gain above its standard error whose interval contains 0.
 
     Example:
         >>> confirmation(0.3, (0.2, 0.4)), confirmation(0.13, (-0.02, 0.28)), confirmation(0.01, (-0.1, 0.1))
@@ -55,10 +55,10 @@ def confirmation(gain: float, interval: tuple[float, float]) -> Confirmation:
 
 
 def confirmed(finding: Finding) -> bool:
-    """Whether unseen blocks surely confirm it; of an event that cannot be held out the search alone has to.
+    """Whether held-out blocks confirm a finding; the search confirms an event that cannot be held out.
 
-    One without a size is none, whatever the blocks show: something that came with it, such as another noise, made the
-    difference. One of a size that cannot be stands in for something else.
+    A finding of size 0 is unconfirmed whatever the blocks show: another change, such as of the noise model, made the
+    difference. A finding of impossible size is a proxy of other physics.
     """
     if is_zero_within_error(finding) or finding.cannot_be:
         return False
@@ -70,13 +70,13 @@ def confirmed(finding: Finding) -> bool:
 
 
 def vetoed(held_out: HeldOut) -> bool:
-    """Whether unseen blocks speak against a finding: the free run is farther off, or it is less likely for no gain.
+    """Whether held-out blocks reject a finding: a larger open-loop residual, or a smaller likelihood without gain.
 
-    Of several outputs the mean of the logarithms of their residuals counts: what mends one may spoil another.
+    Several outputs are combined by the geometric mean of their residual ratios.
 
     Example:
-        >>> from mkc_torch.diagnosis.result import Sizes
-        >>> each = {"angle": Sizes(2.0, 1.8, "rad"), "speed": Sizes(2.0, 3.0, "rad/s")}
+        >>> from mkc_torch.diagnosis.result import ResidualSizes
+        >>> each = {"angle": ResidualSizes(2.0, 1.8, "rad"), "speed": ResidualSizes(2.0, 3.0, "rad/s")}
         >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.8, "", each))
         True
         >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.0, "m")), vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 2.2, "m"))
@@ -89,7 +89,7 @@ def vetoed(held_out: HeldOut) -> bool:
 
 
 def is_zero_within_error(finding: Finding) -> bool:
-    """Whether each of its numbers is as well 0, within one standard error; of what has no standard errors, never."""
+    """Whether all parameters are within a standard error of 0; False without standard errors."""
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
@@ -99,13 +99,13 @@ def is_zero_within_error(finding: Finding) -> bool:
 
 
 def change(held_out: HeldOut) -> float:
-    """Share by which a finding makes the residual smaller, of the output where that is most; 0 where it is not known.
+    """Return the largest relative reduction of an output's residual; 0 if unknown.
 
     Example:
         >>> round(change(HeldOut(0.3, (0.2, 0.4), 2.0, 1.5, "µT")), 3)
         0.25
-        >>> from mkc_torch.diagnosis.result import Sizes
-        >>> each = {"angle": Sizes(0.2, 0.1, "rad"), "speed": Sizes(3.0, 3.0, "rad/s")}
+        >>> from mkc_torch.diagnosis.result import ResidualSizes
+        >>> each = {"angle": ResidualSizes(0.2, 0.1, "rad"), "speed": ResidualSizes(3.0, 3.0, "rad/s")}
         >>> change(HeldOut(0.3, (0.2, 0.4), 3.0, 3.0, "", each))
         0.5
     """
@@ -113,28 +113,28 @@ def change(held_out: HeldOut) -> float:
 
 
 def _sizes(held_out: HeldOut) -> list[tuple[float, float]]:
-    """Residuals before and after, of each output."""
+    """Return residual before and after of each output."""
     each = [(output.before, output.after) for output in held_out.outputs.values()]
     return each or [(held_out.rmse_before, held_out.rmse_after)]
 
 
 def _ratio(before: float, after: float) -> float:
-    """Of residuals after and before; 1 where it is not known."""
+    """Return the ratio of residuals after and before; 1 if unknown."""
     return after / before if before > 0.0 and 0.0 < after / before < math.inf else 1.0
 
 
 def small(finding: Finding) -> bool:
-    """Whether it hardly makes the residual smaller: a mean over many samples shows it, a single sample does not."""
+    """Whether a finding hardly reduces the residual; only means over many samples show it."""
     return finding.held_out is not None and change(finding.held_out) < SMALL
 
 
 def grade_of(finding: Finding) -> Grade:
-    """What a finding is worth by its evidence, as long as its shape is the recording's.
+    """Return the grade of a finding by its evidence, without the test of its shape.
 
     Example:
-        >>> from mkc_torch.diagnosis.result import Told
+        >>> from mkc_torch.diagnosis.result import EvidenceResult
         >>> held = HeldOut(0.02, (0.01, 0.03), 2.0, 1.96, "µT")
-        >>> seen = (Told("held_out", (held, "")),)
+        >>> seen = (EvidenceResult("held_out", (held, "")),)
         >>> grade_of(Finding("time_lag", (), (), (), None, "", "", (), 0.01, (), True, "", evidence=seen))
         'small'
     """
@@ -144,9 +144,9 @@ def grade_of(finding: Finding) -> Grade:
 
 
 def grade_in_short(finding: Finding) -> Grade:
-    """The same where no noise was drawn, or nobody asked for its shape: only unseen blocks can confirm it.
+    """Return the grade without surrogates and without the test of the shape: only held-out blocks can confirm.
 
-    Blocks that only speak against a finding, as those of process noise do, do not.
+    Blocks that can only reject a finding, as with process noise, do not confirm it.
     """
     held = finding.held_out
     if held is None or not held.decides:
@@ -155,13 +155,13 @@ def grade_in_short(finding: Finding) -> Grade:
 
 
 def worth_correcting(finding: Finding) -> bool:
-    """Whether a simulation is clearly better with it, in this form."""
+    """Whether the finding clearly improves the simulation."""
     return finding.grade == "left_out"
 
 
 def transfers(finding: Finding) -> bool:
-    """Whether a model of it is of use on another recording.
+    """Whether a finding can be applied to another recording.
 
-    What belongs to the place of this one, or comes and goes at times that nothing tells, is not.
+    Location-specific and intermittent findings cannot.
     """
     return worth_correcting(finding) and finding.plausible and not (finding.location_specific or finding.comes_and_goes)

@@ -1,4 +1,4 @@
-"""Whether a simulation's free run is of more use than a trivial prediction, output by output."""
+"""Whether the open-loop simulation predicts each output better than the output's mean."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment
 __all__ = ["follows", "follows_all"]
 
 _FLOOR = 2.0
-"""Times the sensor's noise floor up to which a residual is as good as noise: an output that hardly varies beyond its
-noise is predicted by its mean as well, and no simulation is worse for that."""
+"""Residual, in noise floors, up to which an output that hardly varies counts as fitted."""
 
 
-def follows(one: GoodnessOfFit) -> bool:
-    """Whether an output is followed: better than by its mean, or down to the sensor's noise.
+def follows(fit: GoodnessOfFit) -> bool:
+    """Whether the residual of an output is smaller than that of its mean, or at the sensor's noise.
 
     Example:
         >>> still = GoodnessOfFit("angle", "rad", 0.0051, 0.005, -0.04, 0.005, "declared", 0.005, 0.007)
@@ -20,9 +19,9 @@ def follows(one: GoodnessOfFit) -> bool:
         >>> follows(still), follows(lost)
         (True, False)
     """
-    return one.residual < one.rmse_of_mean or one.residual <= _FLOOR * one.noise_floor
+    return fit.residual < fit.rmse_of_mean or fit.residual <= _FLOOR * fit.noise_floor
 
 
-def follows_all(world: NoiseEnvironment) -> bool:
-    """Whether each output is that is known of."""
-    return all(follows(fit) for fit in world.goodness_of_fit)
+def follows_all(environment: NoiseEnvironment) -> bool:
+    """Whether :func:`follows` holds for each output."""
+    return all(follows(fit) for fit in environment.goodness_of_fit)

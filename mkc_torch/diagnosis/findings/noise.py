@@ -1,4 +1,4 @@
-"""The noise that is left, in words and numbers."""
+"""Summary of the final noise model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["noise_summary"]
 
 
 def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary:
-    """White, autoregressive, or wandering like a random walk, with its numbers."""
+    """Return the noise model (white, autoregressive or random walk) with its parameters."""
     fit, drift = final.fit, final.noise
     prepared = fit.model.prepared
     orders = final.spectrum.coefficients
@@ -20,20 +20,20 @@ def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary
     units: dict[str, str] = {}
     clear = drift.size > 0 and drift.gain > settings.reported_drift
     if clear:
-        parameters["wander"] = final.drift_spread
-        units["wander"] = next(port.unit for port in prepared.ports.values() if port.allows_drift)
+        parameters["drift"] = final.drift_spread
+        units["drift"] = next(port.unit for port in prepared.ports.values() if port.allows_drift)
         if drift.family > 0:
             length = float(prepared.time[-1] - prepared.time[0])
-            parameters["wander_period"] = 2.0 * length / settings.plateaus[drift.family - 1][0]
-            units["wander_period"] = "s"
+            parameters["drift_period"] = 2.0 * length / settings.plateaus[drift.family - 1][0]
+            units["drift_period"] = "s"
     if coloured:
         parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)
     if clear and drift.family == 0:
         model = "random_walk"
-        size = f"{parameters['wander']:.2g} {units['wander']}"
-        text = f"noise around an offset that wanders like a random walk, by {size} in all"
+        size = f"{parameters['drift']:.2g} {units['drift']}"
+        text = f"noise around an offset with a random walk of standard deviation {size}"
     elif clear or coloured:
-        model, text = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
+        model, text = "ar", "coloured noise" + (", with drift of the offset" if clear else "")
     else:
         model, text = "white", "white noise"
     tails = time_series_tails(fit.residual)

@@ -1,4 +1,4 @@
-"""Why a simulation does not follow its recording: what is sought first, and told as sentences."""
+"""Reasons for a poor fit of a simulation, as sentences."""
 
 from __future__ import annotations
 
@@ -26,30 +26,36 @@ if TYPE_CHECKING:
 
 __all__ = ["at_ends", "reasons_of", "wrong_turns"]
 
-_NOUGHT, _AWAY, _AT_END = 1e-3, 30.0, 1e-6
-"""Times its first value at which a parameter is nearly 0, has run away, and is at an end of its range."""
+_NOUGHT = 1e-3
+"""Relative value below which a parameter is nearly 0."""
 
-_MENDS = 0.5
-"""Share of the residual to which a trial has to bring it to be told as the reason."""
+_AWAY = 30.0
+"""Relative value above which a parameter has diverged."""
+
+_AT_END = 1e-6
+"""Relative distance within which a parameter is at a bound."""
+
+_FIXES = 0.5
+"""Relative residual below which a trial is reported as the reason."""
 
 _MATTERS = 0.97
-"""Share of the residual without an input below which the input matters."""
+"""Residual, relative to that without an input, below which the input matters."""
 
 _LAGS = (2, 5, 20)
-"""Samples by which an input is tried late."""
+"""Tried delays of an input, in samples."""
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """A change of the simulation or the recording, and the sentence where it mends the fit, from a start of its own."""
+    """A change of the simulation or of the recording, and its sentence if it fixes the fit."""
 
-    told: Callable[[Float[Tensor, " p"]], str]
+    sentence: Callable[[Float[Tensor, " p"]], str]
     prepared: PreparedDynamics
     thorough: bool = False
 
 
 def at_ends(fit: FittedModel) -> tuple[str, ...]:
-    """Parameters of the equations that ended at an end of their range, where they did not begin."""
+    """Return the parameters of the equations that were fitted to a bound."""
     prepared = fit.model.prepared
     if not isinstance(prepared, PreparedDynamics):
         return ()
@@ -66,35 +72,35 @@ def at_ends(fit: FittedModel) -> tuple[str, ...]:
 
 
 def wrong_turns(prepared: PreparedSimulation) -> str:
-    """What is wrong with the recorded turns that a sensor is compared by; empty where nothing is."""
+    """Return the fault of the recorded rotation; empty without a fault."""
     return getattr(prepared, "wrong_turns", "")
 
 
 def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> tuple[str, ...]:
-    """Sentences, the most likely reason first.
+    """Return the reasons in sentences, the most likely first.
 
     Args:
-        fits: of the simulation alone: the one that predicts best from sample to sample, and its free run if any.
-        follows: how it follows each output.
+        fits: of the simulation without findings: the best one-step predictor, and its open-loop fit if any.
+        follows: goodness of fit of each output.
     """
     prepared = fits[0].model.prepared
     if turns := wrong_turns(prepared):
         return (turns,)
     if not isinstance(prepared, PreparedDynamics):
-        return ("Look at signs, units and the order of columns: what is compared may be another quantity.",)
+        return ("Check signs, units and the order of columns: they may be of another quantity.",)
     prepared = prepared.observed(None)
     sentences = _of_trials(prepared, fits, follows)
     ends = at_ends(fits[0])
     sentences += [
-        f"The fit drives `{name}` to the end of its range, {_value(fits[0], prepared, name):.4g}: the recording asks "
-        "for more than the range allows, often for the other sign of its term."
+        f"`{name}` is fitted to its bound, {_value(fits[0], prepared, name):.4g}: the recording needs a value beyond it, "
+        "often with the other sign."
         for name in ends
     ]
     sentences += _of_sizes(prepared, fits[-1], ends)
     if not sentences:
         sentences = [
-            "No other start, sign or delay of an input mends it: compare the recording's columns, their units and "
-            "order with what the simulation means by them, or the simulation is of another system."
+            "No other start, sign or delay of an input improves the fit: compare columns, units and order of the recording "
+            "with those of the simulation, or the simulation is of another system."
         ]
     return tuple(sentences)
 
@@ -110,39 +116,39 @@ def _of_sizes(prepared: PreparedDynamics, fit: FittedModel, ends: Sequence[str])
         if name in ends or begun == 0.0:
             continue
         if value < _NOUGHT * begun:
-            sentences.append(f"The free run follows best with `{name}` nearly 0, as if its term was not there.")
+            sentences.append(f"The open-loop fit is best with `{name}` nearly 0, without its term.")
         elif value > _AWAY * begun:
             sentences.append(
-                f"The free run follows best with `{name}` at {value / begun:.2g} times the value it began with."
+                f"The open-loop fit is best with `{name}` at {value / begun:.2g} times its start value."
             )
     return sentences
 
 
 def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> list[str]:
-    """What each trial brings, where it mends the fit; and the inputs that do not matter."""
-    now = torch.tensor([model_fit.residual for model_fit in follows], dtype=fits[0].parameters.dtype)
+    """Return sentences on trials that fix the fit, and on inputs that do not matter."""
+    now = torch.tensor([output.residual for output in follows], dtype=fits[0].parameters.dtype)
     trials = _trials(prepared)
     sizes = run_parallel([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
     sentences = []
     shares = [float((size / now).max()) if size is not None else torch.inf for size, _ in sizes]
     for number in sorted(range(len(trials)), key=shares.__getitem__):
         size, theta = sizes[number]
-        if size is not None and theta is not None and shares[number] < _MENDS:
+        if size is not None and theta is not None and shares[number] < _FIXES:
             parts = zip(follows, size.tolist(), strict=True)
-            reach = ", ".join(f"{item.output} to {value:.3g} {item.unit}".rstrip() for item, value in parts)
-            sentences.append(f"{trials[number].told(theta)} it follows {reach}.")
+            reach = ", ".join(f"{output.output} {value:.3g} {output.unit}".rstrip() for output, value in parts)
+            sentences.append(f"{trials[number].sentence(theta)} the residual is {reach}.")
     if sentences:
-        # with its sign turned round, say, an input matters that did not before
+        # an input can matter with the other sign only
         return sentences[:3]
     still = [
         (name, _size(_with_inputs(prepared, _still(prepared, number)), fits)[0])
         for number, name in enumerate(prepared.system.inputs)
     ]
-    known = [fit.output for fit in follows]
+    known = [output.output for output in follows]
     for name, size in still:
         if size is not None and bool((size <= now / _MATTERS).all()):
             sentences.append(
-                f"`{name}` does not matter: held at its mean the simulation follows {', '.join(known)} as well."
+                f"`{name}` does not matter: held at its mean, the simulation fits {', '.join(known)} equally well."
             )
     return sentences[:3]
 
@@ -161,19 +167,19 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
             for k, name in enumerate(names)
             if not float(prepared.bounds[0][k]) <= float(theta[k]) <= float(prepared.bounds[1][k])
         ]
-        return f"With {' and '.join(turned) or 'free ranges'}, which its range forbids,"
+        return f"With {' and '.join(turned) or 'free bounds'}, which the bounds exclude,"
 
     if bool(torch.cat(prepared.bounds).isfinite().any()):
         trials.append(_Trial(of_signs, freed, thorough=True))
     for number, name in enumerate(prepared.system.inputs):
         turned = prepared.inputs_at_rows.clone()
         turned[:, number] = -turned[:, number]
-        trials.append(_Trial(_always(f"With the sign of `{name}` turned round"), _with_inputs(prepared, turned)))
+        trials.append(_Trial(_always(f"With the sign of `{name}` reversed,"), _with_inputs(prepared, turned)))
         step = float(prepared.time.diff().median())
         for lag in (lag for lag in _LAGS if lag < len(prepared.time) // 10):
             late = prepared.inputs_at_rows.clone()
             late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
-            text = f"With `{name}` late by {lag * step:.3g} s"
+            text = f"With `{name}` delayed by {lag * step:.3g} s,"
             trials.append(_Trial(_always(text), _with_inputs(prepared, late)))
     return trials
 
@@ -197,14 +203,14 @@ def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "N u"]) -> Pr
 def _size(
     prepared: PreparedDynamics, fits: Sequence[FittedModel], *, thorough: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
-    """The smallest residual of a changed simulation from a few starts, and its parameters."""
+    """Return the smallest residual of a changed simulation over a few starts, and its parameters."""
     starts = [fits[0].parameters[: len(prepared.parameter_names)]]
     if thorough:
         ends, begun = at_ends(fits[0]), prepared.given.clone()
         for number, name in enumerate(prepared.known):
             begun[number] = -begun[number] if name in ends else begun[number]
-        found = [multiple_shooting_start(prepared, element) for element in (prepared.given, begun)]
-        starts = [item for item in found if item is not None] or starts
+        found = [multiple_shooting_start(prepared, start) for start in (prepared.given, begun)]
+        starts = [start for start in found if start is not None] or starts
     best: tuple[Tensor | None, Tensor | None] = None, None
     for start in starts:
         try:

@@ -1,4 +1,4 @@
-"""What is told of each of several recordings: its runs, and the offsets of its outputs."""
+"""Runs and offsets of several recordings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["offsets_of", "runs_of"]
 
 
 def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]:
-    """The offsets of each output in each recording; none of an output that no recording has a fitted one of.
+    """Return the offsets of each output in each recording, for outputs with a fitted offset.
 
     Args:
         final: the fit with all findings.
@@ -26,7 +26,7 @@ def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]
     own: tuple[OwnOffset, ...] = getattr(prepared, "own_offsets", ())
     units, error = dict(zip(prepared.channels, units_of(prepared), strict=True)), final.standard_error
     row = {name: k for k, name in enumerate(prepared.parameter_names)}
-    fitted = {(one.output, one.recording): row[one.name] for one in own}
+    fitted = {(offset.output, offset.recording): row[offset.name] for offset in own}
     sentences = []
     for output in dict.fromkeys(offset.output for offset in own):
         for number, name in enumerate(names):
@@ -39,12 +39,12 @@ def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]
 
 
 def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence[int]) -> tuple[Run, ...]:
-    """The runs that findings give shares of, in their order; none of a single one, or where runs are not known.
+    """Return the runs, in the order of a finding's shares; empty for a single run or unknown runs.
 
     Args:
         prepared: the simulation.
-        names: of the recordings; none for a single one.
-        counts: how many runs each recording holds; none for a single one.
+        names: of the recordings; empty for a single recording.
+        counts: number of runs per recording; empty for a single recording.
     """
     if not isinstance(prepared, PreparedDynamics) or int(prepared.run.max()) < 1:
         return ()
@@ -56,4 +56,4 @@ def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence
         for run in range(count)
     ]
     first = (prepared.run.diff(prepend=prepared.run[:1] - 1) != 0).nonzero().flatten()
-    return tuple(each[int(item)] for item in prepared.recording["experiment"][first])
+    return tuple(each[int(number)] for number in prepared.recording["experiment"][first])

@@ -1,8 +1,8 @@
-"""Where in the space of a simulation's states, and in which of its runs, a finding's gain arises.
+"""Attribution of a finding's gain to states and runs.
 
-The gain of an effect is the integral of the likelihood's slope along the way from nothing to its size, and the slope is
-a sum over the moments at which the effect acts: integrated gradients (Sundararajan, Taly & Yan, ICML 2017), through the
-simulation. What is summed belongs to a moment's states, though the outputs show it later.
+The gain of an effect is the integral of the likelihood's gradient from amplitude 0 to its amplitude, and the gradient is
+a sum over the times at which the effect acts: integrated gradients (Sundararajan, Taly & Yan, ICML 2017), through the
+simulation. Each term belongs to the states at its time, although the outputs show it later.
 """
 
 from __future__ import annotations
@@ -25,36 +25,37 @@ if TYPE_CHECKING:
 __all__ = ["Attribution", "attributed", "map_of", "region_of", "shares_of_runs"]
 
 _NODES = 8
-"""Sizes between none and its own at which an effect's slope is taken: nodes of Gauss's rule, close together near its
-own size, as the slope is far in the tail of the density at all smaller ones."""
+"""Gauss-Legendre nodes of the integral over the amplitude, denser near the full amplitude."""
 
 _TIMES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-"""Shares of the time that a region may hold."""
+"""Candidate shares of time of a region."""
 
 _CLEARLY = 0.3
-"""What the share of the gain in a region has to exceed its share of the time by to be told."""
+"""Minimum excess of a region's share of gain over its share of time."""
 
-_MOST, _SLICES = 1.25, 20
-"""Where more is gained than this share of the gain, and lost elsewhere, it says nothing of where the gain arises; and
-the slices of a state's range that are asked."""
+_MOST = 1.25
+"""Sum of positive gains, in shares of the total, above which gains and losses do not localise the effect."""
+
+_SLICES = 20
+"""Number of slices of a state's range."""
 
 _BINS = 24
-"""Cells of a map along either state."""
+"""Cells of a map along each state."""
 
 _REVERSES = 0.05
-"""Share of the time that a state has to have either sign for to be near zero, or far from it."""
+"""Minimum share of time of each sign for the regions "near zero" and "far from zero"."""
 
 
 @dataclass(frozen=True)
 class Attribution:
-    """The gain of an effect, moment by moment.
+    """Gain of an effect at each time.
 
     Attributes:
-        nats: (G,), of each moment at the port; their sum is the gain.
-        places: by name, the components of the signal that passes the port, (G,) each.
-        units: of these, where they are known.
-        parts: what some of them are to each other, such as ``{"own": "speed", "position": "angle"}``.
-        run: (G,), number of each moment's run; None where there are no runs.
+        nats: (G,), gain at each time of the port; the sum is the total gain.
+        places: components of the port's signal by name, (G,) each.
+        units: of the components, if known.
+        parts: roles of components, such as ``{"own": "speed", "position": "angle"}``.
+        run: (G,), run number at each time; None without runs.
     """
 
     nats: Float[Tensor, " G"]
@@ -65,15 +66,14 @@ class Attribution:
 
 
 def attributed(fit: FittedModel, number: int) -> Attribution | None:
-    """The gain of one effect of a model, the rest of its parameters held.
+    """Attribute the gain of an effect, with all other parameters fixed.
 
     Args:
         fit: the model.
         number: of the effect among its terms.
 
     Returns:
-        The attribution; None for a port of which it is not known what its components are to each other, and where the
-        simulation has no answer without the effect.
+        The attribution; None for a port without component roles, and if the simulation diverges without the effect.
     """
     model, term = fit.model, fit.model.terms[number]
     prepared, port = model.prepared, model.prepared.ports[term.port]
@@ -86,7 +86,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     signal = model.signals(fit.parameters)[term.port].detach()
     nats = torch.zeros_like(signal[:, 0])
-    less = 0.5 * (nodes + 1.0)  # its square is what is left off the size
+    less = 0.5 * (nodes + 1.0)  # the square is 1 minus the relative amplitude
     for node, weight in zip(1.0 - less**2, less * weights, strict=True):
         parameters = fit.parameters.clone()
         parameters[mine] = node * gamma
@@ -102,7 +102,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
         return None
     names = port.carries or port.channels
     units = {name: port.part_units[part] for part, name in port.parts.items() if port.part_units.get(part)}
-    # where a rate is large is not where a system is
+    # a rate is not a state
     places = {
         name: course for name, course in zip(names, signal.unbind(-1), strict=False) if name != port.parts.get("rate")
     }
@@ -110,7 +110,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
 
 
 def region_of(found: Attribution) -> Region | None:
-    """The part of one state's range whose share of the gain exceeds its share of the time most; None if not clearly."""
+    """Return the part of a state's range with the largest excess of gain over time; None without a clear excess."""
     whole = float(found.nats.sum())
     if not whole > 0.0:
         return None
@@ -130,12 +130,12 @@ def region_of(found: Attribution) -> Region | None:
 
 
 def _gained(nats: Float[Tensor, " G"], values: Float[Tensor, " G"]) -> float:
-    """Sum over those slices of a state's range that gain; slices of as many moments each."""
+    """Return the sum of positive gains over slices of a state's range with equal numbers of samples."""
     return sum(max(float(part.sum()), 0.0) for part in nats[values.argsort()].chunk(_SLICES))
 
 
 def _parts_of(values: Float[Tensor, " G"]) -> Iterator[tuple[str, float, Bool[Tensor, " G"]]]:
-    """Ends of the range, and where values of either sign occur, its middle and what is far from it."""
+    """Yield regions at the ends of the range and, with values of both signs, near and far from zero."""
     if float(values.max()) == float(values.min()):
         return
     shares = values.new_tensor(_TIMES)
@@ -150,7 +150,7 @@ def _parts_of(values: Float[Tensor, " G"]) -> Iterator[tuple[str, float, Bool[Te
 
 
 def shares_of_runs(found: Attribution) -> tuple[float, ...]:
-    """Each run's share of the gain; empty for a single one, and where some lose what others gain."""
+    """Return each run's share of the gain; empty for a single run, and if runs have opposite gains."""
     if found.run is None or not float(found.nats.sum()) > 0.0:
         return ()
     count = int(found.run.max()) + 1
@@ -162,7 +162,7 @@ def shares_of_runs(found: Attribution) -> tuple[float, ...]:
 
 
 def map_of(found: Attribution) -> StateMap | None:
-    """The gain over the position and its speed, or over the two components that an effect refers to; None for one."""
+    """Return the gain over position and speed, or over two components of the effect; None for a single component."""
     order = [found.parts[part] for part in ("position", "own", "other", "sideways") if part in found.parts]
     names = list(dict.fromkeys(name for name in (*order, *found.places) if name in found.places))
     names = [name for name in names if float(found.places[name].max()) > float(found.places[name].min())][:2]
@@ -173,7 +173,7 @@ def map_of(found: Attribution) -> StateMap | None:
     across, up = (torch.bucketize(v.contiguous(), e[1:-1].contiguous()) for v, e in zip((x, y), edges, strict=True))
     cell = across * _BINS + up
     zero = found.nats.new_zeros(_BINS * _BINS)
-    moments = zero.index_add(0, cell, torch.ones_like(found.nats))
+    count = zero.index_add(0, cell, torch.ones_like(found.nats))
     nats = zero.index_add(0, cell, found.nats)
-    nats = torch.where(moments > 0, nats, torch.nan).reshape(_BINS, _BINS)
+    nats = torch.where(count > 0, nats, torch.nan).reshape(_BINS, _BINS)
     return StateMap((names[0], names[1]), tuple(found.units.get(n, "") for n in names), (edges[0], edges[1]), nats)

@@ -1,4 +1,4 @@
-"""How well candidates can be told apart on a recording, whatever is found in it."""
+"""Separability of the candidates on a recording."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mkc_torch.diagnosis.search.run import SearchResult
 __all__ = ["separability"]
 
 _MOST = 8
-"""Candidates in the matrix, the leading ones."""
+"""Largest number of candidates in the matrix."""
 
 
 def separability(located: SearchResult) -> Separability:
-    """The matrix of the leading candidates, each at its best shape, in the metric of the noise.
+    """Return the separability of the leading candidates at their best shapes, in the metric of the noise.
 
-    The trace of a candidate is its tangent along the γ that fits best. Its share is the squared length that is left
-    once the simulation's own parameters, and then the rival, have taken over what they can, over that before the rival.
+    The trace of a candidate is its tangent along the best γ, orthogonal to the simulation's parameters. The share is the
+    squared norm that remains after projection on the rival, relative to the norm before.
     """
     numbers = [ranked.number for ranked in located.ranking[:_MOST]]
     traces, spaces, left = [], [], []

@@ -1,4 +1,4 @@
-"""Whether the shape that a name claims is the recording's: a free curve of the same variables in the name's place."""
+"""Test of an effect's shape against a free curve of the same variables."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ __all__ = ["nearest_power", "shape_of"]
 
 _POWERS = torch.arange(0.0, 4.001, 0.02, dtype=torch.float64)
 _POINTS = 60
-"""Points of a curve."""
+"""Number of points of a curve."""
 
 _NORMAL_95 = 1.96
-"""Standard errors to either side that a 95 % interval reaches."""
+"""Half-width of a 95 % interval in standard errors."""
 
 
 def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> ShapeCheck | None:
-    """Of one effect of a fit; None where the name claims no shape that a curve could be set against.
+    """Test the shape of an effect; None without a comparable curve.
 
     Args:
         fit: with all effects.
         number: of the effect.
-        terms: all candidates, curves among them.
-        settings: when a curve is clearly better.
+        terms: all candidates, including curves.
+        settings: thresholds.
     """
     term = fit.model.terms[number]
     curves = _curves(term, terms, fit)
     if term.effect.is_curve or not curves:
         return None
     found = run_parallel([partial(_instead, fit, number, curve) for curve in curves], fit.model.prepared, curves)
-    fits = [item for item in found if item is not None]
+    fits = [result for result in found if result is not None]
     if not fits:
         return None
-    best = max(fits, key=lambda one: one.log_likelihood - schwarz(one) * one.model.sizes[number])
+    best = max(fits, key=lambda curve_fit: curve_fit.log_likelihood - schwarz(curve_fit) * curve_fit.model.sizes[number])
     gain = best.log_likelihood - fit.log_likelihood
     more = max(
         best.model.sizes[number] - fit.model.sizes[number] - len({*continuous(term), *term.effect.fitted_shape}), 1
@@ -63,7 +63,7 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
 
 
 def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
-    """Curves at the rate that a named effect acts on."""
+    """Return the curves at the port of an effect."""
     channels = fit.model.prepared.ports[term.port].channels
     found: dict[tuple[str, str], Term] = {}
     for other_term in terms:
@@ -74,7 +74,7 @@ def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
 
 
 def _instead(fit: FittedModel, number: int, curve: Term) -> FittedModel | None:
-    """The fit with a curve in the place of a named effect."""
+    """Refit with a curve in place of a named effect; None if the fit fails."""
     model = fit.model
     terms = (*model.terms[:number], curve, *model.terms[number + 1 :])
     joint = JointModel(model.prepared, terms, model.near)
@@ -88,7 +88,7 @@ def _instead(fit: FittedModel, number: int, curve: Term) -> FittedModel | None:
 
 
 def curve_of(fit: FittedModel, number: int) -> Curve:
-    """An effect's change of its rate over the range that was visited, with its 95 % band."""
+    """Return an effect's change of a rate over the visited range, with its 95 % band."""
     model, term = fit.model, fit.model.terms[number]
     prepared, port = model.prepared, model.prepared.ports[term.port]
     signal = model.signals(fit.parameters)[term.port].detach()
@@ -109,7 +109,7 @@ def curve_of(fit: FittedModel, number: int) -> Curve:
 
 
 def _covariance(fit: FittedModel) -> Float[Tensor, "p p"]:
-    """Of the parameters, noise taken for white: they are fitted under the pushes that are left."""
+    """Return the covariance of the parameters for white noise."""
     tangents = torch.func.jacfwd(fit.model.around(fit.parameters).residual)(fit.parameters)
     weighted = (fit.weights / fit.d.square()).unsqueeze(-1) * tangents
     gram = torch.einsum("nmp,nmq->pq", weighted, tangents)
@@ -118,7 +118,7 @@ def _covariance(fit: FittedModel) -> Float[Tensor, "p p"]:
 
 
 def nearest_power(curve: Curve) -> str:
-    """The power law that is nearest to a curve, beside a line and a constant that the simulation may have; as text."""
+    """Return the power law nearest to a curve, in addition to a line and a constant, as text."""
     x, y = curve.x, curve.value[:, 0]
     if not bool(y.isfinite().all()):
         return ""
@@ -135,4 +135,4 @@ def nearest_power(curve: Curve) -> str:
             best = left, power, float(solution[0, 0] / size[0])
     if best is None or not math.isfinite(best[2]):
         return ""
-    return f"{best[2]:.3g} |{curve.driver}|^{best[1]:.2g} sign({curve.driver}), beside a straight line"
+    return f"{best[2]:.3g} |{curve.driver}|^{best[1]:.2g} sign({curve.driver}) plus a straight line"

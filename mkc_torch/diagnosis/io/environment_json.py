@@ -23,7 +23,7 @@ _TIME_DIGITS = 6
 """Decimals of a time in s."""
 
 
-def goodness_of_fit_json(world: NoiseEnvironment) -> dict[str, Any]:
+def goodness_of_fit_json(environment: NoiseEnvironment) -> dict[str, Any]:
     """Return the goodness of fit of each output, by its name.
 
     Example:
@@ -43,21 +43,21 @@ def goodness_of_fit_json(world: NoiseEnvironment) -> dict[str, Any]:
             "rmse_of_mean": _finite(fit.rmse_of_mean),
             "rmse_of_last_value": _finite(fit.rmse_of_last_value),
         }
-        for fit in world.goodness_of_fit
+        for fit in environment.goodness_of_fit
     }
 
 
-def noise_json(world: NoiseEnvironment) -> dict[str, Any]:
+def noise_json(environment: NoiseEnvironment) -> dict[str, Any]:
     """Return the process noise of states, the drift of outputs, and the input hold: the rest of the key "noise"."""
     return {
-        "process": _by_place(process for process in world.process_noise if process.at_rate),
-        "sensor": _by_place(process for process in world.process_noise if not process.at_rate),
-        "input_hold": dict(world.input_hold),
+        "process": _by_place(process for process in environment.process_noise if process.at_rate),
+        "sensor": _by_place(process for process in environment.process_noise if not process.at_rate),
+        "input_hold": dict(environment.input_hold),
     }
 
 
 def _by_place(processes: Iterable[ProcessNoise]) -> dict[str, Any]:
-    """Return the strongest process of each state or output, with the weaker ones under "besides"."""
+    """Return the strongest process of each state or output, with the weaker ones under "weaker"."""
     found: dict[str, Any] = {}
     for process in processes:
         content = {
@@ -68,13 +68,13 @@ def _by_place(processes: Iterable[ProcessNoise]) -> dict[str, Any]:
             "log_likelihood_gain": _finite(process.log_likelihood_gain),
         }
         if process.place in found:
-            found[process.place].setdefault("besides", []).append(content)
+            found[process.place].setdefault("weaker", []).append(content)
         else:
             found[process.place] = content
     return found
 
 
-def recordings_json(world: NoiseEnvironment) -> dict[str, Any]:
+def recordings_json(environment: NoiseEnvironment) -> dict[str, Any]:
     """Return the keys "runs" and "offsets" of several recordings; a key without entries is absent.
 
     Example:
@@ -82,14 +82,14 @@ def recordings_json(world: NoiseEnvironment) -> dict[str, Any]:
         >>> recordings_json(NoiseEnvironment(offsets=(Offset("speed", "m/s", 2, "b.csv", -0.2, 0.001),)))
         {'offsets': [{'output': 'speed', 'unit': 'm/s', 'recording': 2, 'name': 'b.csv', 'value': -0.2, ...}]}
     """
-    offsets = [{**asdict(offset), "standard_error": _finite(offset.standard_error)} for offset in world.offsets]
-    runs = [asdict(run) for run in world.runs]
+    offsets = [{**asdict(offset), "standard_error": _finite(offset.standard_error)} for offset in environment.offsets]
+    runs = [asdict(run) for run in environment.runs]
     return {**({"runs": runs} if runs else {}), **({"offsets": offsets} if offsets else {})}
 
 
-def disturbance_json(world: NoiseEnvironment) -> list[dict[str, Any]]:
+def disturbance_json(environment: NoiseEnvironment) -> list[dict[str, Any]]:
     """Return each estimated disturbance; a long recording is thinned evenly."""
-    return [_course(estimate) for estimate in world.disturbance]
+    return [_course(estimate) for estimate in environment.disturbance]
 
 
 def _course(estimate: DisturbanceEstimate) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A simulation's model with the findings in it: a module, its file model.json, and the correction of new recordings."""
+"""Simulation with findings: a module, its file model.json, and the correction of new recordings."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ SCHEMA = "mkc-model/1"
 
 
 class ModelFileError(ValueError):
-    """A text that is no model; the sentence says why."""
+    """Text that is not a valid model.json."""
 
 
 class DiagnosedModel(CorrectingModel):
-    """What a diagnosis found, ready for other recordings of the same sensor or system.
+    """Simulation with the findings of a diagnosis, for other recordings of the same sensor or system.
 
     Args:
         simulation: its name.
@@ -49,11 +49,11 @@ class DiagnosedModel(CorrectingModel):
         parameters: the simulation's own, (p,).
         terms: the effects, each with its driver's columns, their reference and units, and its shape.
         gammas: their γ.
-        source: a simulation of the user's own, which files do not hold.
+        source: the user's simulation, which files do not contain.
 
     Attributes:
         theta: the simulation's parameters.
-        gammas: a parameter list, one γ an effect.
+        gammas: a parameter list, one γ per effect.
 
     Example:
         >>> from mkc_torch import diagnose
@@ -84,13 +84,13 @@ class DiagnosedModel(CorrectingModel):
         self.source = source
 
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
-        """The corrected signal of a recording, row by row, and sentences about effects that do not carry over.
+        """Return the corrected signal of a recording (N,), and notes on effects that do not transfer.
 
-        Of an effect that is bound to the time of the diagnosed recording what is left at its end is taken off, such as
-        the offset after the last step; one that is bound to its place is left out.
+        Of an effect that depends on the time of the diagnosed recording, its final value is subtracted, such as the
+        offset after the last step; an effect that depends on its location is omitted.
 
         Raises:
-            MissingColumnError: a column of the simulation, or an effect's driver, is not there.
+            MissingColumnError: a column of the simulation, or an effect's driver, is missing.
         """
         correction = correction_of(self.simulation, self.state, recording, self.source)
         changes: dict[str, Change] = {}
@@ -99,20 +99,20 @@ class DiagnosedModel(CorrectingModel):
             term, gamma = self.terms[number], self.gammas[number]
             port = term.port
             if port not in correction.ports:
-                notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
+                notes.append(f"{term.effect.id} depends on the location of the diagnosed recording and is left out.")
                 continue
             series = correction.ports[port].in_series(port)
             change = self._change(term, gamma, correction, recording)
             changes[port] = summed(changes.get(port), change, series=series)
             if term.effect.persistent_change:
                 notes.append(
-                    f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken "
-                    "off all of this one."
+                    f"{term.effect.id} depends on the time of the diagnosed recording: its final offset is subtracted "
+                    "from all samples."
                 )
         return correction.corrected(self.theta, changes), tuple(notes)
 
     def forward(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
-        """The corrected signal alone, see :meth:`correct`."""
+        """Return the corrected signal, see :meth:`correct`."""
         return self.correct(recording)[0]
 
     def _change(self, term: Term, gamma: Tensor, correction: Correction, recording: Recording) -> Change:
@@ -126,7 +126,7 @@ class DiagnosedModel(CorrectingModel):
         return change
 
     def to_json(self) -> str:
-        """The model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
+        """Return the model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
         terms = [
             {
                 "effect": term.effect.id,
@@ -151,24 +151,22 @@ class DiagnosedModel(CorrectingModel):
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
     def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
-        """The simulation with what was found as Python: a class derived from the diagnosed one.
+        """Return Python source of a class derived from the diagnosed class, with the findings.
 
-        Its parameters have the fitted values, and each effect is a line of torch, so that a person can read, keep and
-        change it. It is a :class:`mkc_torch.simulation.Dynamics` like the one it comes from, without the first states
-        of the recording. Numbers are written to nine digits.
+        Its parameters have the fitted values, and each effect is a line of torch. It is a
+        :class:`mkc_torch.simulation.Dynamics` without the initial states of the recording. Numbers have nine digits.
 
         Args:
-            module: to import the diagnosed class from; default the one it was defined in.
-            folder: where the text will be written: a class that was loaded from a file is then loaded from it again,
-                by the way from there.
+            module: to import the diagnosed class from; default its defining module.
+            folder: of the written file: a class that was loaded from a file is loaded by its path relative to it.
 
         Raises:
-            SourceError: no differential equations, or an effect that has no line of its own.
+            SourceError: the simulation has no differential equations, or an effect has no source code.
         """
         system = self.source
         if not isinstance(system, Dynamics):
             raise SourceError(
-                f'Only differential equations are written out as Python, but the model is of "{self.simulation}"'
+                f'Only differential equations can be exported as Python, but the model is of "{self.simulation}"'
                 f"{'' if system else '; give its simulation with `simulation=`'}."
             )
         measured = tuple(map(str, self.state.get("outputs", system.outputs or system.states)))
@@ -178,15 +176,15 @@ class DiagnosedModel(CorrectingModel):
     def from_json(
         text: str, effects: Sequence[Effect] = CATALOGUE, simulation: Simulation | None = None
     ) -> DiagnosedModel:
-        """The model of a JSON text.
+        """Read a model from JSON.
 
         Args:
             text: of model.json.
-            effects: where the effects are looked up by their id; a user's own go in here too.
-            simulation: the user's own that was diagnosed; None for one of the package's.
+            effects: catalogue in which effects are looked up by id; add the user's effects.
+            simulation: the diagnosed simulation of the user; None for a simulation of the package.
 
         Raises:
-            ModelFileError: not JSON, of another schema, an effect that is not known, or a value of the wrong kind.
+            ModelFileError: not JSON, another schema, an unknown effect, or a value of the wrong type.
 
         Example:
             >>> DiagnosedModel.from_json("{}")
@@ -210,7 +208,7 @@ class DiagnosedModel(CorrectingModel):
 
 
 def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
-    """The model of a final fit."""
+    """Return the model of a final fit."""
     model = final.fit.model
     signals = model.signals(final.fit.parameters)
     terms = []
@@ -218,7 +216,7 @@ def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
     parameters = final.fit.parameters
-    of_recordings = {item.name for item in getattr(model.prepared, "own_offsets", ())}
+    of_recordings = {offset.name for offset in getattr(model.prepared, "own_offsets", ())}
     own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(
         model.prepared.name,
@@ -254,22 +252,22 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
 
 
 def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
-    """The one of that id; of several forms, that with these numbers in its shape."""
+    """Return the effect of an id; of several forms, the form with these shape parameters."""
     if entry["effect"] == Unrecorded.id and any(name.startswith(COURSE) for name in entry["shape"]):
         return Unrecorded()
     same = [effect for effect in reversed(known) if effect.id == entry["effect"]]
     if not same:
         names = ", ".join(dict.fromkeys(effect.id for effect in known))
         raise ModelFileError(
-            f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {names}).'
+            f'its effect "{entry["effect"]}" is unknown; register it with `effects=` (known: {names}).'
         )
     numbers = set(entry["shape"])
-    of_shape = [one for one in same if set(one.relative) <= numbers]
+    of_shape = [effect for effect in same if set(effect.relative) <= numbers]
 
-    def fitting(one: Effect) -> tuple[int, int, int, bool]:
-        own, at = {*one.fitted_shape, *one.relative}, str(entry.get("port", "")).partition(" ")[0]
-        choices = set(one.form_parameters)
-        return -len(choices - numbers), len(choices & numbers), len(own & numbers), one.port == at
+    def fitting(form: Effect) -> tuple[int, int, int, bool]:
+        own, at = {*form.fitted_shape, *form.relative}, str(entry.get("port", "")).partition(" ")[0]
+        choices = set(form.form_parameters)
+        return -len(choices - numbers), len(choices & numbers), len(own & numbers), form.port == at
 
     effect = max(of_shape or same, key=fitting)
     lost = sorted({*effect.fitted_shape, *effect.relative} - numbers)
@@ -307,9 +305,9 @@ def _context(term: Term, correction: Correction, recording: Recording) -> Contex
 
 
 def missing_driver(column: str, effect: str) -> MissingColumnError:
-    """The error for a recording without an effect's driver."""
+    """Return the error for a recording without an effect's driver."""
     return MissingColumnError(
-        f"The model corrects {effect} by the column `{column}`, which the recording does not have; "
+        f"The model corrects {effect} by the column `{column}`, which the recording lacks; "
         f"rename it with `--columns {column}=NAME`, or record it."
     )
 
@@ -317,16 +315,16 @@ def missing_driver(column: str, effect: str) -> MissingColumnError:
 def correction_of(
     name: str, state: Mapping[str, Any], recording: Recording, simulation: Simulation | None = None
 ) -> Correction:
-    """How a simulation corrects a recording.
+    """Return the correction of a recording by a simulation.
 
     Args:
         name: of the simulation.
-        state: of the one that was fitted.
+        state: of the fitted simulation.
         recording: to correct.
-        simulation: a user's own.
+        simulation: of the user.
 
     Raises:
-        ValueError: no simulation of this name corrects recordings, or the one that is given has another.
+        ValueError: no simulation of this name corrects recordings, or the given simulation has another name.
         MissingColumnError: the recording lacks a column.
     """
     refuse_unknown(name, simulation)
@@ -339,14 +337,14 @@ def correction_of(
 
 
 def refuse_unknown(name: str, simulation: Simulation | None) -> None:
-    """Refuses a model whose simulation is not at hand: a file of a model never says what code is run.
+    """Raise an error unless the model's simulation is given; a model file never selects code to run.
 
     Args:
         name: of the model's simulation.
-        simulation: what was given.
+        simulation: the given simulation.
 
     Raises:
-        ValueError: nothing was given for a simulation of the user's own, or another one.
+        ValueError: the user's simulation is not given, or another simulation is given.
 
     Example:
         >>> refuse_unknown("Pendulum", None)

@@ -1,4 +1,4 @@
-"""A simulation with what it lacked as Python that a person can read and keep."""
+"""Export of a simulation with its findings as Python source."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _FROM_HERE: Mapping[str, str] = {
 
 
 class SourceError(ValueError):
-    """A model that cannot be written out; the sentence says why."""
+    """The model cannot be exported as Python."""
 
 
 def python_source(
@@ -53,15 +53,15 @@ def python_source(
     module: str | None = None,
     folder: Path | None = None,
 ) -> str:
-    """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`.
+    """Return the source of a module with a class derived from the diagnosed class, see :meth:`DiagnosedModel.to_python`.
 
     Args:
-        system: the diagnosed one.
-        theta: its parameters, then the first states; these are left out, but for guesses of internal states.
+        system: the diagnosed simulation.
+        theta: its parameters, then the initial states, which only give guesses of internal states.
         terms, gammas: the effects.
-        measured: the outputs that were compared.
+        measured: names of the measured outputs.
         module: to import the diagnosed class from.
-        folder: where the text will be, if that is known.
+        folder: of the written file, if known.
     """
     kind = type(system)
     rates: list[str] = []
@@ -70,15 +70,15 @@ def python_source(
     outputs: list[str] = []
     for number in in_order_of_the_chain(terms, range(len(terms))):
         term, gamma = terms[number], gammas[number]
-        lines = _lines(term, [_rounded(float(item)) for item in gamma], system, measured)
+        lines = _lines(term, [_rounded(float(value)) for value in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         if place is outputs and outputs:
-            place.append("y = dict(shown)")  # the next one acts on what this one shows
+            place.append("y = dict(shown)")  # the next effect acts on these outputs
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
     label = ", ".join(term.effect.display_name for term in terms) or "nothing more"
     body = [
         f"class Corrected{kind.__name__}({kind.__name__}):",
-        f'    """{kind.__name__} with the parameters that a recording gave it, and {label}."""',
+        f'    """{kind.__name__} with fitted parameters, and {label}."""',
         "",
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
@@ -91,7 +91,7 @@ def python_source(
     text = "\n".join(body)
     loaded = None if module else _loaded(kind, folder)
     base = loaded or f"from {module or kind.__module__.removeprefix('_simulation_')} import {kind.__name__}"
-    # in the order of standard library, torch, the package, the user's own file
+    # order of imports: standard library, torch, this package, the user's file
     used = [line for name, line in _FROM_HERE.items() if name in text]
     first = [line for line in used if "mkc_torch" not in line]
     own = sorted([line for line in used if "mkc_torch" in line] + [_of_class(loaded)] * bool(loaded))
@@ -99,7 +99,7 @@ def python_source(
     groups = [first, [*torch, *own], [base]]
     imports = "\n\n".join("\n".join(group) for group in groups if group)
     return (
-        f'"""{kind.__name__}, corrected by what `mkc diagnose` found; every number is of that recording."""\n\n'
+        f'"""{kind.__name__}, with the findings of `mkc diagnose`; all numbers were fitted to its recording."""\n\n'
         f"{imports}\n\n\n{text}\n"
     )
 
@@ -109,9 +109,9 @@ def _of_class(line: str | None) -> str:
 
 
 def _loaded(kind: type, folder: Path | None) -> str | None:
-    """A line that loads a class from its own file, by the way from a folder; None where there is no such file or way.
+    """Return a line that loads a class from its file, by a relative path; None without such a file or path.
 
-    A way within one tree says nothing of the machine, and both can be moved together.
+    With a relative path, both files can be moved together.
     """
     fmu = kind.evaluation.description.path if is_of_an_fmu(kind) else None
     file = fmu or file_of(kind)
@@ -146,7 +146,7 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
 
 
 def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float]) -> list[str]:
-    """The states with the internal ones that effects bring; one that begins like another state begins about there."""
+    """Return the lines of states with the effects' internal states, and guesses of their initial values."""
     base, first = type(system).__name__, theta[len(system.parameters) :]
     guesses: dict[str, float] = {}
     for name, like in memories.items():
@@ -188,17 +188,17 @@ def _sensed(outputs: list[str]) -> list[str]:
 
 
 def _memories(term: Term) -> dict[str, str]:
-    """The internal states that an effect brings, and the state that each begins like; empty for 0."""
+    """Return an effect's internal states, each with the state that gives its initial value; empty for 0."""
     kind, _, state = term.port.rpartition(" of ")
     return memory_at(kind, state)
 
 
 def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
-    """Assignments that add an effect to what it acts on."""
+    """Return assignments that add an effect at its port."""
     if term.driver is not None or not term.effect.has_code:
         raise SourceError(
-            f"{term.effect.id} cannot be written out as Python: "
-            + ("it is driven by a recorded column." if term.driver else "it has no `code` method.")
+            f"{term.effect.id} cannot be exported as Python: "
+            + ("its driver is a recorded column." if term.driver else "it has no `code` method.")
         )
     shape = {name: _rounded(value) for name, value in term.shape.items()}
     before: list[str] = []
@@ -209,9 +209,9 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         names = _parts(state, system) | _numbered([f"x.{name}" for name in memories])
         before = _load(state) if term.port.startswith("loaded") else []
     elif term.port.startswith("exchange of "):
-        one, _, other = term.port.removeprefix("exchange of ").partition(" and ")
-        targets = [f'rates["{one}"]', f'rates["{other}"]']
-        names = {"own": f"x.{one}", "other": f"x.{other}"}
+        first, _, other = term.port.removeprefix("exchange of ").partition(" and ")
+        targets = [f'rates["{first}"]', f'rates["{other}"]']
+        names = {"own": f"x.{first}", "other": f"x.{other}"}
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
         targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
@@ -227,7 +227,7 @@ def _signed(expression: str) -> str:
 
 
 def _parts(state: str, system: Dynamics) -> dict[str, str]:
-    """Expressions of what an effect on the rate of a state refers to."""
+    """Return expressions of the quantities that an effect on a rate uses."""
     known = {name: parameter if isinstance(parameter, Parameter) else Parameter(parameter) for name, parameter in system.parameters.items()}
     position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
     zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
@@ -242,15 +242,15 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
 
 
 def _numbered(memories: Sequence[str]) -> dict[str, str]:
-    """Expressions of internal states: memory, memory_2 and so on."""
+    """Return expressions of internal states: memory, memory_2, ..."""
     return {"memory" if k == 0 else f"memory_{k + 1}": memory for k, memory in enumerate(memories)}
 
 
 def _load(state: str) -> list[str]:
-    """Lines that compute how hard the inputs work, at this speed, against what acts at standstill without them."""
+    """Return lines that compute the load: the inputs' effect at this speed, relative to standstill without inputs."""
     return [
         f'still = SimpleNamespace(**{{**vars(x), "{state}": torch.zeros_like(x.{state})}})',
-        "idle = SimpleNamespace(**{name: torch.zeros_like(one) for name, one in vars(u).items()})",
+        "idle = SimpleNamespace(**{name: torch.zeros_like(value) for name, value in vars(u).items()})",
         f'coasting = self.plain_rates(time, x, idle, p)["{state}"]',
         f'held = self.plain_rates(time, still, idle, p)["{state}"]',
         f'load = (self.plain_rates(time, x, u, p)["{state}"] - coasting - held).abs()',

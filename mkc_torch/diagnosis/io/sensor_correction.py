@@ -1,4 +1,4 @@
-"""What a model of a magnetometer corrects, as offset, matrix and the field of a current: the form of exports."""
+"""Correction of a magnetometer model as offset, matrix and field of a current, for exports."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["sensor_correction"]
 
 
 def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
-    """The affine part of what a model corrects; what else it found is told as left out.
+    """Return the affine part of a model's correction, with notes on the effects that are left out.
 
-    Of effects that are bound to the time of the diagnosed recording the offset at its end is in the offset, as
-    :meth:`DiagnosedModel.correct` has it.
+    The offset includes the final offset of effects that depend on the time of the diagnosed recording, as in
+    :meth:`DiagnosedModel.correct`.
 
     Args:
         model: of a magnetometer.
-        name: what the sensor is called.
+        name: of the sensor.
 
     Raises:
         ExportError: the model is of another simulation.
@@ -61,7 +61,7 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
 
 
 def _kept(model: DiagnosedModel, unit: str) -> tuple[list[int], int | None, list[str]]:
-    """Numbers of the terms that are exported, that of the current among them, and what is said of all."""
+    """Return the numbers of the exported terms, the number of the current's term, and the notes."""
     ports = correction_of(model.simulation, model.state, _probe(unit, {})).ports
     kept: list[int] = []
     current: int | None = None
@@ -69,10 +69,10 @@ def _kept(model: DiagnosedModel, unit: str) -> tuple[list[int], int | None, list
     for number, term in enumerate(model.terms):
         effect = term.effect.id
         if term.port not in ports:
-            sentences.append(f"{effect} belongs to the place of the diagnosed recording and is left out.")
+            sentences.append(f"{effect} depends on the location of the diagnosed recording and is left out.")
         elif term.effect.persistent_change:
             kept.append(number)
-            sentences.append(f"{effect} is bound to the time of the diagnosed recording: its offset at the end is in.")
+            sentences.append(f"{effect} depends on the time of the diagnosed recording: its final offset is included.")
         elif current is None and _is_current(term):
             kept.append(number)
             current = number
@@ -108,7 +108,7 @@ def _why(term: Term, current_taken: bool) -> str:
 def _field_of_current(
     model: DiagnosedModel, kept: list[int], number: int, unit: str, offset: Tensor
 ) -> CurrentCoefficients:
-    """The offset at one ampere more, less that at the mean."""
+    """Return the change of the offset per ampere."""
     driver = model.terms[number].driver
     assert driver is not None
     amperes = ratio(driver.units[0], "A")
@@ -125,7 +125,7 @@ def _reduced(model: DiagnosedModel, kept: list[int]) -> DiagnosedModel:
 
 
 def _affine(model: DiagnosedModel, unit: str, raised: str | None) -> tuple[Tensor, Tensor]:
-    """Matrix and offset, of what the model itself makes of readings on the axes; one column may be raised by one."""
+    """Return matrix and offset from the model's correction of readings on the axes; ``raised`` adds 1 to a column."""
     drivers: dict[str, float] = {}
     for term in model.terms:
         if term.driver is not None:
@@ -139,7 +139,7 @@ def _affine(model: DiagnosedModel, unit: str, raised: str | None) -> tuple[Tenso
 
 
 def _probe(unit: str, drivers: dict[str, float]) -> Recording:
-    """A reading of nothing, and one of 1 along each axis."""
+    """Return readings of 0, and of 1 along each axis."""
     points = torch.cat([torch.zeros(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)])
     columns = {f"mag_{axis}": values for axis, values in zip("xyz", points.unbind(-1), strict=True)}
     units = dict.fromkeys(columns, unit)

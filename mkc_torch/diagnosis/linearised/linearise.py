@@ -264,8 +264,8 @@ def _with_own_spectrum(
         return spectrum_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
 
     # spectrum and drift can imitate each other: start without a drift, with a white spectrum, and from high frequencies
-    colours = (without_drift_first, with_drift_first, at_high_frequencies)
-    starts = shared([partial(tried, spectrum) for spectrum in colours], [slow, slow.tangents, slow.scales])
+    spectra = (without_drift_first, with_drift_first, at_high_frequencies)
+    starts = shared([partial(tried, spectrum) for spectrum in spectra], [slow, slow.tangents, slow.scales])
     best = max(starts, key=lambda found: found.evidence)
     return replace(_settled(best), others=tuple(start for start in starts if start is not best))
 

@@ -163,18 +163,15 @@ def fit_baseline(
     if free is not None:
         keep(ProcessNoiseFit(free, free, None, len(starts)))
     if free is not None and _explains(free):
-        return fit_with_process_noise(
-            _wider(free, settings), declared, settings, further_starts=starts[1:], model=model
-        )
+        return fit_with_process_noise(_wider(free, settings), declared, settings, more_starts=starts[1:], model=model)
     others = other_starts(prepared, starts[0], _OTHER_STARTS)
-    works = [
-        partial(multiple_shooting_start, prepared, start, shortest=True) for start in (prepared.given, *others.starts)
-    ]
+    guesses = (prepared.given, *others.starts)
+    works = [partial(multiple_shooting_start, prepared, guess, shortest=True) for guess in guesses]
     further = [start for start in run_parallel(works, prepared) if start is not None]
     more = [fit for fit in (free, _best_open_loop(model, [*others.starts, *further])) if fit is not None]
     free = _wider(max(more, key=lambda fit: fit.log_likelihood), settings) if more else None
     try:
-        found = fit_with_process_noise(free, declared, settings, further_starts=[*starts[1:], *further], model=model)
+        found = fit_with_process_noise(free, declared, settings, more_starts=[*starts[1:], *further], model=model)
     except NoFitError as error:
         raise NoFitError(no_first_fit(prepared, others)) from error
     return replace(found, starts=len(starts) + others.tried + len(further))
@@ -207,7 +204,7 @@ def fit_with_process_noise(
     declared: Mapping[str, float],
     settings: NoiseSettings,
     *,
-    further_starts: Sequence[Float[Tensor, " p"]] = (),
+    more_starts: Sequence[Float[Tensor, " p"]] = (),
     model: JointModel | None = None,
 ) -> ProcessNoiseFit:
     """Fit a model under its most likely noise, from its open-loop fit.
@@ -216,18 +213,18 @@ def fit_with_process_noise(
         free: the open-loop fit; None if there is none.
         declared: known standard deviations of the outputs' white noise.
         settings: of the noise.
-        further_starts: parameters that predict over short horizons, to start from as well.
+        more_starts: parameters that predict over short horizons, to start from as well.
         model: the model, if there is no open-loop fit.
     """
-    starts = 1 + len(further_starts)
+    starts = 1 + len(more_starts)
     noise = None if free is None else estimate_noise(free, declared, settings)
     if free is not None and (noise is None or noise.observer is None):
         return ProcessNoiseFit(free, free, noise, starts)
     own = model if free is None else free.model
     assert own is not None
     bound = None if free is None else free.bound
-    works = [partial(_from_short, own, start, bound, declared, settings) for start in further_starts]
-    if further_starts and isinstance(own.prepared, PreparedDynamics):
+    works = [partial(_from_short, own, start, bound, declared, settings) for start in more_starts]
+    if more_starts and isinstance(own.prepared, PreparedDynamics):
         works.append(partial(_from_given, own, own.prepared.given, bound, declared, settings))
     if free is not None and not works:
         works = [partial(_under_noise, free, noise, declared, settings)]
@@ -374,16 +371,8 @@ def _from_given(
     strong = with_strong_observer(prepared, start, _STRONG)
     if strong is None or bound is None:
         return None
-    noise = most_likely_noise(
-        strong,
-        start,
-        {},
-        None,
-        declared=declared,
-        least=settings.disturbance_gain,
-        most=settings.max_disturbances,
-        known=None,
-    )
+    least, most = settings.disturbance_gain, settings.max_disturbances
+    noise = most_likely_noise(strong, start, {}, None, declared=declared, least=least, most=most, known=None)
     if noise is None or noise.observer is None:
         return None
     try:
@@ -411,10 +400,8 @@ def choose_input_hold(
         others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [found for found in run_parallel(works, prepared) if found is not None]
-        base = max(
-            [base, *tried],
-            key=lambda found: found.fit.log_likelihood - settings.disturbance_gain * found.disturbance_count,
-        )
+        least = settings.disturbance_gain
+        base = max([base, *tried], key=lambda fits: fits.fit.log_likelihood - least * fits.disturbance_count)
     return _with_sizes(base)
 
 

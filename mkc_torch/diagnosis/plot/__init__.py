@@ -1,1 +1,1 @@
-"""What a diagnosis draws, each picture on one pair of axes; the report places the same drawings on its page."""
+"""Figures of a diagnosis, each on axes of matplotlib; the report uses the same functions."""

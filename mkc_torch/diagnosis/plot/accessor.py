@@ -1,4 +1,4 @@
-"""``diagnosis.plot``: each picture of the report on axes of matplotlib."""
+"""``diagnosis.plot``: the figures of the report on axes of matplotlib."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from mkc_torch.effects import words_of
 __all__ = ["DiagnosisPlot"]
 
 _MOST_SHOWN = 12
-"""Candidates that are drawn unless more are asked for."""
+"""Default number of candidates."""
 
 
 class DiagnosisPlot:
-    """The pictures of a diagnosis. Each method draws on ``ax``, or on a new figure of pyplot, and returns the axes.
+    """Figures of a diagnosis. Each method draws on ``ax``, or on a new figure of pyplot, and returns the axes.
 
-    Needs matplotlib, which the extra ``cli`` has. What is not there to be drawn is a ValueError that says so; axes that
-    are none a TypeError.
+    Needs matplotlib, which the extra ``cli`` installs. Raises ValueError if there is nothing to draw, and TypeError if
+    ``ax`` is not an Axes.
 
     Example:
         >>> import torch
@@ -55,34 +55,33 @@ class DiagnosisPlot:
         findings: tuple[Finding, ...],
         candidates: tuple[CandidateScore, ...],
         separability: Separability,
-        world: NoiseEnvironment,
+        environment: NoiseEnvironment,
     ) -> None:
         self._traces, self._findings, self._candidates = traces, findings, candidates
-        self._separability, self._world = separability, world
+        self._separability, self._environment = separability, environment
 
     def residual(self, channel: int | str = 0, *, corrected: bool | None = None, ax: Any = None) -> Any:
-        """Recording less simulation over time, in the unit of the output, with the findings' moments and intervals.
+        """Draw the residual over time, in the unit of the output, with onsets and intervals of the findings.
 
-        Samples in use are blue, rejected ones orange; the black line is their mean, those to either side their root
-        mean square. Of the corrected simulation the residual before stands behind, dashed. Dotted is the sensor's
-        noise floor.
+        Samples in use are blue, rejected samples orange. The black line is the mean of the samples in use, the lines on
+        both sides their RMS; dashed: RMS without findings; dotted: noise floor.
 
         Args:
             channel: number or name of an output.
-            corrected: with the findings in the simulation; default where there are any.
+            corrected: with the findings; default if there are any.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there is no such channel, or nothing was found that could correct the simulation.
+            ValueError: the channel does not exist, or ``corrected`` is True without findings.
         """
         t, which = self._traces, self._channel(channel)
         after = bool(self._findings) if corrected is None else corrected
         if after and not self._findings:
-            raise ValueError("Expected argument `corrected` to be False: nothing was found that corrects it.")
+            raise ValueError("Expected argument `corrected` to be False: the diagnosis has no findings.")
         ax = axes_or_new(ax)
         mark_findings(ax, self._findings)
         draw_residual(ax, t, array(t.time), which, after=after)
-        floor = [fit.noise_floor for fit in self._world.goodness_of_fit if fit.output == t.channels[which]]
+        floor = [fit.noise_floor for fit in self._environment.goodness_of_fit if fit.output == t.channels[which]]
         draw_floor(ax, floor[0] if floor else None)
         ax.set_title(of_channel(MOMENTS[after] if self._findings else "label.residual", t.channels[which]))
         ax.set_xlabel(of_time(t.has_time))
@@ -97,23 +96,23 @@ class DiagnosisPlot:
         corrected: bool = True,
         ax: Any = None,
     ) -> Any:
-        """The residual over what drives a finding, in the units of both; colours as in :meth:`residual`.
+        """Draw the residual over a finding's driver; colours as in :meth:`residual`.
 
         Args:
             finding: its number, from 0.
             driver: a recorded column; default the finding's first.
-            channel: number or name of an output; default the one that the finding changes most.
-            corrected: with the findings in the simulation.
+            channel: number or name of an output; default the channel with the largest change.
+            corrected: with the findings.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there is no such finding, channel or column, or the finding has no recorded driver.
+            ValueError: the finding, channel or column does not exist, or the finding has no recorded driver.
         """
         t, found = self._traces, self._finding(finding)
         known = [name for name in found.drivers if name in t.drivers]
         name = driver if driver is not None else (known[0] if known else None)
         if name is None:
-            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no recorded driver to draw it over.")
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no recorded driver.")
         if name not in t.drivers:
             there = ", ".join(t.drivers) or "none"
             raise ValueError(
@@ -127,14 +126,14 @@ class DiagnosisPlot:
         return ax
 
     def effect(self, finding: int = 0, ax: Any = None) -> Any:
-        """The curve of a finding over what drives it, a colour a channel, with the band in which it lies with 95 %.
+        """Draw the curve of a finding over its driver, one colour per channel, with its 95 % band.
 
         Raises:
-            ValueError: there is no such finding, or it has no curve.
+            ValueError: the finding does not exist, or has no curve.
         """
         found = self._finding(finding)
         if found.curve is None:
-            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no curve to draw.")
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no curve.")
         ax = axes_or_new(ax)
         draw_curve(ax, found.curve, self._traces.has_time, most=2 * MOST_LETTERS)
         ax.set_title(term("picture.curve_of", effect=capital(words_of(found.effect))))
@@ -143,27 +142,27 @@ class DiagnosisPlot:
         return ax
 
     def gain_map(self, finding: int = 0, ax: Any = None) -> Any:
-        """Where in the plane of two states the gain of a finding arises, in nats a cell.
+        """Draw the gain of a finding over two states, in nats per cell.
 
         Raises:
-            ValueError: there is no such finding, or it has no map: the simulation has fewer than two states.
+            ValueError: the finding does not exist, or has no map: the simulation has fewer than two states.
         """
         found = self._finding(finding)
         if found.map is None:
-            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no map over two states to draw.")
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no map over two states.")
         ax = axes_or_new(ax)
         draw_map(ax, found.map)
         return ax
 
     def held_out(self, ax: Any = None) -> Any:
-        """What each finding gains on blocks that the fit has not seen, in nats a sample, with its 95 % interval.
+        """Draw the gain of each finding on held-out blocks, in nats per sample, with its 95 % interval.
 
         Raises:
-            ValueError: there is no finding whose gain was measured.
+            ValueError: no finding has a gain on held-out blocks.
         """
         known = [(f, f.held_out) for f in self._findings if f.held_out is not None]
         if not known:
-            raise ValueError("There is no finding whose gain on unseen blocks was measured.")
+            raise ValueError("No finding has a gain on held-out blocks.")
         ax = axes_or_new(ax)
         ax.axvline(0.0, color=GREY, lw=0.7, zorder=1)
         for row, (_, held) in enumerate(known):
@@ -175,42 +174,42 @@ class DiagnosisPlot:
         return ax
 
     def candidates(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
-        """What the leading candidates of the search gain, in nats; those that became findings in orange.
+        """Draw the gains of the leading candidates, in nats; findings are orange.
 
         Args:
-            most: of how many at the most.
+            most: maximum number of candidates.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no candidates, or ``upper`` is less than one.
+            ValueError: there are no candidates, or ``most`` is less than 1.
         """
         if isinstance(most, bool) or most < 1:
-            raise ValueError(f"Expected argument `upper` to be at least 1 but got {most}; 12 is what the report shows.")
+            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; the report shows 12.")
         if not self._candidates:
-            raise ValueError("There are no candidates to draw: none was tried.")
-        shown = sorted(self._candidates[:most], key=lambda one: -one.log_likelihood_gain)
+            raise ValueError("There are no candidates to draw.")
+        shown = sorted(self._candidates[:most], key=lambda candidate: -candidate.log_likelihood_gain)
         found = {(finding.effect, finding.drivers) for finding in self._findings}
         ax = axes_or_new(ax)
-        for row, element in enumerate(shown):
-            color = ORANGE if (element.effect, element.drivers) in found else BLUE
-            ax.barh(row, max(element.log_likelihood_gain, 0.0), color=color, height=0.66)
-        _rows(ax, [_with_drivers(item.effect, item.drivers) for item in shown])
+        for row, candidate in enumerate(shown):
+            color = ORANGE if (candidate.effect, candidate.drivers) in found else BLUE
+            ax.barh(row, max(candidate.log_likelihood_gain, 0.0), color=color, height=0.66)
+        _rows(ax, [_with_drivers(candidate.effect, candidate.drivers) for candidate in shown])
         ax.set_xlabel(term("table.gain"))
         ax.set_title(term("section.candidates"))
         return ax
 
     def separability(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
-        """What is left of each row's candidate once that of the column may take over what it can: 0 is inseparable.
+        """Draw the share of each row's candidate that remains after a refit of the column's candidate: 0 is inseparable.
 
         Args:
             most: of how many candidates at the most.
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no candidates to compare, or ``upper`` is less than one.
+            ValueError: there are no candidates to compare, or ``most`` is less than 1.
         """
         if isinstance(most, bool) or most < 1:
-            raise ValueError(f"Expected argument `upper` to be at least 1 but got {most}; 12 is what the report shows.")
+            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; the report shows 12.")
         labels = [_label(label) for label in self._separability.labels[:most]]
         if not labels:
             raise ValueError("There are no candidates to compare.")
@@ -224,13 +223,13 @@ class DiagnosisPlot:
         return ax
 
     def forcing(self, index: int = 0, ax: Any = None) -> Any:
-        """The course of what pushes a rate unrecorded, or is added to an output, with its 95 % band, in its unit.
+        """Draw the estimated disturbance of a rate or drift of an output, with its 95 % band.
 
         Raises:
-            ValueError: there is no such forcing.
+            ValueError: the disturbance does not exist.
         """
-        known = self._world.disturbance
-        _check_number("index", index, len(known), "forcing was found")
+        known = self._environment.disturbance
+        _check_number("index", index, len(known), "disturbance was found")
         ax = axes_or_new(ax)
         draw_course(ax, known[index], self._traces.has_time)
         ax.set_ylabel(named(term("picture.process_noise"), tidy(known[index].unit)))
@@ -246,14 +245,14 @@ class DiagnosisPlot:
             if channel not in names:
                 raise ValueError(f"Expected argument `channel` to be one of {', '.join(names)} but got {channel!r}.")
             return names.index(channel)
-        _check_number("channel", channel, len(names), "channel is there")
+        _check_number("channel", channel, len(names), "channel exists")
         return channel
 
 
 def _check_number(argument: str, number: int, count: int, what: str) -> None:
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < count:
-        there = f"no {what}" if count == 0 else f"1 {what}: 0" if count == 1 else f"they are 0 to {count - 1}"
-        raise ValueError(f"Expected argument `{argument}` to be the number of one, but got {number!r}; {there}.")
+        there = f"no {what}" if count == 0 else f"1 {what}: 0" if count == 1 else f"valid: 0 to {count - 1}"
+        raise ValueError(f"Expected argument `{argument}` to be a valid number but got {number!r}; {there}.")
 
 
 def _with_drivers(effect: str, drivers: Sequence[str]) -> str:
@@ -266,6 +265,6 @@ def _label(label: str) -> str:
 
 
 def _rows(ax: Any, names: Sequence[str]) -> None:
-    """A name a row, the first at the top."""
+    """Label the rows, the first at the top."""
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.4, -0.6)

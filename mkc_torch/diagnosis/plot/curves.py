@@ -1,4 +1,4 @@
-"""Curves of effects and courses of forcings with their bands, the map of a gain, and names of axes."""
+"""Curves of effects, disturbances over time, maps of gains, and labels of axes."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ __all__ = ["CURVE_COLORS", "MOST_LETTERS", "draw_course", "draw_curve", "draw_ma
 
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 MOST_LETTERS = 26
-"""Of a name in a picture; longer ones are cut."""
+"""Letters of a name in a figure; longer names are cut."""
 
 _MOST_POINTS = 2_000
-"""Of a course that is drawn; of more, some are left out evenly."""
+"""Largest number of points of a line; longer series are thinned."""
 
 _GAP = 5.0
-"""Times the usual step beyond which two samples are not joined."""
+"""Gap, in median steps, across which samples are not joined."""
 _NEVER = "#E3E3E3"
 
 
 def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) -> None:
-    """A curve with its band, a colour a channel, over what drives it."""
+    """Draw a curve with its band over its driver, one colour per channel."""
     x, value, band = array(curve.x), array(curve.value), array(curve.band)
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     for i in range(value.shape[1]):
@@ -44,23 +44,23 @@ def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) 
     ax.locator_params(axis="y", nbins=5)
 
 
-def draw_course(ax: Any, forcing: DisturbanceEstimate, has_time: bool) -> None:
-    """What pushes a rate, or is added to an output, over time with its band."""
-    course = array(forcing.time)
-    time, value, band = (_joined(course, array(item)) for item in (forcing.time, forcing.value, forcing.band))
+def draw_course(ax: Any, estimate: DisturbanceEstimate, has_time: bool) -> None:
+    """Draw a disturbance over time with its band."""
+    course = array(estimate.time)
+    time, value, band = (_joined(course, array(series)) for series in (estimate.time, estimate.value, estimate.band))
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     ax.fill_between(time, value - band, value + band, color=BLUE, alpha=0.2, lw=0, zorder=2)
     ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)
     ax.margins(x=0.01)
     ax.set_xlabel(of_time(has_time))
-    ax.set_ylabel(short(tidy(forcing.unit)))
+    ax.set_ylabel(short(tidy(estimate.unit)))
     ax.locator_params(axis="y", nbins=5)
-    key = "picture.disturbance" if forcing.at_rate else "picture.drift"
-    ax.set_title(term(key, place=short(forcing.place)))
+    key = "picture.disturbance" if estimate.at_rate else "picture.drift"
+    ax.set_title(term(key, place=short(estimate.place)))
 
 
 def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Of a long course some samples, and nothing between runs, over which a line would lead."""
+    """Thin a long series, and break the line between runs."""
     step = max(-(-len(time) // _MOST_POINTS), 1)
     time, values = time[::step], values[::step].astype(float)
     steps = np.diff(time)
@@ -70,21 +70,21 @@ def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.insert(values, apart, np.nan)
 
 
-def draw_map(ax: Any, found: StateMap, beside: Any = None) -> None:
-    """Nats gained or lost in each cell of two states, and their scale on axes beside it or taken from it."""
+def draw_map(ax: Any, found: StateMap, colorbar_axes: Any = None) -> None:
+    """Draw gains and losses in nats over two states, with a colour bar on ``colorbar_axes`` or next to the map."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    # pictures are transparent, so a ground of that colour would be lost
+    # figures are transparent, so a background colour would be lost
     gain = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE]).with_extremes(bad=_NEVER)
     nats = array(found.nats)
-    shown = np.sign(nats) * np.sqrt(np.abs(nats))  # by the root: a few cells hold most
+    shown = np.sign(nats) * np.sqrt(np.abs(nats))  # square root: a few cells have most of the gain
     limit = float(np.nanmax(np.abs(shown)))
     x, y = (array(edge) for edge in found.edges)
     drawn = ax.pcolormesh(x, y, shown.T, cmap=gain, vmin=-limit, vmax=limit, rasterized=True)
     for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
         axis.set_label_text(named(name, unit))
     ax.set_title(term("picture.map"))
-    bar = ax.figure.colorbar(drawn, cax=beside, ax=None if beside is not None else ax)
+    bar = ax.figure.colorbar(drawn, cax=colorbar_axes, ax=None if colorbar_axes is not None else ax)
     bar.ax.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
     ticks = [tick for tick in bar.get_ticks() if bar.ax.get_ylim()[0] <= tick <= limit]
     bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
@@ -92,16 +92,16 @@ def draw_map(ax: Any, found: StateMap, beside: Any = None) -> None:
 
 
 def of_time(has_time: bool) -> str:
-    """The name of an axis of time."""
+    """Return the label of a time axis."""
     return term("picture.time" if has_time else "unit.sample")
 
 
 def named(name: str, unit: str, most: int = MOST_LETTERS) -> str:
-    """A name with its unit, as an axis has it."""
+    """Return the label of an axis: name and unit."""
     return f"{short(name, most)} ({short(unit)})" if unit else short(name, most)
 
 
 def short(text: str, most: int = MOST_LETTERS) -> str:
-    """A text from a file, cut where there is no room."""
+    """Cut a text from a file to ``most`` letters."""
     label = plain(text)
     return label if len(label) <= most else label[: most - 1] + "…"

@@ -1,4 +1,4 @@
-"""The residual over time or over a driver: samples, the mean and size of those in use, and the findings' moments."""
+"""Residual over time or over a driver: samples, their mean and RMS, and the times of findings."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ MOMENTS = ("table.before", "table.after")
 _USED, _REJECTED = "#7FB8DA", "#F2C7AA"
 _MOST_POINTS = 5_000  # of a panel
 _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
-"""Bins over a driver, and how many samples one has at least."""
+"""Number of bins over a driver, and minimum number of samples per bin."""
 
 _MOST_LEVELS = 24  # of a driver that takes few values, such as a switch
 
 
 @dataclass(frozen=True)
 class _Bins:
-    """Mean and root mean square of the samples in use along a driver."""
+    """Mean and RMS of the samples in use, by bins of a driver."""
 
     x: np.ndarray
     mean: np.ndarray
@@ -45,7 +45,7 @@ class _Bins:
 
 
 def draw_residuals(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) -> None:
-    """The residual before and, on second axes beside the first, after."""
+    """Draw the residual before and, on the second axes, after."""
     for ax, after in zip(axes, (False, True), strict=False):
         draw_residual(ax, t, x, channel, after=after)
     for ax in axes[1:]:
@@ -54,7 +54,7 @@ def draw_residuals(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) 
 
 
 def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, *, after: bool) -> None:
-    """Draw samples, and the mean and size of those in use; behind those after, the size before."""
+    """Draw samples, and mean and RMS of the samples in use; with ``after``, also the RMS before."""
     before, used = array(t.before[:, channel]), array(t.weight[:, channel]) >= 0.5
     limit, earlier, shown = _limit(before[used]), _binned(x[used], before[used]), _apart(x)
     marker = "o" if len(earlier.x) <= _MOST_LEVELS else ""
@@ -92,7 +92,7 @@ def _thinned(index: np.ndarray) -> np.ndarray:
 
 
 def _apart(x: np.ndarray) -> np.ndarray:
-    """The driver, but where it takes few values each spread a little, so that its samples do not hide each other."""
+    """Jitter a driver with few values, so that its samples do not overlap."""
     levels = np.unique(x[np.isfinite(x)])
     if not 1 < len(levels) <= _MOST_LEVELS or len(x) <= _MOST_LEVELS:
         return x
@@ -101,7 +101,7 @@ def _apart(x: np.ndarray) -> np.ndarray:
 
 
 def _binned(x: np.ndarray, e: np.ndarray) -> _Bins:
-    """By level where the driver takes few values, else in bins of equal counts."""
+    """Bin by value for a driver with few values, otherwise by equal counts."""
     fine = np.isfinite(x) & np.isfinite(e)
     x, e = x[fine], e[fine]
     if len(x) == 0:
@@ -129,12 +129,12 @@ def mark_findings(ax: Any, findings: Sequence[Finding]) -> None:
 
 
 def onsets(finding: Finding) -> tuple[float, ...]:
-    """The moments at which it sets in."""
+    """Return the onsets of a finding."""
     return finding.event_times or (() if finding.onset is None else (finding.onset,))
 
 
 def draw_floor(ax: Any, size: float | None) -> None:
-    """The noise floor to either side of zero."""
+    """Draw the noise floor on both sides of zero."""
     for side in (-1.0, 1.0) if size is not None and math.isfinite(size) else ():
         ax.axhline(side * (size or 0.0), color=GREY, lw=1.1, ls=":", zorder=6)
 
@@ -144,7 +144,7 @@ def of_channel(key: str, channel: str) -> str:
 
 
 def acting_channels(t: Traces, finding: Finding) -> list[int]:
-    """The channels that a finding acts on, those that change most first."""
+    """Return the channels of a finding, the largest change first."""
     acting = [i for i, name in enumerate(t.channels) if name in finding.channels] or list(range(len(t.channels)))
     change = (t.before - t.after).nan_to_num().square().sum(0).tolist()
     return sorted(acting, key=lambda i: -change[i])

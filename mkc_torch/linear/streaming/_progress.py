@@ -250,8 +250,8 @@ class StreamProgress:
         """
         if not isinstance(state, dict) or state.get("format") != FORMAT:
             raise ValueError(
-                "Expected a state of StreamedMKCRegression, of this version, but got something else; start over without "
-                "it."
+                "Expected a state of StreamedMKCRegression, of this version, but got something else; start over "
+                "without it."
             )
         fields = {key: value for key, value in state.items() if key != "format"}
         survey, climb = dict(fields["survey"]), fields["climb"]
@@ -299,6 +299,6 @@ class StreamProgress:
         for name, value in settings.items():
             if self.settings.get(name) != value:
                 raise ValueError(
-                    f"Expected argument `{name}` as in the saved state, {self.settings.get(name)!r}, but got {value!r}; "
-                    "use that value, or start over without the state."
+                    f"Expected argument `{name}` as in the saved state, {self.settings.get(name)!r}, but got "
+                    f"{value!r}; use that value, or start over without the state."
                 )

@@ -222,7 +222,7 @@ def _all_terms(
 
 
 def _in_basis(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Iterator[StreamBlock]:
-    """The blocks of a pass, in the basis of ``point`` if it has one."""
+    """The blocks of a pass, in the basis of ``point``, if any."""
     for _, block in blocks(batches, shape):
         if point.to_basis is not None:
             block = replace(block, joined=np.concatenate([np.matmul(point.to_basis.T, block.X), block.Y[:, None]], 1))

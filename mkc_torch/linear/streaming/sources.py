@@ -150,7 +150,7 @@ class ParquetBatches:
             for name in self._columns:
                 if name not in file.schema_arrow.names:
                     known = ", ".join(f"`{column}`" for column in file.schema_arrow.names)
-                    raise ValueError(f"Expected {path} to have a column `{name}` but got {known}; use one of these.")
+                    raise ValueError(f"Expected {path} to have a column `{name}` but got {known}; use a listed name.")
                 kind = file.schema_arrow.field(name).type
                 if not (arrow.types.is_integer(kind) or arrow.types.is_floating(kind) or arrow.types.is_boolean(kind)):
                     raise TypeError(f"Expected column `{name}` of {path} to hold real numbers but got {kind}.")

@@ -22,7 +22,7 @@ from mkc_torch.losses.kernels.launch import (
     rescale,
     weight_sums,
 )
-from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, average_over_processes, is_distributed
+from mkc_torch.losses.residual_scale import ScaleState, average_over_processes, is_distributed, synchronized_state
 
 __all__ = ["gradients_of_each", "options_of", "prepared", "request_of", "updated_table"]
 
@@ -145,7 +145,7 @@ def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, 
         )
     make_table(batch, running, *numbers, options, scale=True, table=False, pace=pace)
     state = ScaleState(running.batches, running.log_scale, running.half_range, running.floor)
-    for own, joined in zip(state, alike_in_all_processes(state), strict=True):
+    for own, joined in zip(state, synchronized_state(state), strict=True):
         own.copy_(joined)
     if scheduled:
         make_table(batch, running, *numbers, options, schedule=True, table=False, pace=pace)

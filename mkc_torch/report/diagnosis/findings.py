@@ -131,7 +131,7 @@ def references_of(finding: Finding) -> str:
     if not finding.references:
         return ""
     marked = re.search("[A-Za-z]\u0304", unicodedata.normalize("NFD", finding.equation))
-    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.references_of")
+    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.reference")
     names = several([item.column for item in finding.references])
     values = ", ".join(f"{size(reference.value)} {plain(reference.unit)}".rstrip() for reference in finding.references)
     key = "finding.means" if len(finding.references) > 1 else "finding.mean"

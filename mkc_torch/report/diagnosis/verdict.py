@@ -122,7 +122,7 @@ def unexplained(diagnosis: Diagnosis) -> str:
 def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
     """Return whether states have process noise, and these states; otherwise the outputs with drift."""
     processes = diagnosis.environment.process_noise
-    rates = [push.place for process in processes if process.at_rate]
+    rates = [process.place for process in processes if process.at_rate]
     places = rates or [process.place for process in processes]
     return bool(rates), [f"`{plain(place)}`" for place in dict.fromkeys(places)]
 

@@ -128,7 +128,7 @@ def process_noise_sentence(process: ProcessNoise) -> str:
         >>> process_noise_sentence(ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
         'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s.'
         >>> process_noise_sentence(ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
-        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white.'
+        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white noise.'
         >>> process_noise_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
         'Drift of `angle` in addition to its white noise: 0.0100 ± 0.0020 rad, correlation time 30 s.'
     """

@@ -58,8 +58,8 @@ class DynamicsCorrection:
         found = prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
         if not found.converged:
             raise SimulationError(
-                f"{prepared.name}: no trajectory was found for this model's parameters and effects, starting from the first "
-                "states of this recording. Give a smaller `step`, or split the recording into shorter runs."
+                f"{prepared.name}: no trajectory was found for this model's parameters and effects from the "
+                "initial states of this recording. Give a smaller `step`, or split the recording into shorter runs."
             )
         begin = first
         near: Nearby | None = found

@@ -35,8 +35,7 @@ __all__ = [
 ]
 
 _CLIP = 4.0
-"""Standard deviations at which an innovation is clipped; smaller ones pass unchanged, so that the most likely size of
-normal noise is unbiased."""
+"""Standard deviations at which an innovation is clipped."""
 
 _OUTLIERS = 0.05
 """Share of outliers among the innovations."""
@@ -165,8 +164,8 @@ class FilterModels:
         size: (B, D), standard deviation of a lasting disturbance.
         lasting: (B, D), its time constant in s.
         sensor: (B, m), standard deviation of each output's white noise.
-        hard_clip: whether an innovation within the clip is left as it is; otherwise a hyperbolic tangent shrinks it, as
-            an observer does, and the most likely process noise is a few per cent too large.
+        hard_clip: whether innovations below the limit pass unchanged. Otherwise they are clipped smoothly by a
+            hyperbolic tangent, as in an observer, and the most likely process noise is a few per cent too large.
     """
 
     white: Float[np.ndarray, "B p"]
@@ -282,8 +281,8 @@ def _run(
             models.place, models.sensor**2,
         ]  # fmt: skip
         compiled(
-            *[np.ascontiguousarray(array) for array in whole], _CLIP, models.hard_clip, end.state, end.covariance, end.kept,
-            found.standard, found.log_spread, found.prior, found.state, found.after, found.posterior,
+            *[np.ascontiguousarray(array) for array in whole], _CLIP, models.hard_clip, end.state, end.covariance,
+            end.kept, found.standard, found.log_spread, found.prior, found.state, found.after, found.posterior,
         )  # fmt: skip
     np.log(found.log_spread, out=found.log_spread)
     return found, end

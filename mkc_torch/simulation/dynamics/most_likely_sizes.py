@@ -56,12 +56,12 @@ def most_likely_sizes(
 
 
 def _lasting(noise: NoiseModel) -> list[int]:
-    """Numbers of the disturbances that have a time constant."""
+    """Indices of the lasting disturbances."""
     return [d for d, (_, _, time) in enumerate(noise.components) if time > 0]
 
 
 def _unknown(noise: NoiseModel) -> list[int]:
-    """Numbers of the outputs whose white noise is not declared."""
+    """Indices of the outputs whose white noise is not declared."""
     return [j for j in range(len(noise.sensor)) if not (noise.known and noise.known[j])]
 
 

@@ -87,9 +87,9 @@ def most_likely_noise(
 def sized_noise(
     prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, noise: StateSpaceNoise
 ) -> StateSpaceNoise:
-    """Return a noise with its disturbances at the maximum-likelihood sizes along a trajectory, for the report.
+    """Return a noise with maximum-likelihood sizes of its disturbances along a trajectory, for the report.
 
-    The noise is returned as it is where there is no disturbance, or no trajectory is found.
+    The noise is unchanged where it has no disturbance, or no trajectory is found.
     """
     flow = flow_of(prepared, theta, changes, near)
     if flow is None or not noise.selected.disturbances:

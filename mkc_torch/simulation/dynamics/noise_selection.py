@@ -195,9 +195,12 @@ def _as_selected_noise(
     like: Float[Tensor, " m"],
     value: float,
 ) -> SelectedNoise:
+    """Convert a noise model to a selected noise, with unknown standard errors."""
     places, p = (*names, *channels), flow.rates
     found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.components)
-    return SelectedNoise(found, (math.inf,) * len(found), tuple(gains), like.new_tensor(noise.sensor), value, noise.known)
+    return SelectedNoise(
+        found, (math.inf,) * len(found), tuple(gains), like.new_tensor(noise.sensor), value, noise.known
+    )
 
 
 def with_most_likely_sizes(
@@ -212,8 +215,8 @@ def with_most_likely_sizes(
 
     Args:
         flow: the linearised trajectory.
-        names, channels, largest, rounding: as of :func:`select_noise_model`.
-        found: the noise at a grid's sizes, whose gains are kept.
+        names, channels, largest, rounding: as in :func:`select_noise_model`.
+        found: the noise with sizes of the grid; its gains are kept.
     """
     known = NoiseModel.of(found.disturbances, found.sensor.tolist(), names, channels, found.declared, rounding)
     noise, errors = most_likely_sizes(flow, known, largest)

@@ -226,7 +226,7 @@ def solve(
     if transformed or any(tensor.requires_grad for tensor in (left, begin)):
         # outside of the transform the result is the same, and cheaper
         recurrence = renewed() if linear is None or moved_on else linear.renewed()
-    # one more Newton step: it changes the value by rounding only, and has the derivative of the solution
+    # a further Newton step: it changes the value by rounding only, and has the derivative of the solution
     start = torch.where(origin, begin[places] - states, 0.0)
     return Trajectory(states + recurrence.solved(start, left), converged, Linear(renewed, recurrence))
 

@@ -354,7 +354,8 @@ def _no_binary(folder: Path, platform: str) -> str:
     available = f"it has binaries for {', '.join(platforms)} only" if platforms else "it has no binaries"
     if (folder / "sources").is_dir():
         return (
-            f"{available}, and none for {platform}, but it contains its sources; `fmpy compile MODEL.fmu` compiles them."
+            f"{available}, and none for {platform}, but it contains sources; compile them with `fmpy compile "
+            "MODEL.fmu`."
         )
     return f"{available}, and none for {platform}; export it for {platform}, or with its sources."
 

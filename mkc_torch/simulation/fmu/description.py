@@ -114,7 +114,7 @@ def read_description(path: Path) -> Description:
             "simulate the recording, and give its output with `--simulator-output SIM.csv`."
         )
     if any(item is None or item.dimensions or item.type not in _REAL for item in [*rates, *states]):
-        raise FmuError(f"{path}: a state of this FMU is no single real number; export its states one by one.")
+        raise FmuError(f"{path}: a state of this FMU is not a single real number; export its states one by one.")
     inputs = [item for item in variables if item.causality == "input" and _single(item)]
     outputs = [item for item in variables if item.causality == "output" and _single(item) and not _same(item, rates)]
     return Description(
@@ -175,7 +175,7 @@ def _version(path: Path) -> str:
         with archive.open("modelDescription.xml") as file:
             head = file.read(4096).decode("utf-8", errors="replace")
     found = re.search(r"fmiVersion\s*=\s*[\"']\s*([^\"']*)", head)
-    text = found[1] if found else "no stated version"
+    text = found[1] if found else "(no version)"
     return text.partition(".")[0] if text.startswith(("2.", "3.")) else text
 
 

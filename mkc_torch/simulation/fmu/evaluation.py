@@ -163,7 +163,7 @@ class Evaluation:
         return found
 
     def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
-        """Whether rates are affine in a parameter, tested once at a few points: a single step then gives the derivative.
+        """Whether rates are affine in a parameter, tested once at a few points: a single step gives the derivative.
 
         Where they are not affine at other points, the step is still small.
         """

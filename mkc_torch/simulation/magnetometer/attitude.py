@@ -1,4 +1,4 @@
-"""A magnetometer compared by the field's vector, where the attitude is recorded."""
+"""A magnetometer compared by the field vector, where the attitude is recorded."""
 
 from __future__ import annotations
 
@@ -27,19 +27,27 @@ if TYPE_CHECKING:
 
 __all__ = ["AttitudeView", "with_attitude"]
 
-_MISFIT, _FAR_BETTER = 0.3, 0.5
-"""Share of the field by which half of the samples are off, from which the attitude is looked into; and how much closer
-they are with its inverse, where that is what was recorded."""
+_MISFIT = 0.3
+"""Median error, as a share of the field, from which the attitude is checked."""
+
+_FAR_BETTER = 0.5
+"""Ratio of median errors below which the inverse of the attitude counts as recorded."""
 
 _MIN_ROWS = 50
-_REWEIGHTED, _RIDGE = 10, 1e-4
+"""Fewest samples of a fit to a part of the recording."""
+
+_REWEIGHTED = 10
+"""Number of reweighted least-squares iterations."""
+
+_RIDGE = 1e-4
+"""Ridge of the response towards the identity, as a share of the field's mean square."""
 
 
 class AttitudeView(View):
-    """The vector, turned into the world by a recorded attitude: along the world's field, and in two axes across it.
+    """The field vector in the world frame by a recorded attitude: along the ambient field, and in two axes across it.
 
-    Errors of the attitude turn the field, so they enter across it alone, as noise that knows nothing of the motion; but
-    for jumps of the heading, which a gyroscope shows, and which are for an effect at the port "heading" to say.
+    Errors of the attitude rotate the field, so they enter only across it, as noise that is independent of the motion;
+    except for jumps of the heading, which a gyroscope shows and an effect at the port "heading" describes.
     """
 
     view = "attitude"
@@ -79,10 +87,14 @@ class AttitudeView(View):
         self._to_frame = self._frame @ self.to_world @ self._unbent
         self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
-        self.warnings = (*self.warnings, *_turned_too_little(self.corrected(self._full, {})), *_told(jumps, self.time))
+        self.warnings = (
+            *self.warnings,
+            *_coverage_warning(self.corrected(self._full, {})),
+            *_jump_warning(jumps, self.time),
+        )
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
-        """The world's field."""
+        """The ambient field in the world frame, (3,)."""
         direction = make_dual(self._ahead, theta[0]) + theta[12:14] @ self._across
         return self._strength(theta) * direction / torch.linalg.vector_norm(direction)
 
@@ -97,7 +109,7 @@ class AttitudeView(View):
         return torch.cat([offset, response.flatten(), offset.new_zeros(2)])
 
     def _offset_and_field(self, attitude: Float[Tensor, "N 3 3"]) -> tuple[Tensor, Tensor]:
-        """Offset and world field by least trimmed squares, the matrix taken for the identity."""
+        """Offset and ambient field in the world frame by least trimmed squares, with the identity as matrix."""
         chosen = thinned(self.thin)
         to_world, measured = attitude[chosen], self.measured[chosen]
         eye = torch.eye(3, dtype=to_world.dtype).expand(len(to_world), 3, 3)
@@ -108,45 +120,45 @@ class AttitudeView(View):
         return coefficients[:3], coefficients[3:]
 
     def _refuse_inverse(self, offset: Tensor, ahead: Tensor) -> None:
-        """Refuse quaternions that turn the world into the sensor's axes; warn of those that do neither.
+        """Refuse quaternions from the world frame to the sensor frame; warn if neither direction fits.
 
         Raises:
             RecordingError: the inverse of the attitude fits far better.
         """
-        left, strength = self._left(self.to_world, offset, ahead), float(torch.linalg.vector_norm(ahead))
-        if left <= _MISFIT * strength:
+        error, strength = self._median_error(self.to_world, offset, ahead), float(torch.linalg.vector_norm(ahead))
+        if error <= _MISFIT * strength:
             return
-        inverse = self._left(self.to_world.mT, *self._offset_and_field(self.to_world.mT))
-        told = f"with the attitude as recorded half of the samples are off by {left:.3g} {self.unit} or more"
-        if inverse < _FAR_BETTER * left:
+        inverse = self._median_error(self.to_world.mT, *self._offset_and_field(self.to_world.mT))
+        misfit = f"with the attitude as recorded the median error is {error:.3g} {self.unit}"
+        if inverse < _FAR_BETTER * error:
             raise RecordingError(
-                f"The quaternions are the inverse of what is expected: {told}, with its inverse by {inverse:.3g} "
-                f"{self.unit}. They are to turn the sensor's axes into the world's; give the conjugate, with q_x, q_y "
-                "and q_z of the other sign."
+                f"The quaternions are the inverse of the expected ones: {misfit}, with the inverse {inverse:.3g} "
+                f"{self.unit}. They must rotate from the sensor frame to the world frame; give the conjugate, with the "
+                "other sign of q_x, q_y and q_z."
             )
         self.warnings = (
             *self.warnings,
-            f"The attitude hardly explains the field: {told}. See that it is of the same axes and times as the "
-            "magnetometer, in the order w, x, y, z.",
+            f"The attitude hardly explains the field: {misfit}. Check that it has the axes and times of the "
+            "magnetometer, and the order w, x, y, z.",
         )
 
-    def _left(self, attitude: Float[Tensor, "N 3 3"], offset: Tensor, ahead: Tensor) -> float:
-        """The median distance of the measurements from an offset and a field that turns."""
+    def _median_error(self, attitude: Float[Tensor, "N 3 3"], offset: Tensor, ahead: Tensor) -> float:
+        """The median distance of the measurements from an offset plus the rotated field."""
         turned = torch.einsum("kij,i->kj", attitude, ahead)
         return float(torch.linalg.vector_norm(self.measured - offset - turned, dim=-1).median())
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
-        # would shrink it. A fixed matrix takes the difference back into the world.
-        left = self._away(theta, changes) - self._sensed(self._seen(theta, changes), theta)
-        residual = rotated(left, self._to_frame)
+        # the fitted matrix multiplies the simulated field: with the measured field, noise would shrink the matrix. A
+        # fixed matrix maps the difference back to the world frame.
+        difference = self._away(theta, changes) - self._sensed(self._seen(theta, changes), theta)
+        residual = rotated(difference, self._to_frame)
         added = self._field_change(changes)
         return residual if added is None else residual - added @ self._frame.mT
 
     def signals(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N k"]]:
-        """Beside the others, at the port "heading", 1 from each of the heading's jumps on."""
+        """The signals at the ports; at the port "heading" a unit step at each jump of the heading."""
         since = {} if self._since is None else {"heading": self._since}
         return {**super().signals(theta, changes, near), **since}
 
@@ -154,7 +166,7 @@ class AttitudeView(View):
         return self._sensed(self._seen(theta, {}), theta)
 
     def _seen(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        """The world's field in the body's axes, turned about the vertical by what the recorded heading is off."""
+        """The ambient field in the sensor frame, rotated about the vertical by the error of the recorded heading."""
         ambient = self.ambient(theta)
         if self._since is None or "heading" not in changes:
             return (ambient @ self._from_world).unflatten(0, (-1, 3))
@@ -165,15 +177,15 @@ class AttitudeView(View):
         return rotated(turned, self.to_world.mT)
 
     def _sensed(self, field: Float[Tensor, "N 3"], theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        """What the sensor makes of a field in its axes, less its offset."""
+        """The measurement of a field in the sensor frame, without the offset."""
         return field @ theta[3:12].unflatten(0, (3, 3)).mT
 
 
 def with_attitude(recording: Recording) -> Recording:
-    """The samples that have an attitude; a quaternion of length zero is none.
+    """The samples with an attitude, whose quaternion is not zero.
 
     Raises:
-        RecordingError: no sample has one.
+        RecordingError: no sample has an attitude.
     """
     known = recording.finite(*QUATERNION)
     has = torch.linalg.vector_norm(known.stack(*QUATERNION), dim=-1) > 0.0
@@ -190,6 +202,7 @@ def with_attitude(recording: Recording) -> Recording:
 
 
 def _matrix_prior(count: int) -> GaussianPrior:
+    """The prior of the response about the identity."""
     mean = torch.zeros(count, dtype=torch.float64)
     precision = torch.zeros(count, dtype=torch.float64)
     mean[3:12] = torch.eye(3, dtype=torch.float64).flatten()
@@ -198,58 +211,59 @@ def _matrix_prior(count: int) -> GaussianPrior:
 
 
 def _response(measured: Tensor, turned: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset and response by reweighted least squares of the measurement on the turned field, near the identity."""
+    """Offset and response by reweighted least squares of the measurement on the rotated field, near the identity."""
     response = torch.eye(3, dtype=turned.dtype)
     ridge = len(turned) * _RIDGE * turned.square().sum(-1).mean()
     for _ in range(_REWEIGHTED):
-        left = torch.linalg.vector_norm(measured - offset - turned @ response.mT, dim=-1)
-        scale = left.median().clamp(min=1e-9 * turned.abs().max())
-        weight = torch.exp(-0.5 * (left / (2.0 * scale)).square()).unsqueeze(-1)
+        distance = torch.linalg.vector_norm(measured - offset - turned @ response.mT, dim=-1)
+        scale = distance.median().clamp(min=1e-9 * turned.abs().max())
+        weight = torch.exp(-0.5 * (distance / (2.0 * scale)).square()).unsqueeze(-1)
         regressors = torch.cat([turned, torch.ones_like(turned[:, :1])], -1)
-        pull = torch.diag(torch.cat([ridge.expand(3), ridge.new_zeros(1)]))
-        gram = regressors.mT @ (weight * regressors) + pull
+        penalty = torch.diag(torch.cat([ridge.expand(3), ridge.new_zeros(1)]))
+        gram = regressors.mT @ (weight * regressors) + penalty
         known = torch.cat([torch.eye(3, dtype=turned.dtype), turned.new_zeros(1, 3)])
-        solved = torch.linalg.solve(gram, regressors.mT @ (weight * measured) + pull @ known)
+        solved = torch.linalg.solve(gram, regressors.mT @ (weight * measured) + penalty @ known)
         response, offset = solved[:3].mT, solved[3]
     return offset, response
 
 
 def _jumps(recording: Recording, to_world: Tensor) -> tuple[HeadingJump, ...]:
-    """Of the heading, as far as the recording has a gyroscope that knows."""
+    """The jumps of the heading; none without a gyroscope and times."""
     if recording.time is None or not all(name in recording for name in GYRO):
         return ()
     return heading_jumps(recording.time, to_world, recording.stack(*GYRO), recording.magnetometer())
 
 
-def _told(jumps: tuple[HeadingJump, ...], time: Tensor) -> tuple[str, ...]:
-    """A sentence about the heading's jumps."""
+def _jump_warning(jumps: tuple[HeadingJump, ...], time: Tensor) -> tuple[str, ...]:
+    """A sentence about the heading's jumps; empty without jumps."""
     if not jumps:
         return ()
-    told = ", ".join(
+    listed = ", ".join(
         f"by {jump.size:.1f}° at {float(time[jump.after]):.1f} s (gyroscope: {jump.turned:.1f}°)" for jump in jumps
     )
     return (
-        f"The recorded heading jumps where the gyroscope does not: {told}. The attitude is off by as much, before or "
-        "after, and an effect that seems to begin there may be that.",
+        f"The recorded heading jumps where the gyroscope does not: {listed}. The attitude has these errors before or "
+        "after the jumps, and an effect that seems to begin there may be such an error.",
     )
 
 
 def _one_axis(to_world: Tensor) -> NotIdentifiableError:
-    """The refusal of a recording that turns about one axis of the sensor alone, or not at all."""
+    """The error for a recording in which the sensor turns about one of its axes only, or not at all."""
     turned = (to_world - to_world.mean(0)).square().sum((0, 1))
     axis = AXES[int(turned.argmin())]
     return NotIdentifiableError(
-        f"Not identifiable: the sensor turns about its {axis} axis alone, or not at all, so the offset along +{axis} "
-        "cannot be told from the field. Turn it about another axis too."
+        f"Not identifiable: the sensor turns about its {axis} axis only, or not at all, so the offset along +{axis} "
+        "cannot be distinguished from the field. Turn it about another axis too."
     )
 
 
-def _turned_too_little(field: Tensor) -> tuple[str, ...]:
+def _coverage_warning(field: Tensor) -> tuple[str, ...]:
+    """A sentence about directions that the recording does not cover; empty if it covers enough."""
     found = coverage(field)
     if found.information >= MIN_INFORMATION:
         return ()
     missing = "; ".join(str(gap) for gap in found.gaps)
     return (
-        "The ellipsoid alone is not identifiable from this recording; the attitude stands in for the missing turns"
+        "The ellipsoid alone is not identifiable from this recording; the attitude replaces the missing turns"
         + (f". Directions not covered: {missing}." if missing else "."),
     )

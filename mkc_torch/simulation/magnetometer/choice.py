@@ -1,4 +1,4 @@
-"""Which view of a magnetometer's recording is compared: by what each leaves of the field."""
+"""Selection of the view by which a magnetometer is compared, by the residuals of the views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from mkc_torch.calibration.aided.fault import LAG, Fault, mend_of_attitude, mend_of_gyroscope
-from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope, robust_size, stretches
+from mkc_torch.calibration.aided.fault import LAG, Fault, attitude_fault, gyroscope_fault
+from mkc_torch.calibration.aided.misfit import misfit_of_attitude, misfit_of_gyroscope, robust_size, stretches
 from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
@@ -23,24 +23,24 @@ __all__ = ["chosen_view", "requested_view"]
 V = TypeVar("V", bound=View)
 
 TIMES_THE_LENGTH = 3.0
-"""Times what the length leaves, from which turns are looked into: noise of the sensor is the same in both."""
+"""Ratio to the residual of the length from which turns are checked; the sensor's noise is the same in both."""
 
 DOUBTFUL = 0.03
-"""Share of the field, which is the angle in rad, by which turns may be off unasked: two degrees, what the gain of a
-gyroscope makes of two seconds, or an attitude's filter of a calm flight. Beyond, a reason is sought; turns with one
+"""Residual, as a share of the field or an angle in rad, up to which turns are not checked: 2°, the error of a
+gyroscope's gain over 2 s, or of an attitude filter in a calm flight. Above it a fault is searched; turns with a fault
 are not used."""
 
 USELESS = 0.1
-"""Share of the field from which turns are not used, reason or not: six degrees, what filters do not reach but where
-something is wrong. At twice that an error of the angle shows along the field too, where it passes for the sensor's."""
+"""Residual, as a share of the field, from which turns are not used even without a fault: 6°, which filters reach only
+if something is wrong. At twice this, errors of the angle also appear along the field, like errors of the sensor."""
 
 
 def chosen_view(recording: Recording) -> NormView | AttitudeView | GyroView:
-    """The attitude's view where there is one, the length's, or the gyroscope's where the length determines nothing.
+    """The attitude's view if there is an attitude, else the length's, or the gyroscope's if the length is insufficient.
 
-    Turns that leave far more of the field than its length does are not used, where the length determines the sensor,
-    alone or together with what changes it; a warning says so, and what seems to be wrong with them. An attitude may be
-    off by its own noise, and a change of the sensor is left in every view: neither is a reason.
+    Turns with a far larger residual than the length's are not used if the length determines the sensor, alone or
+    together with a change of it; a warning states the probable fault of the turns. Noise of the attitude, and a change
+    of the sensor, which is in the residual of every view, are no reasons to exclude turns.
 
     Raises:
         NotIdentifiableError: no view determines the sensor.
@@ -53,20 +53,20 @@ def chosen_view(recording: Recording) -> NormView | AttitudeView | GyroView:
 
 
 def requested_view(recording: Recording, use: str) -> NormView | AttitudeView | GyroView:
-    """The attitude's view, the gyroscope's or the length's, as it is asked for.
+    """The view ``use``: "attitude", "gyro" or "norm", the length.
 
-    Turns that leave far more of the field than its length does are told in the view's ``wrong_turns``.
+    The fault of turns with a far larger residual than the length's is in the view's ``wrong_turns``.
 
     Raises:
-        NotIdentifiableError: that view does not determine the sensor.
+        NotIdentifiableError: this view does not determine the sensor.
     """
     if use == "norm":
         return NormView(prepared(recording))
     if use == "attitude":
         usable = prepared(with_attitude(recording))
-        return _compared_by_attitude(usable, AttitudeView(usable), _length(usable)).told()
+        return _compared_by_attitude(usable, AttitudeView(usable), _length(usable)).with_fault()
     usable = prepared(recording.finite(*GYRO))
-    return _compared_by_gyroscope(usable, GyroView(usable), _length(usable)).told()
+    return _compared_by_gyroscope(usable, GyroView(usable), _length(usable)).with_fault()
 
 
 def _attitude_or_length(recording: Recording) -> NormView | AttitudeView:
@@ -77,8 +77,8 @@ def _attitude_or_length(recording: Recording) -> NormView | AttitudeView:
     except NotIdentifiableError as error:
         if length is None:
             raise
-        # an attitude that stands still says nothing of a sensor that turns
-        return _warned(length, f"The attitude is left out, for it does not turn as the field does. {error}")
+        # a constant attitude has no information on a sensor that turns
+        return _warned(length, f"The attitude is left out, because it does not turn as the field does. {error}")
     return _compared_by_attitude(usable, view, length).settled()
 
 
@@ -98,16 +98,16 @@ def _length_or_gyroscope(recording: Recording) -> NormView | GyroView:
 
 @dataclass(frozen=True)
 class _Compared(Generic[V]):
-    """A view by turns beside the length; what both leave."""
+    """A view by turns, and the length's view to compare it with."""
 
     what: str
     view: V
     length: NormView | None
     left: float
-    mend: Callable[[], Fault | None]
+    find_fault: Callable[[], Fault | None]
 
     def settled(self) -> V | NormView:
-        """The view, or the length where the view's turns are wrong; with a warning of turns that are."""
+        """The view, or the length's view if the turns have a fault, with a warning about the fault."""
         fault = self.fault()
         if not fault:
             return self.view
@@ -119,49 +119,49 @@ class _Compared(Generic[V]):
             )
         return _warned(self.length, f"The {self.what} is left out and the field's length is compared alone: {fault}")
 
-    def told(self) -> V:
-        """The view, which knows what is wrong with its turns."""
+    def with_fault(self) -> V:
+        """The view, with the fault of its turns in ``wrong_turns``."""
         fault = self.fault()
         self.view.wrong_turns = fault[:1].upper() + fault[1:]
         return self.view
 
     def fault(self) -> str:
-        """What is wrong with the turns, as sentences; empty where nothing is."""
+        """Sentences about the fault of the turns; empty if there is no fault."""
         known, unit = self.view if self.length is None else self.length, self.view.unit
-        most = USELESS * known.strength
+        limit = USELESS * known.strength
         if self.length is not None and self.left < TIMES_THE_LENGTH * _left(self.length):
             return ""
-        if self.left < (most if self.length is None else DOUBTFUL * known.strength):
+        if self.left < (limit if self.length is None else DOUBTFUL * known.strength):
             return ""
-        reason = self.mend()
-        if reason is None and self.left < most:
+        reason = self.find_fault()
+        if reason is None and self.left < limit:
             return ""
-        beside = "" if self.length is None else f", of the length {_two(_left(self.length))} {unit}"
+        length = "" if self.length is None else f", with the length {_two(_left(self.length))} {unit}"
         return (
-            f"with the {self.what} {_two(self.left)} {unit} of the field of {_two(known.strength)} {unit} are left in "
-            f"each axis{beside}. {_reason(self.what, reason, unit)}"
+            f"with the {self.what} the residual in each axis is {_two(self.left)} {unit} of the field of "
+            f"{_two(known.strength)} {unit}{length}. {_reason(self.what, reason, unit)}"
         )
 
 
 def _compared_by_attitude(usable: Recording, view: AttitudeView, length: NormView | None) -> _Compared[AttitudeView]:
     unbent = view.measured @ _matrix(view, length).mT
-    left = min(_left(view), left_by_attitude(unbent, view.to_world, stretches(view.time)))
+    left = min(_left(view), misfit_of_attitude(unbent, view.to_world, stretches(view.time)))
 
-    def mend() -> Fault | None:
-        return mend_of_attitude(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
+    def find_fault() -> Fault | None:
+        return attitude_fault(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
 
-    return _Compared("attitude", view, length, left, mend)
+    return _Compared("attitude", view, length, left, find_fault)
 
 
 def _compared_by_gyroscope(usable: Recording, view: GyroView, length: NormView | None) -> _Compared[GyroView]:
     unbent = view.measured @ _matrix(view, length).mT
-    left = min(_left(view), left_by_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
+    left = min(_left(view), misfit_of_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
 
-    def mend() -> Fault | None:
+    def find_fault() -> Fault | None:
         rate = usable.stack(*GYRO)
-        return mend_of_gyroscope(_calibrated(view, length), view.time, rate, view.window, view.first, left)
+        return gyroscope_fault(_calibrated(view, length), view.time, rate, view.window, view.first, left)
 
-    return _Compared("gyroscope", view, length, left, mend)
+    return _Compared("gyroscope", view, length, left, find_fault)
 
 
 def _length(recording: Recording) -> NormView | None:
@@ -176,7 +176,7 @@ def _left(view: View) -> float:
 
 
 def _matrix(view: View, length: NormView | None) -> Tensor:
-    """The calibration matrix of the length, which no wrong turn spoils; without a length, that of the view."""
+    """The calibration matrix of the length's view, which wrong turns do not affect; without a length, of the view."""
     known = view if length is None else length
     return known.matrix(known.start())
 
@@ -195,17 +195,18 @@ _TRIED = {
     "attitude": "Neither its inverse, another order of the quaternion",
     "gyroscope": "Neither another sign, degrees for radians, other axes",
 }
+"""Corrections that were tried, except shifts in time."""
 
 
-def _reason(what: str, mend: Fault | None, unit: str) -> str:
-    if mend is None:
+def _reason(what: str, fault: Fault | None, unit: str) -> str:
+    if fault is None:
         return (
-            f"{_TRIED[what]} nor a shift in time of up to {LAG:g} s mends it; see that it is of this recording and of "
-            "this sensor."
+            f"{_TRIED[what]} nor a shift in time of up to {LAG:g} s corrects it; check that it belongs to this "
+            "recording and this sensor."
         )
-    return f"{mend.sentence} Without that {_two(mend.left)} {unit} would be left; mend it to use it."
+    return f"{fault.sentence} Without this fault the residual would be {_two(fault.left)} {unit}; correct it to use it."
 
 
 def _two(value: float) -> str:
-    """Two digits, without an exponent."""
+    """A number to two digits, without an exponent."""
     return f"{float(f'{value:.2g}'):.10g}"

@@ -1,4 +1,4 @@
-"""The field that a calibrated magnetometer saw, in any recording of it."""
+"""The calibrated field of a fitted magnetometer in any recording of it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ if TYPE_CHECKING:
 __all__ = ["MagnetometerCorrection"]
 
 _PARAMETERS = {"norm": 9, "gyro": 15, "attitude": 14}
-"""Numbers of each view's parameters."""
+"""Number of parameters of each view."""
 
 
 class MagnetometerCorrection:
     """``matrix @ (measured - change - offset)`` on any recording of the sensor.
 
     Args:
-        state: of the view that was fitted.
-        recording: with ``mag_x``, ``mag_y``, ``mag_z``.
+        state: state of the fitted view.
+        recording: a recording with ``mag_x``, ``mag_y``, ``mag_z``.
+
+    Raises:
+        ValueError: the state has an unknown view.
     """
 
     def __init__(self, state: Mapping[str, Any], recording: Recording) -> None:
@@ -41,6 +44,11 @@ class MagnetometerCorrection:
         self.ports = {"sensor": Port(AXES, recording.units["mag_x"])}
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        """The calibrated field as ``field_x``, ``field_y``, ``field_z``.
+
+        Raises:
+            ValueError: the number of parameters does not fit the view.
+        """
         if len(theta) != self._count:
             raise ValueError(
                 f"The model has {len(theta)} parameters of its sensor and not {self._count}; it may be of another "

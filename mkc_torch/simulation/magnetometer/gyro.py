@@ -1,4 +1,4 @@
-"""A magnetometer compared by the field's vector within seconds, along which a gyroscope turns it."""
+"""A magnetometer compared by the field vector within windows of seconds, rotated by a gyroscope."""
 
 from __future__ import annotations
 
@@ -22,18 +22,23 @@ if TYPE_CHECKING:
 __all__ = ["GyroView"]
 
 WINDOW = 2.0
-"""Length in s over which a gyroscope's rotation is trusted; each window has its own unknown direction of the field."""
+"""Length in s of the windows within which a gyroscope is integrated; each has its own unknown field direction."""
 
 GYRO_BIAS = 0.02
-"""Standard deviation of a gyroscope's bias in rad/s before the data speak."""
+"""Prior standard deviation of a gyroscope's bias in rad/s."""
 
-_REWEIGHTED, _TURNED = 10, 1e-3
+_REWEIGHTED = 10
+"""Number of reweighted least-squares iterations."""
+
+_TURNED = 1e-3
+"""Smallest ratio of eigenvalues at which the turns determine the offset."""
 
 
 class GyroView(View):
-    """The vector, turned by the gyroscope to the first sample of its window: along that window's field, and across.
+    """The field vector, rotated by the gyroscope to the first sample of its window: along the field, and across it.
 
-    The matrix is any: it also turns the magnetometer's axes into those of the gyroscope, which no length shows.
+    The matrix is a general matrix: it also rotates the magnetometer's axes to the gyroscope's, which the length does
+    not determine.
     """
 
     view = "gyro"
@@ -64,7 +69,7 @@ class GyroView(View):
             self._full = torch.cat([offset, torch.eye(3).to(offset).flatten(), offset.new_zeros(3)])
             self.warnings = (
                 *self.warnings,
-                f"The gyroscope stands in for turns that are missing: {error}",
+                f"The gyroscope replaces missing turns: {error}",
             )
         else:
             self.strength = float(fit.radius_)
@@ -75,18 +80,18 @@ class GyroView(View):
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
 
     def _offset_by_turns(self, error: NotIdentifiableError) -> Tensor:
-        """The offset that leaves the field of each window steady, by reweighted least squares; the matrix is 1.
+        """The offset for which the field of each window is constant, by reweighted least squares; the matrix is 1.
 
         Raises:
             NotIdentifiableError: ``error``, where the turns do not determine the offset either.
         """
-        seen = rotated(self.measured, self.turned)
-        weight = seen.new_ones(len(seen), 1)
-        offset = seen.new_zeros(3)
+        field = rotated(self.measured, self.turned)
+        weight = field.new_ones(len(field), 1)
+        offset = field.new_zeros(3)
         for _ in range(_REWEIGHTED):
-            mean = self._window_mean(seen, weight)[self.window]
+            mean = self._window_mean(field, weight)[self.window]
             turned = self._window_mean(self.turned.flatten(1), weight)[self.window].unflatten(-1, (3, 3))
-            regressors, target = (self.turned - turned), seen - mean
+            regressors, target = (self.turned - turned), field - mean
             gram = torch.einsum("kai,k,kaj->ij", regressors, weight[:, 0], regressors)
             known = torch.linalg.eigvalsh(gram)
             if not bool(known[0] > _TURNED * known[-1]):
@@ -94,8 +99,9 @@ class GyroView(View):
             offset = torch.linalg.lstsq(
                 gram, torch.einsum("kai,k,ka->i", regressors, weight[:, 0], target).unsqueeze(-1)
             ).solution.squeeze(-1)
-            left = torch.linalg.vector_norm(target - regressors @ offset, dim=-1, keepdim=True)
-            weight = torch.exp(-0.5 * (left / (2.0 * left.median().clamp(min=1e-9))).square()).clamp(min=1e-12)
+            distance = torch.linalg.vector_norm(target - regressors @ offset, dim=-1, keepdim=True)
+            scale = distance.median().clamp(min=1e-9)
+            weight = torch.exp(-0.5 * (distance / (2.0 * scale)).square()).clamp(min=1e-12)
         return offset
 
     def _theta(self, fit: EllipsoidFit) -> Tensor:
@@ -109,15 +115,15 @@ class GyroView(View):
         strength, added = self._strength(theta), self._field_change(changes)
         ambient = (strength if added is None else strength + added) * direction[self.window]
         frame = _frame(direction.detach())[self.window]
-        # as the sensor has it: the matrix would shrink the noise of what it is fitted to. A fixed one takes it back
-        left = rotated(along - ambient, self.turned.mT)
-        left = torch.linalg.solve(self.matrix(theta), left.mT).mT @ self._unbent.mT
-        return rotated(rotated(left, self.turned), frame)
+        # in units of the measurement: the fitted matrix would shrink the noise; a fixed matrix calibrates the residual
+        difference = rotated(along - ambient, self.turned.mT)
+        difference = torch.linalg.solve(self.matrix(theta), difference.mT).mT @ self._unbent.mT
+        return rotated(rotated(difference, self.turned), frame)
 
     def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
-        """The calibrated field in the axes of its window's first sample."""
+        """The calibrated field in the sensor frame of its window's first sample."""
         along = rotated(field, self.turned)
-        # a bias b, small, turns what has been summed up since the window's first sample by the integral of turned · b
+        # a small bias b rotates it by the integral of turned · b since the window's first sample
         return along - torch.linalg.cross(self.summed @ theta[12:15], along)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
@@ -132,7 +138,7 @@ class GyroView(View):
         return total / weight.new_zeros(self.count, 1).index_add(0, self.window, weight)[:, :1]
 
     def _weights(self, along: Tensor) -> Tensor:
-        """Of each sample in its window's mean: one step of Welsch's estimator from a Huber mean, as constants."""
+        """Weights of the samples in the mean of their window, constant in the fit: three redescending reweightings."""
         weight = along.new_ones(len(along), 1)
         for cut in (2.0, 1.0, 1.0):
             distance = torch.linalg.vector_norm(
@@ -152,7 +158,7 @@ def _frame(direction: Float[Tensor, "W 3"]) -> Float[Tensor, "W 3 3"]:
 
 
 def _windows(time: Tensor) -> tuple[Tensor, Tensor]:
-    """The window of each sample, and the first sample of that window; a gap starts a new one."""
+    """The window of each sample, and the first sample of that window; a gap starts a new window."""
     number = torch.floor((time - time[0]) / WINDOW).long()
     number[1:] += gaps(time).cumsum(0)
     _, window, counts = torch.unique_consecutive(number, return_inverse=True, return_counts=True)
@@ -161,7 +167,7 @@ def _windows(time: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _prior() -> GaussianPrior:
-    """Of the matrix, as where an attitude is recorded, and of the gyroscope's bias."""
+    """The prior of the matrix about the identity, and of the gyroscope's bias about 0."""
     mean = torch.zeros(15, dtype=torch.float64)
     precision = torch.zeros(15, dtype=torch.float64)
     mean[3:12] = torch.eye(3, dtype=torch.float64).flatten()
@@ -173,5 +179,5 @@ def _summed(turned: Tensor, time: Tensor, first: Tensor) -> Tensor:
     """Integral of the rotation over time since the first sample of each window, (N, 3, 3), by trapezoids."""
     step = 0.5 * (turned[1:] + turned[:-1]) * time.diff()[:, None, None]
     total = torch.cat([torch.zeros_like(turned[:1]), step.cumsum(0)])
-    # between windows the frames differ, but what was summed before a window's first sample is taken off
+    # frames differ between windows, but the sum before a window's first sample is subtracted
     return total - total[first]

@@ -1,4 +1,4 @@
-"""Where a recorded heading jumps and the gyroscope says that nothing turned."""
+"""Jumps of a recorded heading while the gyroscope shows no turn."""
 
 from __future__ import annotations
 
@@ -16,25 +16,33 @@ if TYPE_CHECKING:
 __all__ = ["HeadingJump", "heading_jumps"]
 
 LEAST = 3.0
-"""A smaller jump, in °, is not told of."""
+"""Smallest jump in °."""
 
 MOST = 8
-"""Of more jumps the largest are told of."""
+"""Largest number of jumps; of more jumps the largest are reported."""
 
 _CLEAR = 30.0
-"""Times the robust scale of how far attitude and gyroscope are apart from one sample to the next."""
+"""Smallest jump in robust scales of the difference of attitude and gyroscope between two samples."""
 
 _LASTS = 1.0
-"""A jump that others take back within so many s is a glitch of the attitude, whose samples are outliers."""
+"""Seconds within which a jump that is reversed is a glitch of the attitude, whose samples are outliers."""
 
 
-_FEW, _MOVED = 5, 3.0
-"""Samples to either side of a gap, and the robust scales of how far the field goes from one sample to the next, beyond
-which their medians are another field."""
+_FEW = 5
+"""Number of samples on each side of a gap whose medians are compared."""
+
+_MOVED = 3.0
+"""Change of the median field across a gap, in robust scales of the change between two samples, that is a turn."""
 
 
 class HeadingJump(NamedTuple):
-    """Between two samples, the first ``after`` which the heading is another; by how much, in °; and the gyroscope's."""
+    """A jump of the heading between two samples.
+
+    Attributes:
+        after: number of the sample before the jump.
+        size: size of the jump in °.
+        turned: turn by the gyroscope in the same interval, in °.
+    """
 
     after: int
     size: float
@@ -47,18 +55,18 @@ def heading_jumps(
     rate: Float[Tensor, "N 3"],
     measured: Float[Tensor, "N 3"],
 ) -> tuple[HeadingJump, ...]:
-    """The intervals in which a recorded attitude turns about the vertical, and the gyroscope clearly does not.
+    """The intervals in which a recorded attitude turns about the vertical and the gyroscope clearly does not.
 
-    Filters of autopilots set their heading anew by the compass, at arming or take-off: the attitude is recorded with an
-    error until then, or from then on. A jump counts that is larger than the turn of the gyroscope in the same interval
-    and is not taken back within a second; of more than eight the largest. What a gyroscope did in a gap of the
-    recording is not known: there a jump counts only where the magnetometer shows that the sensor did not turn.
+    Filters of autopilots reset their heading by the compass at arming or take-off: the attitude has an error before or
+    after. A jump is larger than the turn by the gyroscope in the same interval and not reversed within a second; of
+    more than eight jumps the largest are returned. Turns in gaps of the recording are not known: a jump in a gap is
+    returned only if the magnetometer shows that the sensor did not turn.
 
     Args:
-        time: in s, ascending.
-        to_world: rotations from the body to a world whose third axis is vertical.
-        rate: angular rate in the body's axes, in rad/s; NaN where it is not known.
-        measured: by a magnetometer, in any unit.
+        time: (N,), in s, ascending.
+        to_world: rotations from the sensor frame to a world frame whose third axis is vertical.
+        rate: angular rate in the sensor frame, in rad/s; NaN where it is not known.
+        measured: measurement of a magnetometer, in any unit.
 
     Example:
         >>> time = torch.arange(100.0)
@@ -72,24 +80,24 @@ def heading_jumps(
     if len(time) < 2:
         return ()
     apart = to_world[1:] @ (to_world[:-1] @ turns(time, rate)).mT
-    # the heading of the rotation that is nearest
+    # the heading of the nearest rotation about the vertical
     size = torch.rad2deg(torch.atan2(apart[:, 1, 0] - apart[:, 0, 1], apart[:, 0, 0] + apart[:, 1, 1]))
     turned = torch.rad2deg(0.5 * torch.linalg.vector_norm(rate[1:] + rate[:-1], dim=-1) * time.diff())
     known = size.isfinite() & ~_turned_in_a_gap(time, measured)
     if not bool(known.any()):
         return ()
-    least = max(LEAST, _CLEAR * float(robust_scale(size[known].unsqueeze(-1))))
-    clear = known & (size.abs() > least) & (size.abs() > turned)
+    threshold = max(LEAST, _CLEAR * float(robust_scale(size[known].unsqueeze(-1))))
+    clear = known & (size.abs() > threshold) & (size.abs() > turned)
     at = clear.nonzero().squeeze(-1)
     near = (time[at, None] - time[at]).abs() < _LASTS
-    left = (near * size[at]).sum(-1).abs()
-    at = at[left > 0.5 * size[at].abs()]
+    net = (near * size[at]).sum(-1).abs()
+    at = at[net > 0.5 * size[at].abs()]
     at = at[size[at].abs().argsort(descending=True)[:MOST]].sort().values
     return tuple(HeadingJump(number, float(size[number]), float(turned[number])) for number in at.tolist())
 
 
 def _turned_in_a_gap(time: Float[Tensor, " N"], measured: Float[Tensor, "N 3"]) -> Bool[Tensor, " n"]:
-    """Of the intervals between samples those that are gaps, with another field after them than before."""
+    """The mask of the intervals between samples that are gaps across which the field changes."""
     gap = gaps(time)
     noise = float(robust_scale(torch.linalg.vector_norm(measured.diff(dim=0), dim=-1, keepdim=True)))
     for k in gap.nonzero().flatten().tolist():

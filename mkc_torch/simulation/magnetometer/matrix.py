@@ -1,4 +1,4 @@
-"""Calibration matrices of a magnetometer's parameters, by what it is compared with."""
+"""Calibration matrices from a magnetometer's parameters, by view."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from torch import Tensor
 __all__ = ["MATRIX_OF_VIEW", "SOFT_IRON", "SYMMETRIC"]
 
 SOFT_IRON = 0.1
-"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix. Weak
-against a sensor that is turned through all directions; it decides for the identity where a vehicle never tilts."""
+"""Prior standard deviation of the matrix about the identity, by soft iron, gains and misalignment. It is weak for a
+sensor that turns through all directions, and selects the identity for a vehicle that never tilts."""
 
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Entries of a symmetric matrix, in the order of its parameters."""

@@ -1,4 +1,4 @@
-"""A magnetometer compared by the length of the field."""
+"""A magnetometer compared by the field strength."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ __all__ = ["NormView"]
 
 
 class NormView(View):
-    """Length of the field: one channel, the distance from the ellipsoid to first order, in the measurement's units.
+    """Field strength: one channel, the first-order distance from the ellipsoid, in the measurement's unit.
 
-    Where all samples together determine no ellipsoid, a part of the recording may: the sensor is determined then
-    together with what changed it meanwhile, and a fit starts from that part.
+    Where all samples together determine no ellipsoid, a part of the recording may determine it: a fit starts from that
+    part, and the sensor is fitted together with the change of it.
 
     Args:
-        recording: as prepared.
-        sphere: take the sphere nearest to the samples to start from, where no part determines an ellipsoid either, but
-            enough directions are there.
+        recording: the prepared recording.
+        sphere: start from the sphere nearest to the samples if no part determines an ellipsoid either but enough
+            directions are covered.
 
     Raises:
-        NotIdentifiableError: the turns of the sensor do not determine it from the length.
+        NotIdentifiableError: the turns of the sensor do not determine it from the field strength.
     """
 
     view = "norm"
@@ -53,18 +53,18 @@ class NormView(View):
             "field": Port(("strength",), self.unit),
         }
         self.alone = True
-        """Whether the length determines the sensor without what changed it meanwhile."""
+        """Whether the field strength determines the sensor without a change of it."""
         try:
             fit = self._ellipsoid(None)
         except NotIdentifiableError as error:
-            surface = self._of_less(sphere)
+            surface = self._surface_of_part(sphere)
             if surface is None:
                 raise
             self.alone = False
             self.strength = surface.radius
             self._full = _numbers(surface.center, surface.matrix)
             self.prior = _near(self._full)
-            self.warnings = (*self.warnings, _of_what(surface, self, error))
+            self.warnings = (*self.warnings, _start_warning(surface, self, error))
         else:
             self.strength = float(fit.radius_)
             self._full = self._theta(fit)
@@ -72,7 +72,8 @@ class NormView(View):
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
 
-    def _of_less(self, sphere: bool) -> Surface | None:
+    def _surface_of_part(self, sphere: bool) -> Surface | None:
+        """The ellipsoid of a part of the recording, else with ``sphere`` the sphere of all samples, else None."""
         chosen = thinned(self.thin)
         found = ellipsoid_of_a_part(self.measured, chosen)
         return sphere_of_all(self.measured, chosen) if found is None and sphere else found
@@ -89,11 +90,11 @@ class NormView(View):
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         away = self._away(theta, {}).mT
         length, outward = self._length(theta, away)
-        # a step against the steepest ascent of the length, as far as that is off
+        # a gradient step that brings the length to the field strength, to first order
         return (away - (length - self._strength(theta)) * length * outward / outward.square().sum(0)).mT
 
     def _length(self, theta: Tensor, away: Float[Tensor, "3 N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
-        """Length of the calibrated field, and that times its gradient by the measurement."""
+        """Length of the calibrated field, and its gradient by the measurement times the length."""
         matrix = self.matrix(theta)
         field = matrix @ away
         return length_of(field), matrix.mT @ field
@@ -104,20 +105,20 @@ def _numbers(center: Float[Tensor, " 3"], matrix: Float[Tensor, "3 3"]) -> Float
 
 
 def _near(theta: Float[Tensor, " 9"]) -> GaussianPrior:
-    """Of the matrix alone: without what is sought, the samples determine none."""
+    """The prior of the matrix only: without the effects, the samples do not determine it."""
     precision = torch.zeros_like(theta)
     precision[3:] = SOFT_IRON**-2
     return GaussianPrior(theta.clone(), precision)
 
 
-def _of_what(surface: Surface, view: View, error: NotIdentifiableError) -> str:
-    """A sentence about what a fit starts from."""
+def _start_warning(surface: Surface, view: View, error: NotIdentifiableError) -> str:
+    """A sentence about the start of a fit."""
     if (surface.first, surface.last) == (0, len(view.measured)):
         what = "the sphere nearest to all samples"
     else:
         begin, end = float(view.time[surface.first]), float(view.time[surface.last - 1])
         what = f"the ellipsoid of the samples from {begin:.4g} to {end:.4g} s"
     return (
-        f"All samples together determine no ellipsoid; offset and matrix start from {what}, and hold together with "
-        f"what changed the sensor meanwhile. {error}"
+        f"All samples together determine no ellipsoid; offset and matrix start from {what}, and are valid together "
+        f"with the change of the sensor. {error}"
     )

@@ -1,4 +1,4 @@
-"""Where all samples together draw no ellipsoid: the part of a recording that does, or the sphere nearest to all."""
+"""Start surfaces if all samples together determine no ellipsoid: the ellipsoid of a part, or the nearest sphere."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 __all__ = ["Surface", "ellipsoid_of_a_part", "sphere_of_all"]
 
 INFORMATION = 0.02
-"""Least information, as a share of even coverage, of a part's directions: below, noise shrinks its ellipsoid to a third
-of what it is, and the directions seem to be more than they are."""
+"""Smallest information of a part's directions, as a share of even coverage: below it, noise shrinks the ellipsoid to a
+third, and the coverage is overestimated."""
 
 SCATTER = 0.04
-"""Share of its radius by which the samples of a part may scatter about its ellipsoid: those of a sensor in a steady
-field scatter by 0.01 to 0.03, and in its part nothing is to have changed it."""
+"""Largest scatter of a part's samples about its ellipsoid, as a share of the radius: a sensor in a steady field
+scatters by 0.01 to 0.03, and in this part nothing must have changed the sensor."""
 
 _PARTS = (2, 3, 4)
-"""Of how many equal parts each is tried, half a part apart: what changes the sensor once leaves one of them whole."""
+"""Numbers of equal parts to try, half a part apart: a single change of the sensor leaves one of them unaffected."""
 
 
 class Surface(NamedTuple):
-    """Centre, the matrix that makes a sphere of the surface, that sphere's radius; the samples that drew it."""
+    """An ellipsoid: centre, matrix to a sphere, and radius of that sphere; from samples ``first`` to ``last`` - 1."""
 
     center: Float[Tensor, " 3"]
     matrix: Float[Tensor, "3 3"]
@@ -42,10 +42,10 @@ class Surface(NamedTuple):
 
 
 def ellipsoid_of_a_part(points: Float[Tensor, "N 3"], chosen: Int[Tensor, " n"]) -> Surface | None:
-    """The ellipsoid of the part of a recording that determines one best; None where no part does.
+    """The ellipsoid of the part of a recording that determines it best; None if no part determines an ellipsoid.
 
     Args:
-        points: in the order of time.
+        points: measurements in the order of time.
         chosen: numbers of the samples in use, ascending.
 
     Example:
@@ -69,16 +69,16 @@ def ellipsoid_of_a_part(points: Float[Tensor, "N 3"], chosen: Int[Tensor, " n"])
         spread = float(robust_scale(fit.residual_.unsqueeze(-1)) / fit.radius_)
         if spread > SCATTER:
             continue
-        # how well its worst coefficient is known, up to a factor: noise over the root of what determines it
-        unsure = spread / (len(part) * known) ** 0.5
-        if best is None or unsure < best[0]:
+        # standard error of its worst coefficient, up to a factor
+        error = spread / (len(part) * known) ** 0.5
+        if best is None or error < best[0]:
             surface = Surface(fit.center_, fit.calibration_matrix_, float(fit.radius_), int(part[0]), int(part[-1]) + 1)
-            best = unsure, surface
+            best = error, surface
     return None if best is None else best[1]
 
 
 def sphere_of_all(points: Float[Tensor, "N 3"], chosen: Int[Tensor, " n"]) -> Surface | None:
-    """The sphere nearest to the samples; None where they scatter widely about it, or leave too many directions out."""
+    """The sphere nearest to the samples; None if they scatter widely about it, or cover too few directions."""
     taken = points[chosen]
     middle = taken.median(0).values
     away = taken - middle

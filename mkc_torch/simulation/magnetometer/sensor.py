@@ -1,4 +1,4 @@
-"""The magnetometer as a simulation: which view of a recording is compared."""
+"""The magnetometer as a simulation."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ __all__ = ["Magnetometer"]
 
 @dataclass(frozen=True)
 class Magnetometer:
-    """``matrix @ (measured - offset)`` is the ambient field in the sensor's axes, of constant strength and direction.
+    """``matrix @ (measured - offset)`` is the ambient field in the sensor frame, of constant strength and direction.
 
-    What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its
-    length with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not
-    determine it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned
-    along. An attitude or a gyroscope that leaves far more of the field than its length does is not used where the
-    length determines the sensor, alone or together with what changed it; a warning says which, how much and why.
+    The comparison depends on the recording. With an attitude, the field vector is compared with the ambient field in
+    the world frame. Otherwise its length is compared with the field strength, as a distance in the unit of the
+    measurement; where the turns of the sensor do not determine it from the length but there is a gyroscope, the vector
+    is compared with the field within windows of 2 s, rotated by the gyroscope. An attitude or a gyroscope with a far
+    larger residual than the length's is not used if the length determines the sensor, alone or together with a change
+    of it; a warning states the residuals and the probable fault.
 
     Attributes:
-        use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows and that
-            explains the field. The length goes before the gyroscope because the drift of a gyroscope enters the vector
-            as structure of its own.
+        use: "attitude", "norm" or "gyro"; None selects the first of these that the recording allows and that explains
+            the field. The length is preferred to the gyroscope, whose drift adds structure to the vector's residual.
 
     Example:
         >>> from mkc_torch.recording.demonstration import simulated_recording
@@ -55,13 +55,13 @@ class Magnetometer:
         return frozenset(f"mag_{a}" for a in AXES)
 
     def prepare(self, recording: Recording) -> NormView | AttitudeView | GyroView:
-        """The magnetometer of a recording.
+        """The magnetometer together with a recording.
 
         Raises:
-            MissingColumnError: a column of the magnetometer, or of what ``use`` asks for, is not there.
+            MissingColumnError: a column of the magnetometer, or a column that ``use`` requires, is missing.
             RecordingError: too few usable samples.
-            NotIdentifiableError: no view determines the sensor; the message names the directions that are missing.
-            ValueError: ``use`` is none of the three.
+            NotIdentifiableError: no view determines the sensor; the message names the missing directions.
+            ValueError: ``use`` has another value.
         """
         if self.use not in (None, "attitude", "gyro", "norm"):
             raise ValueError(f"Expected argument `use` to be 'attitude', 'gyro', 'norm' or None but got {self.use!r}.")

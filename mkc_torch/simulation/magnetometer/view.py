@@ -1,4 +1,4 @@
-"""What all comparisons of a magnetometer share: the measured field and the sensor's model."""
+"""The base class of all views of a magnetometer: the measured field and the sensor's model."""
 
 from __future__ import annotations
 
@@ -30,17 +30,20 @@ ACCEL = ("accel_x", "accel_y", "accel_z")
 AXES = ("x", "y", "z")
 
 VECTOR = ("along", "across_1", "across_2")
-"""Channels of a compared vector."""
+"""Channels of a compared vector: along the field, and two axes across it."""
 
 INDEPENDENT = (True, False, False)
-"""The error of a rotation is across the field, in residual and signal alike."""
+"""Independence of the channels: errors of a rotation are across the field, in the residual and in the signal."""
 
 _MOSTLY = 0.5
+"""Share of the recording at rest from which there is a warning."""
+
 _ENOUGH = 1500
+"""Number of samples for the start of a fit."""
 
 
 class View(ClosedForm):
-    """The measured field, the sensor's model, and what is compared."""
+    """The measured field, the sensor's model, and their comparison."""
 
     name = "magnetometer"
     view: str
@@ -48,7 +51,7 @@ class View(ClosedForm):
     strength: float
     bounds: tuple[Tensor, Tensor] | None = None
     wrong_turns: str = ""
-    """What is wrong with the turns that it is compared by, as sentences; empty where nothing is."""
+    """Sentences about the fault of the turns used in the comparison; empty if there is no fault."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -61,7 +64,7 @@ class View(ClosedForm):
 
     @property
     def state(self) -> dict[str, str | float]:
-        """What a model needs on another recording, and what the corrected field's length was here, in which unit."""
+        """Constants for the correction of another recording: the view, and the field strength with its unit."""
         return {"view": self.view, "unit": self.unit, "strength": self.strength}
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
@@ -79,24 +82,24 @@ class View(ClosedForm):
         changes: Changes,  # noqa: ARG002
         near: Nearby | None = None,  # noqa: ARG002
     ) -> Mapping[str, Float[Tensor, "N 3"]]:
-        """At the port "sensor", the simulated field as the sensor's own axes and gains show it."""
-        # not the measured one: its noise is the residual's too, and would pass for a nonlinearity
+        """At the port "sensor", the simulated measurement without the offset."""
+        # not the measured field: its noise is also in the residual, and would look like a nonlinearity
         return {"sensor": self.simulated(theta)}
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        """The measurement as simulated, less its offset."""
+        """The simulated measurement without the offset, (N, 3)."""
         raise NotImplementedError
 
     def matrix(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
-        """Calibration matrix of the parameters."""
+        """The calibration matrix, (3, 3)."""
         return MATRIX_OF_VIEW[self.view](theta)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        """The calibrated field, with what changes the sensor taken off the measurement."""
+        """The calibrated field, with the changes at the port "sensor" removed from the measurement."""
         return self._away(theta, changes) @ self.matrix(theta).mT
 
     def _away(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        """The measurement from the offset, with what changes the sensor taken off it."""
+        """The measurement without the offset and the changes at the port "sensor"."""
         away = make_dual(self.measured, theta[0])
         if "sensor" in changes:
             change = changes["sensor"]
@@ -106,16 +109,16 @@ class View(ClosedForm):
         return away - theta[:3]
 
     def _field_change(self, changes: Changes) -> Tensor | None:
-        """What is added to the field, (N, channels of the port), if anything."""
+        """The change at the port "field", (N, channels of the port); None without a change."""
         return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else None
 
     def _strength(self, theta: Float[Tensor, " p"]) -> Float[Tensor, ""]:
-        """Length of the field."""
+        """The field strength."""
         return make_dual(self.measured.new_tensor(self.strength), theta[0])
 
     def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
         chosen = thinned(self.thin if rows is None else self.thin & rows)
-        # what is sought may scatter the samples as widely as noise does
+        # effects may scatter the samples as widely as noise
         ellipsoid = EllipsoidFit(LeastTrimmedSquares(), max_scatter=math.inf)
         if rows is None:
             return ellipsoid.fit(self.measured[chosen])
@@ -126,21 +129,22 @@ class View(ClosedForm):
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+    """Lengths of column vectors."""
     return vectors.square().sum(0).sqrt()
 
 
 def thinned(taken: Bool[Tensor, " N"]) -> Int[Tensor, " n"]:
-    """Numbers of the samples taken; evenly, as many of them as a place to start a fit from needs."""
+    """Evenly spaced numbers of the samples taken, as many as the start of a fit needs."""
     numbers = torch.nonzero(taken).flatten()
     return numbers[:: max(1, len(numbers) // _ENOUGH)]
 
 
 def _rests(turns: Tensor | None) -> tuple[str, ...]:
-    """A sentence about a sensor that rests most of the time."""
+    """A warning if the sensor rests most of the time; else empty."""
     rest = 0.0 if turns is None else 1.0 - float(turns.double().mean())
     if rest <= _MOSTLY:
         return ()
     return (
         f"The sensor rests for {100.0 * rest:.0f} % of the recording. While it rests, a change of its offset shows in "
-        "one direction alone, or not at all; keep it turning.",
+        "one direction only, or not at all; keep it turning.",
     )

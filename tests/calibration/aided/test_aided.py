@@ -1,4 +1,4 @@
-"""Vehicles that hardly tilt: what a gyroscope or an attitude determines, and what it does not."""
+"""Vehicles that hardly tilt: what a gyroscope or an attitude determines, and what remains undetermined."""
 
 import json
 import math
@@ -53,7 +53,7 @@ def test_it_tells_by_what_and_its_standard_errors_hold(drawn, found):
     aid = found.aid
     assert (aid.by, aid.response) == ("gyroscope", "full matrix")
     assert {name for name, value in aid.evidence if value == 0.0} == {"full matrix"}
-    assert any("the gyroscope stands in" in w and "Not identifiable" not in w for w in found.warnings)
+    assert any("the gyroscope replaces the missing turns" in w and "Not identifiable" not in w for w in found.warnings)
     off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
     assert float(off.abs().max()) < 4.0
     assert 0.0 < aid.heading_error < 1.5
@@ -89,7 +89,7 @@ def test_the_report_says_what_stood_in(drawn, found):
 
 
 def level(seconds=30.0, rate=50.0, noise=0.3):
-    """A vehicle that turns about its vertical alone, and its heading."""
+    """A vehicle that only turns about its vertical, and its heading."""
     draw = torch.Generator().manual_seed(3)
     t = torch.arange(round(seconds * rate), dtype=torch.float64) / rate
     yaw_rate = 0.5 + 0.3 * torch.sin(0.4 * t)
@@ -109,7 +109,7 @@ def test_what_a_level_vehicle_does_not_determine_is_named_and_never_invented():
     assert json.loads(c.to_json())["center"]["standard_error"][2] is None
     assert c.center[:2] == pytest.approx((5.0, -8.0), abs=0.5)
     assert any("Not determined: the offset of z" in w for w in c.warnings)
-    # and a level heading is good all the same
+    # and a level heading is still accurate
     field = c.corrected(torch.stack([columns[name] for name in MAG], -1))
     off = torch.rad2deg(torch.atan2(field[:, 0], field[:, 1]) - yaw)
     off = (off + 180.0) % 360.0 - 180.0
@@ -152,32 +152,32 @@ def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
     swapped = {"mag_x": r["mag_y"], "mag_y": r["mag_x"]}
     with pytest.raises(NotIdentifiableError, match=r"With the gyroscope: .*x and y seem exchanged"):
         calibrate(changed(r, **swapped))
-    with pytest.raises(NotIdentifiableError, match="With the gyroscope: the gyroscope does not turn as the field does"):
+    with pytest.raises(NotIdentifiableError, match="With the gyroscope: the gyroscope does not turn like the field"):
         calibrate(changed(r, **{name: 57.3 * r[name] for name in GYRO}))
 
 
 def test_a_response_that_exchanges_axes_is_told():
-    told, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope")
-    assert "x is z of the magnetometer, y is x of the magnetometer, z is minus y" in told
+    sentence, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope")
+    assert "x is z of the magnetometer, y is x of the magnetometer, z is minus y" in sentence
     assert bool((rest.diagonal() > 6.0).all())
     assert exchanged(torch.eye(3).double(), "gyroscope")[0] == ""
 
 
 @pytest.mark.parametrize(
-    ("order", "signs", "told"),
+    ("order", "signs", "words"),
     [
         ((0, 1, 2), (1, 1, 1), None),
         ((0, 2, 1), (1, 1, 1), "y and z seem exchanged"),
         ((0, 1, 2), (1, -1, 1), "y seems to have the other sign"),
-        ((2, 0, 1), (1, 1, 1), "axes seem to be others"),
+        ((2, 0, 1), (1, 1, 1), "axes seem to differ from the attitude's"),
     ],
 )
-def test_axes_are_checked_against_the_attitude(drawn, order, signs, told):
+def test_axes_are_checked_against_the_attitude(drawn, order, signs, words):
     turns = turns_of_attitude(quaternions(drawn.to_world))
     body = (drawn.to_world.mT @ drawn.field) @ drawn.response.mT + drawn.offset
     seen = body[:, list(order)] * torch.tensor(signs)
     found = mounting(seen, turns, torch.zeros_like(turns.window), float(drawn.field.norm()), "attitude")
-    assert found is None if told is None else told in found.sentence
+    assert found is None if words is None else words in found.sentence
 
 
 def test_a_sensor_at_rest_is_refused_with_a_gyroscope_too():
@@ -200,7 +200,7 @@ def test_slopes_of_the_turns_are_those_of_differences():
         step = torch.zeros(12).double()
         step[k] = 1e-5
         moved = turns_of_gyroscope(time, rate, run, step)
-        # errors are taken off the rates, and turn the frame the other way
+        # errors are subtracted from the rates, and rotate the frame in the opposite direction
         turn = (at.to_frame @ moved.to_frame.mT - torch.eye(3)) / 1e-5
         skew = torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
         assert torch.allclose(skew, at.summed[:, :, k], atol=2e-3 * float(at.summed.abs().max()))

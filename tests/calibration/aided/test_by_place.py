@@ -1,4 +1,4 @@
-"""Place and date alone: the field's length and how far it points down, for a vehicle that turns on level ground."""
+"""Only place and date: calibration by the field's length and inclination, for a vehicle on level ground."""
 
 import math
 
@@ -31,13 +31,13 @@ def field_of(draw, strength=1.0):
 
 
 def level(tilt=0.0, count=1200, vertical=-42.0):
-    """A vehicle that turns on level ground, and leans to and fro by so many rad."""
+    """A vehicle that turns on level ground and sways by ``lean`` rad."""
     g = torch.Generator().manual_seed(4)
     yaw = torch.linspace(0.0, 20.0, count, dtype=torch.float64)
     lean = tilt * torch.sin(3.7 * yaw)
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    field = torch.stack([20.0 * yaw.sin(), 20.0 * yaw.cos(), vertical * one], -1)
-    turn = torch.stack([one, zero, zero, zero, lean.cos(), lean.sin(), zero, -lean.sin(), lean.cos()], -1)
+    zero, unit = torch.zeros_like(yaw), torch.ones_like(yaw)
+    field = torch.stack([20.0 * yaw.sin(), 20.0 * yaw.cos(), vertical * unit], -1)
+    turn = torch.stack([unit, zero, zero, zero, lean.cos(), lean.sin(), zero, -lean.sin(), lean.cos()], -1)
     seen = (turn.unflatten(-1, (3, 3)) @ field.unsqueeze(-1)).squeeze(-1)
     seen = seen + torch.tensor([5.0, -8.0, 15.0]).double() + 0.2 * torch.randn(count, 3, generator=g).double()
     names = ("time", "mag_x", "mag_y", "mag_z")
@@ -72,8 +72,8 @@ def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
 
 def test_it_says_by_what_and_what_it_takes_for_true(found):
     assert found.aid.by == "place"
-    assert any("field of the place stands in" in warning for warning in found.warnings)
-    assert any("level ground" in warning and "known one" in warning for warning in found.warnings)
+    assert any("field of the place replaces the missing turns" in warning for warning in found.warnings)
+    assert any("level ground" in warning and "known heading" in warning for warning in found.warnings)
     assert "By the place" in " ".join(aided(found))
     assert "a constant is not known" in " ".join(aided(found))
     matrix = torch.tensor(found.matrix)
@@ -106,7 +106,7 @@ def test_another_place_is_refused_with_both_widths():
 def test_a_vehicle_that_hardly_turned_is_refused():
     part = level(0.15, count=4000)
     part = Recording({name: values[:100] for name, values in part.columns.items()})
-    with pytest.raises(NotIdentifiableError, match=r"vertical axis, once round"):
+    with pytest.raises(NotIdentifiableError, match=r"vertical axis, at least once round"):
         calibrate(part, earth=EARTH)
 
 
@@ -117,11 +117,11 @@ def model(rises=0.6):
 
 
 def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle():
-    one, g = model(), torch.Generator().manual_seed(0)
+    fitted_model, g = model(), torch.Generator().manual_seed(0)
     response = 50.0 * torch.tensor([[1.1, 0.05, 0.0], [0.05, 0.9, 0.1], [0.0, 0.1, 1.2]]).double()
-    theta = one.start(torch.tensor([3.0, 4.0, 5.0]).double(), response)
-    assert torch.allclose(one.response(theta), response)
-    axis = torch.nn.functional.normalize(response.mT @ one.circle.axis, dim=0)
+    theta = fitted_model.start(torch.tensor([3.0, 4.0, 5.0]).double(), response)
+    assert torch.allclose(fitted_model.response(theta), response)
+    axis = torch.nn.functional.normalize(response.mT @ fitted_model.circle.axis, dim=0)
     first = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([1.0, 0.0, 0.0]).double()), dim=0)
     second = torch.linalg.cross(axis, first)
     angle = torch.linspace(0.0, 6.0, 50).double()[:, None]
@@ -130,17 +130,17 @@ def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle
     tilt = 0.02 * tilt
     on, drawn = (torch.cos(a) * level + torch.sin(a) * axis for a in (0.6 + tilt, torch.tensor(0.6).double()))
     outwards = torch.nn.functional.normalize(torch.linalg.solve(response, on.mT).mT, dim=-1)
-    found = one.residual(theta, on @ response.mT + theta[:3] + off * outwards)
+    found = fitted_model.residual(theta, on @ response.mT + theta[:3] + off * outwards)
     assert torch.allclose(found[:, :1], off, atol=0.03 * float(off.square().max()))
     moved = torch.linalg.vector_norm((on - drawn) @ response.mT, dim=-1, keepdim=True)
-    plain = one.residual(theta, on @ response.mT + theta[:3])
+    plain = fitted_model.residual(theta, on @ response.mT + theta[:3])
     assert torch.allclose(plain[:, 1:].abs(), moved, rtol=0.03)
     assert torch.equal(plain[:, 1:].sign(), tilt.sign())
 
 
 @pytest.mark.parametrize("rises", [0.6, -0.6])
 def test_a_turn_without_tilts_is_as_likely_on_either_side(rises):
-    """Mirrored at the plane of the circle, offset and all, nothing changes: the noise of lengths decides nothing."""
+    """Mirroring everything at the plane of the circle changes nothing: noise of lengths favours neither side."""
     recording = level()
     points, place = recording.magnetometer(), PlaceField(EARTH.strength, EARTH.inclination, 0.5, 0.01)
     first = by_place._judged(*_mirrored(points, rises, place))
@@ -149,6 +149,6 @@ def test_a_turn_without_tilts_is_as_likely_on_either_side(rises):
 
 
 def _mirrored(points, rises, place):
-    one = by_place._model(lengths.circle(points), place, math.copysign(1.0, rises))
-    offset = one.circle.center - math.sin(one.rises) * one.scale * one.circle.axis
-    return one, one.start(offset, one.scale * torch.eye(3).double()), points, place
+    fitted_model = by_place._model(lengths.circle(points), place, math.copysign(1.0, rises))
+    offset = fitted_model.circle.center - math.sin(fitted_model.rises) * fitted_model.scale * fitted_model.circle.axis
+    return fitted_model, fitted_model.start(offset, fitted_model.scale * torch.eye(3).double()), points, place

@@ -1,4 +1,4 @@
-"""The response of a turned sensor: its tangents, and the stretches that a gyroscope is trusted over."""
+"""The response of a turned sensor: its derivatives, and the windows of integrated rates."""
 
 import math
 import sys
@@ -56,7 +56,7 @@ def test_tangents_are_differences_and_none_takes_torchs_functions_in_python(name
 
 
 def by_a_loop(time, rate):
-    """The first sample of each sample's stretch."""
+    """The first sample of each sample's window."""
     turn = torch.linalg.vector_norm(0.5 * (rate[1:] + rate[:-1]), dim=-1) * time.diff()
     angle, broken = [0.0, *turn.cumsum(0).tolist()], [False, *gaps(time).tolist()]
     first, begin = [], 0

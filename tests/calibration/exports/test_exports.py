@@ -188,7 +188,7 @@ def test_places_on_the_vehicle():
     assert values["CAL_MAG3_ID"] == 396825
     assert "CAL_MAG3_ID" not in text.split("1\t1")[0]
     without = exported("px4", correction).text
-    assert "CAL_MAG0_ID, which says whose calibration this is" in without
+    assert "You have to set CAL_MAG0_ID" in without
     assert "CAL_MAG0_ID" not in formulas.qgroundcontrol(without)
     assert set(formulas.mission_planner(exported("ardupilot", correction, instance=2).text)) >= {
         "COMPASS_OFS2_X",
@@ -219,13 +219,13 @@ def test_the_scale_of_ardupilot_counts_within_its_limits_alone():
     ("change", "words"),
     [
         ({"offset": (190.0, 0.0, 0.0)}, "COMPASS_OFFS_MAX"),
-        ({"matrix": ((6.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.5))}, "DIA outside 0.2 to 5"),
-        ({"matrix": ((2.0, 1.2, 0.0), (1.2, 1.5, 0.0), (0.0, 0.0, 0.8))}, "ODI of 1"),
-        ({"field_strength": 95.0}, "does not arm in a field"),
-        ({"current": CurrentCoefficients((150.0, 0.0, 0.0), 0.0, "I")}, "COMPASS_MOT goes to"),
+        ({"matrix": ((6.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.5))}, "accepts DIA from 0.2 to 5"),
+        ({"matrix": ((2.0, 1.2, 0.0), (1.2, 1.5, 0.0), (0.0, 0.0, 0.8))}, "accepts ODI below 1"),
+        ({"field_strength": 95.0}, "arms in a field of 185 to 875 mG"),
+        ({"current": CurrentCoefficients((150.0, 0.0, 0.0), 0.0, "I")}, "COMPASS_MOT is limited to 1000 mG/A"),
     ],
 )
-def test_what_ardupilot_takes_for_a_mistake_is_told(change, words):
+def test_numbers_beyond_ardupilots_limits_have_warnings(change, words):
     correction = SensorCorrection("a", "µT", (10.0, 0.0, 0.0), EYE, "µT", 48.0)
     assert exported("ardupilot", correction).warnings == ()
     text, warnings = exported("ardupilot", dataclasses.replace(correction, **change))
@@ -233,13 +233,13 @@ def test_what_ardupilot_takes_for_a_mistake_is_told(change, words):
     assert words in text
 
 
-def test_a_scale_beyond_what_px4_takes_is_told():
+def test_a_scale_beyond_px4s_range_has_a_warning():
     matrix = ((3.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     assert "from 0.1 to 3" in exported("px4", SensorCorrection("a", "µT", (0.0, 0.0, 0.0), matrix, "µT")).warnings[0]
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot"])
-def test_a_turn_is_left_out_and_told_and_a_mirror_refused(kind):
+def test_a_rotation_is_left_out_with_a_warning_and_a_mirror_is_rejected(kind):
     angle = np.radians(3.0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     shape = np.array([[1.1, 0.05, 0.0], [0.05, 0.95, -0.02], [0.0, -0.02, 1.0]])

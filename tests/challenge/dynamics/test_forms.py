@@ -133,7 +133,7 @@ def test_drag_in_flight_is_along_the_velocity(one, other):
 
 
 @given(st.floats(0.01, 3.0), st.floats(-3, 3))
-def test_contact_takes_energy_and_only_pushes(depth, speed):
+def test_contact_dissipates_energy_and_only_repels(depth, speed):
     form = forces.contact(1, 0, 1.0, (1.0, -1.0))
     force = added(form, [1.0 + depth, speed])[1]
     assert force <= 0.0

@@ -29,12 +29,12 @@ def test_the_same_address_gives_the_same_case(cases):
         torch.testing.assert_close(again.recording[name], values, rtol=0, atol=0)
 
 
-def test_names_tell_the_system_and_nothing_else(cases):
+def test_names_reveal_only_the_system(cases):
     for name, case in cases.items():
         assert case.recording.name == f"{name}_{FIRST_OF_EACH[name]:05d}"
 
 
-def test_keys_survive_json_and_say_how_well_it_could_be_seen(cases):
+def test_keys_survive_json_and_have_the_detectability(cases):
     for case in cases.values():
         assert key_from(case.key.numbers()) == dataclasses.replace(case.key, sensor=dict(case.key.sensor))
         (effect,) = case.key.effects
@@ -110,7 +110,7 @@ def test_the_true_run_is_as_good_as_the_oracle(cases):
     assert ratio_to_oracle(broken, second, key) == torch.inf
 
 
-def test_errors_have_the_size_and_correlation_they_say():
+def test_errors_have_their_declared_size_and_correlation():
     errors = Errors((0.5, 2.0), 0.4, "laplace")
     noise = sample(generator(5), errors, 20000, 1)[..., 0]
     np.testing.assert_allclose(noise.std(1), errors.deviations, rtol=0.05)
@@ -128,7 +128,7 @@ def test_outliers_are_far_and_few():
 SLOW_ERRORS = Errors((0.5, 2.0), 0.0, "gaussian", (Slow(3.0, 20.0), Slow(0.0, 20.0)))
 
 
-def test_a_slow_error_lies_beside_the_white_one_and_is_autoregressive():
+def test_drift_is_autoregressive_and_added_to_white_noise():
     values = sample(generator(3), SLOW_ERRORS, 200, 1500)
     slow, other = values[0] / 0.5, values[1] / 2.0
     assert slow.var() == pytest.approx(1.0 + 9.0, rel=0.03)
@@ -147,7 +147,7 @@ def test_white_and_slow_errors_together_are_whitened(correlation):
         np.testing.assert_allclose(found, np.eye(60), atol=0.2)
 
 
-def test_slow_errors_whiten_several_traces_as_one_after_the_other():
+def test_whitening_several_traces_equals_whitening_each():
     traces = np.random.default_rng(1).standard_normal((2, 30, 3, 4))
     together = SLOW_ERRORS.whitened(traces)
     alone = np.stack([SLOW_ERRORS.whitened(traces[..., k]) for k in range(4)], -1)

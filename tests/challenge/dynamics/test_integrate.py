@@ -39,7 +39,7 @@ def test_agrees_with_an_adaptive_method(name):
     assert np.abs(found[..., 0] - stated_diagnosis.y).max() < 1e-5 * scale.max()
 
 
-def test_sizes_side_by_side_are_those_one_by_one():
+def test_parallel_sizes_equal_single_sizes():
     setting = pendulum.draw(generator(2))
     trial = short(setting.trial)
     hidden = HiddenTerm("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
@@ -64,7 +64,7 @@ def test_between_is_linear():
     assert between(np.zeros((0, 5, 2)), 4).shape == (0, 17, 2)
 
 
-def test_variation_is_exact_for_a_decay_under_a_constant_push():
+def test_variation_is_exact_for_a_decay_under_a_constant_force():
     count = 101
     jacobian, forcing = np.full((count, 1, 1, 1), -2.0), np.ones((count, 1, 1, 1))
     found = variation(jacobian, forcing, np.zeros((1, 1, 1)), 0.01)[:, 0, 0, 0]

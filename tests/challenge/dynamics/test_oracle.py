@@ -69,10 +69,10 @@ def test_tangents_are_finite_differences_of_the_simulation(scene):
         assert np.abs(known[:, k] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_accounts_are_finite_differences_of_the_simulation_with_them():
+def test_rival_forms_equal_finite_differences_of_the_simulation():
     scene = short_scene(pendulum, 5)
     errors = errors_of(scene, 0.0)
-    found = {(a.effect, a.at): c for a, c in tangents(scene, errors, rivals=True).accounts}
+    found = {(a.effect, a.at): c for a, c in tangents(scene, errors, rivals=True).forms}
     forms = {"constant_force": lambda x, _: np.ones_like(x[1]), "quadratic_drag": lambda x, _: -x[1] * np.abs(x[1]),
              "cubic_stiffness": lambda x, _: -x[0] ** 3}  # fmt: skip
     for effect, form in forms.items():
@@ -118,7 +118,7 @@ def test_an_account_that_contains_the_own_form_is_no_rival():
     assert found.z_sep > 1.0
 
 
-def test_linear_accounts_are_judged_to_first_order():
+def test_linear_forms_are_compared_to_first_order():
     scene = short_scene(tanks, 8)
     errors = errors_of(scene)
     hidden = HiddenTerm("overflow", "", (rate_of("level_1"),), 1.0, weir(0, 0.7 * scene.largest("level_1"), 1.5))

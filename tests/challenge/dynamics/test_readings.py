@@ -65,7 +65,7 @@ def test_each_name_is_at_the_angle_or_at_the_command(scene):
     }
 
 
-def test_the_same_delay_of_the_command_is_no_rival_but_told_as_inseparable(scene):
+def test_the_same_delay_of_the_command_is_inseparable_and_not_a_rival(scene):
     seen = power(scene.plant, scene.trial, servo.late(generator(1), scene), 0.08, errors_of(scene))
     assert "input_delay" not in {rival.effect for rival in seen.rivals}
     assert "input_delay" in {rival.effect for rival in seen.larger}

@@ -46,7 +46,7 @@ def test_the_key_is_sealed(quiet):
     assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
 
 
-def test_a_diagnosis_that_says_nothing_raises_no_alarm_and_names_nothing(quiet):
+def test_an_empty_diagnosis_raises_no_alarm_and_names_nothing(quiet):
     result, _ = quiet
     assert (result.false_alarms.count, result.false_alarms.total) == (0, 2)
     assert result.named.count == 0
@@ -65,7 +65,7 @@ def test_thresholds_and_page_are_those_of_dynamics(quiet):
     assert "thresholds hold" in page
 
 
-def test_recordings_do_not_tell_what_is_hidden(quiet):
+def test_recordings_do_not_reveal_the_hidden_physics(quiet):
     _, output = quiet
     stems = sorted(path.stem for path in (output / "recordings").iterdir())
     assert len(stems) == 5

@@ -33,7 +33,7 @@ def test_names_a_current():
     assert (found[0]["effect"], found[0]["drivers"]) == ("current_field", ["current"])
 
 
-def test_says_nothing_where_no_ellipsoid_fits():
+def test_no_result_without_an_ellipsoid():
     rest = torch.ones(50).double()
     flat = Recording({"time": torch.arange(50), "mag_x": rest, "mag_y": rest, "mag_z": rest})
     assert stepwise_bic(flat) is None

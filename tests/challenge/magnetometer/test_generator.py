@@ -67,7 +67,7 @@ def test_keys_are_consistent(cases):
             assert all(rival.z_sep < 6 for rival in effect.inseparable)
 
 
-def test_names_of_columns_do_not_tell(cases):
+def test_names_of_columns_do_not_reveal_the_driver(cases):
     known = {"time", "temperature", "current", "voltage", *POSITION, "q_w", "q_x", "q_y", "q_z"}
     known |= {f"{name}_{axis}" for name in ("mag", "gyro", "accel") for axis in "xyz"}
     for case in cases:

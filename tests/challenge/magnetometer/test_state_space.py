@@ -31,7 +31,7 @@ def test_coloured_noise_needs_no_white_part():
     torch.testing.assert_close(white.mT @ white, expected, rtol=1e-7, atol=1e-7)
 
 
-def test_samples_left_out_tell_nothing():
+def test_masked_samples_have_no_influence():
     variance, gains, values = problem(1, 0.3)
     keep = torch.arange(40) % 3 != 0
     inside = dense_covariance(variance, gains, PROCESSES)[keep][:, keep]

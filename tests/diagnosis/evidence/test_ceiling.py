@@ -220,7 +220,7 @@ def scores(gain, columns=("load",)):
 
 
 @pytest.mark.parametrize(
-    ("gain", "by_time", "columns", "told"),
+    ("gain", "by_time", "columns", "text"),
     [
         (0.05, 0.0, ("load",), ("load",)),
         (0.005, 0.0, ("load",), ()),  # too small to matter

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.driver_shift import said, shifted
+from mkc_torch.diagnosis.evidence.driver_shift import as_result, shifted
 from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
@@ -44,7 +44,7 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
 def warning(shift):
     effect = next(e for e in CATALOGUE if e.id == "current_field")
     column = Driver(("load",), "current", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return said(shift, Term(effect, column, {}), EvidenceSettings()).warnings
+    return as_result(shift, Term(effect, column, {}), EvidenceSettings()).warnings
 
 
 @pytest.mark.e2e

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, said
+from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, as_result
 from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -51,7 +51,7 @@ def held_beyond(fits, seed=0):
 def warning(found):
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     load = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return said(found, Term(effect, load, {}), EvidenceSettings()).warnings
+    return as_result(found, Term(effect, load, {}), EvidenceSettings()).warnings
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():

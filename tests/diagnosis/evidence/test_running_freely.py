@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import open_loop_evidence as module
+from mkc_torch.diagnosis.evidence import open_loop as module
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.open_loop import open_loop_evidence
 from mkc_torch.diagnosis.model.fit import fitted

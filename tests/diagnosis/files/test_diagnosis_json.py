@@ -78,7 +78,7 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 
 def test_what_is_for_the_report_alone_is_not_written():
     diagnosis = with_finding(
-        make_diagnosis(1), extrapolation.said(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings())
+        make_diagnosis(1), extrapolation.as_result(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings())
     )
     assert written(diagnosis) == written(make_diagnosis(1))
 
@@ -95,7 +95,7 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
 
 def test_what_shifted_copies_of_a_driver_gain_is_written():
     (finding,) = written(
-        with_finding(make_diagnosis(1), driver_shift.said(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings()))
+        with_finding(make_diagnosis(1), driver_shift.as_result(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings()))
     )["findings"]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
@@ -107,7 +107,7 @@ def test_what_an_equation_needs_is_written():
         "parameters": (parameter,), "event_times": (61.1, 77.8), "advice": "Do it.",
         "references": (Reference("current", 10.5, "A"),),
     }  # fmt: skip
-    said = intermittency.said(True), onset.said((60.9, 61.2))
+    said = intermittency.as_result(True), onset.as_result((60.9, 61.2))
     (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["event_times"] == [61.1, 77.8]
@@ -126,7 +126,7 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     tails = (ChannelTails(31.5, 0.041, 0.006),)
     noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", tails=tails)
-    stored = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check], EvidenceSettings())))[
+    stored = written(with_evidence(dataclasses.replace(made, noise=noise), density.as_result([check], EvidenceSettings())))[
         "noise"
     ]
     assert (stored["unit"], stored["units"]) == ("µT", {"wander": "µT"})
@@ -144,7 +144,7 @@ def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order(
         "my_test",
         content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
     )
-    made = with_evidence(with_finding(make_diagnosis(1), said, onset.said((1.0, 2.0)), intermittency.said(True)), said)
+    made = with_evidence(with_finding(make_diagnosis(1), said, onset.as_result((1.0, 2.0)), intermittency.as_result(True)), said)
     content = written(made)
     held_out = {
         "log_likelihood_gain": 0.1,
@@ -210,7 +210,7 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
     held_out = HeldOut(0.1, (-math.inf, 0.2), 1.0, 0.9, "µT")
     (rival, *_) = diagnosis.findings[0].alternatives
     gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
-    said = held_out_gain.said(held_out, "")
+    said = held_out_gain.as_result(held_out, "")
     stored = written(with_finding(diagnosis, said, parameters=(errors,), alternatives=(gap,)))
     (finding,) = stored["findings"]
     assert stored["ceiling"] is None
@@ -248,7 +248,7 @@ def test_a_stopped_search_says_why_and_what_was_not_done():
 
 def test_missing_evidence_needs_its_reason():
     with pytest.raises(DiagnosisFileError, match="held_out_note"):
-        diagnosis_to_json(with_finding(make_diagnosis(1), held_out_gain.said(None, "")))
+        diagnosis_to_json(with_finding(make_diagnosis(1), held_out_gain.as_result(None, "")))
 
 
 def test_a_verdict_agrees_with_its_findings():

@@ -49,7 +49,7 @@ def test_what_cannot_be_written_out():
         id = "silent"
         code = Effect.code
 
-    with pytest.raises(SourceError, match="silent cannot be written out as Python: it has no `code` method"):
+    with pytest.raises(SourceError, match="silent cannot be exported as Python: it has no `code` method"):
         model(Silent(), Vessel()).to_python()
 
 

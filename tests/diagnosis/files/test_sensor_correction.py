@@ -69,7 +69,7 @@ def test_offset_matrix_current_and_what_lasts_are_exported_whole(terms):
         assert np.abs(field - applied(model, of)).max() < CLOSE
     assert (correction.current is not None) == (CABLE in terms)
     text = " ".join(correction.left_out)
-    assert ("hard_iron_step is bound to the time" in text) == (STEP in terms)
+    assert ("hard_iron_step depends on the time" in text) == (STEP in terms)
 
 
 def test_a_current_in_other_units_is_one_in_amperes():
@@ -112,7 +112,7 @@ def test_a_second_current_and_one_without_a_unit_are_left_out():
 def test_what_belongs_to_a_place_is_left_out():
     placed = Term(MagneticPole(), driver("position_x", 0.0, "m"), {}, "field_of_the_world")
     correction = sensor_correction(model_of([placed], [(1.0, 1.0, 1.0)]), "mast")
-    assert "belongs to the place" in correction.left_out[0]
+    assert "depends on the location" in correction.left_out[0]
     assert correction.offset == pytest.approx(OFFSET)
 
 

@@ -73,8 +73,8 @@ def test_pushes_and_what_inputs_do_are_written():
     noise = written(pushed(process_noise=(PUSHED, slow, weak)))["noise"]
     assert noise["process"]["rate"]["size"] == 0.2284
     assert noise["process"]["rate"]["unit"] == "rad/s²"
-    assert [item["size"] for item in noise["process"]["rate"]["besides"]] == [0.05]
-    assert noise["process"]["rate"]["besides"][0]["standard_error"] is None
+    assert [item["size"] for item in noise["process"]["rate"]["weaker"]] == [0.05]
+    assert noise["process"]["rate"]["weaker"][0]["standard_error"] is None
     assert set(noise["sensor"]) == {"angle"}
     assert noise["input_hold"] == {"torque": "held"}
 
@@ -124,7 +124,7 @@ def test_grades_shapes_and_sizes_of_each_output_are_written():
         (DivergedBlock(7, before=True, after=False),), 25,
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)
-    finding = nearest(with_evidence(made.findings[0], held_out_gain.said(held, "")))
+    finding = nearest(with_evidence(made.findings[0], held_out_gain.as_result(held, "")))
     (stored,) = written(dataclasses.replace(made, findings=(finding,)))["findings"]
     assert stored["grade"] == "nearest"
     assert stored["shape"] == {"free_curve_gain": 163.0, "p_value": 0.002, "formula": "0.0071 |x|^1.52 sign(x)"}

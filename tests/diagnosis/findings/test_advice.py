@@ -40,7 +40,7 @@ def test_what_belongs_to_the_place_is_not_for_other_recordings():
 
 def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
     made = make_diagnosis(1, samples=50)
-    step = dataclasses.replace(with_evidence(made.findings[0], intermittency.said(True)), alternatives=())
+    step = dataclasses.replace(with_evidence(made.findings[0], intermittency.as_result(True)), alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
     assert only.startswith("Look for something that is switched on and off")
 
@@ -48,7 +48,7 @@ def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
 def test_what_a_rival_could_be_instead_is_done_only_once_it_is_told_apart():
     drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     apart, do, _model = advised(1, alternatives=(drift,))
-    assert apart.startswith("To tell hard_iron_step from offset_drift")
+    assert apart.startswith("To distinguish hard_iron_step from offset_drift")
     assert do.startswith("If it is hard_iron_step: look for what changed at that time")
 
 
@@ -60,7 +60,7 @@ def test_what_is_not_plausible_is_not_built_in():
 
 
 @pytest.mark.parametrize(
-    ("formula", "told"), [("2 |x|^1.5 sign(x)", "the formula 2 |x|^1.5 sign(x)"), ("", "the curve")]
+    ("formula", "text"), [("2 |x|^1.5 sign(x)", "the formula 2 |x|^1.5 sign(x)"), ("", "the curve")]
 )
 def test_what_is_only_nearest_is_not_built_in(formula, text):
     made = make_diagnosis(1, samples=50)
@@ -68,7 +68,7 @@ def test_what_is_only_nearest_is_not_built_in(formula, text):
         made.findings[0], effect="thermal_loss", advice="Add radiation with this coefficient.", alternatives=()
     )
     (only,) = advice_of(dataclasses.replace(made, findings=(nearest(heat, formula=formula),)))
-    assert only.startswith("Do not build thermal_loss in: what this recording shows has another form.")
+    assert only.startswith("Do not add thermal_loss in: what this recording shows has another form.")
     assert text in only
     assert "Add radiation" not in only
 
@@ -83,7 +83,7 @@ def test_a_contradiction_never_says_that_the_simulation_can_be_used():
     assert lost.verdict == "adequate"
     assert "Use the simulation as it is" not in " ".join(lost.advice)
     followed = make_diagnosis(0, samples=50, environment=make_environment(process_noise=()))
-    assert followed.advice == ("Use the simulation as it is, within what this recording covers.",)
+    assert followed.advice == ("The simulation can be used within the range of this recording.",)
 
 
 def test_what_pushes_a_state_is_looked_for_and_counted_on():
@@ -99,7 +99,7 @@ def test_a_step_and_a_drift_are_told_apart_by_another_recording():
     drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     sentence = advised(1, alternatives=(drift,))[0]
     assert sentence == (
-        "To tell hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
+        "To distinguish hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
         "warm-up comes again after a cold start."
     )
     assert "hold the other" not in sentence
@@ -108,8 +108,8 @@ def test_a_step_and_a_drift_are_told_apart_by_another_recording():
 def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
     current = Alternative("current_field", ("current",), 0.4, False)
     assert advised(1, alternatives=(current,))[0] == (
-        "To tell hard_iron_step from current_field (current), record again: a step does not come at the same moment "
-        "again; what follows current goes along with it, so let that change at other times."
+        "To distinguish hard_iron_step from current_field (current), record again: a step does not come at the same moment "
+        "again; what follows current goes along with it, change at other times."
     )
 
 
@@ -118,7 +118,7 @@ def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
     [
         (Alternative("temperature_offset", ("temperature",), 0.4, False), "change one and hold the other."),
         (Alternative("driver_linear", ("current",), 0.4, False), "record again with current over a wider range."),
-        (Alternative("linear_drag", (), 0.4, False, "rate of speed"), "so let that change at other times."),
+        (Alternative("linear_drag", (), 0.4, False, "rate of speed"), "change at other times."),
     ],
 )
 def test_two_columns_are_told_apart_by_changing_one(rival, how):
@@ -142,7 +142,7 @@ def test_rivals_are_told_apart_by_what_the_kind_of_state_can_do(kind, how):
         made.findings[0], effect="coulomb_friction", recurrence="", alternatives=(rival,), kind=kind
     )
     assert advice_of(dataclasses.replace(made, findings=(first,)))[0] == (
-        f"To tell coulomb_friction from stribeck_friction, record again {how}."
+        f"To distinguish coulomb_friction from stribeck_friction, record again {how}."
     )
 
 
@@ -154,16 +154,16 @@ def test_what_is_not_confirmed_is_not_to_be_corrected():
 
 def test_where_nothing_shows_the_simulation_is_to_be_used():
     assert advice_of(make_diagnosis(0, samples=50)) == (
-        "Use the simulation as it is, within what this recording covers.",
+        "The simulation can be used within the range of this recording.",
     )
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "text"),
     [
         ({"p_value": 0.04}, "Record again, for longer"),
         ({"verdict": "unexplained"}, "Record again, for longer"),
-        ({"remaining": ("load", "rpm")}, "Find out what else goes along with load, rpm"),
+        ({"remaining": ("load", "rpm")}, "Look for other causes that vary with load, rpm"),
     ],
 )
 def test_where_something_shows_it_is_not(changes, text):

@@ -49,9 +49,9 @@ def test_a_number_at_the_end_of_its_range_is_told(tank):
     largest = tank.ports["rate of level"].sizes["own"].largest
     (text,) = doubted(tank, "overflow", rim=0.98 * largest, exponent=1.7)
     assert text.startswith("overflow: its rim ended at ")
-    assert "cm, the greatest that is tried" in text
+    assert "cm, the greatest bound" in text
     (text,) = doubted(tank, "hidden_lag", time_constant=0.4 * 19.9)
-    assert "its time constant ended at 7.96 s, the greatest that is tried" in text
+    assert "its time constant ended at 7.96 s, the greatest bound" in text
     assert doubted(tank, "hidden_lag", time_constant=3.0) == ()
 
 
@@ -69,7 +69,7 @@ def test_an_amplitude_at_its_end_or_ten_times_what_is_plausible_cannot_be(tank):
 
     assert (
         text(HiddenLag(), 30.0, "lagged rate of level")
-        == "Its share ended at 30, the most that is tried: nothing holds it."
+        == "Its share ended at 30, the upper bound: the recording does not limit it."
     )
     assert text(HiddenLag(), 29.0, "lagged rate of level") == ""
     assert text(EFFECTS["dead_zone"], 1.0, "input pump") == ""  # all of a dead zone
@@ -79,18 +79,18 @@ def test_an_amplitude_at_its_end_or_ten_times_what_is_plausible_cannot_be(tank):
 
     term = Term(Known(), None, Known().shapes(tank.time)[0], "lagged rate of level")
     assert times_plausible(term, torch.tensor([2.0]).double(), term.context(tank, None)) == pytest.approx(20.0)
-    assert text(Known(), 2.0, "lagged rate of level").startswith("Its share is 20 times the largest that is plausible")
+    assert text(Known(), 2.0, "lagged rate of level").startswith("Its share is 20 times the largest plausible size")
     assert text(Known(), 0.9, "lagged rate of level") == ""
 
 
 def test_what_cannot_be_is_not_confirmed_and_says_why():
     made = make_diagnosis(1, samples=50)
-    why = "Its share ended at 30, the most that is tried: nothing holds it."
+    why = "Its share ended at 30, the upper bound: the recording does not limit it."
     odd = dataclasses.replace(made.findings[0], cannot_be=True, plausible=False, plausibility=why, alternatives=())
     odd = dataclasses.replace(odd, grade=grade_of(odd))
     assert (made.findings[0].grade, odd.grade) == ("left_out", "unconfirmed")
     diagnosis = dataclasses.replace(made, findings=(odd,))
-    assert grade(odd) == "not confirmed, as its size cannot be right"
+    assert grade(odd) == "not confirmed: impossible size"
     assert headline(diagnosis).startswith("Found, but of a size that cannot be right: hard-iron step")
     (only, *_) = advice_of(diagnosis)
     assert only.startswith("Do not correct for hard_iron_step: its share ended at 30")

@@ -1,4 +1,4 @@
-"""What pushes a simulation that nobody recorded: its size, its course with a band, and what it goes along with."""
+"""The disturbance of a simulation that nobody recorded: its size, its course with a band, and what it goes along with."""
 
 import functools
 import math
@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.disturbances import forcing_of, pushes_of
+from mkc_torch.diagnosis.findings.disturbances import forcing_of, process_noise_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.simulation.dynamics.first_fit import strong_observer
@@ -50,7 +50,7 @@ def correlation(one, other):
 def test_a_push_of_a_rate_has_its_unit_and_one_of_an_output_that_of_the_output():
     prepared = Pendulum().prepare(swung("white", 1)[0])
     noise = noise_of(TRUTH["slow"], WANDER, errors=(0.2, 0.05), gains=(311.0, 12.0))
-    rate, angle = pushes_of(prepared, noise)
+    rate, angle = process_noise_of(prepared, noise)
     assert (rate.place, rate.at_rate, rate.correlation_time, rate.size, rate.log_likelihood_gain) == ("rate", True, 1.0, 0.3, 311.0)
     assert rate.unit == prepared.ports["rate of rate"].unit == "rad/s/s"
     assert (angle.place, angle.at_rate, angle.unit, angle.log_likelihood_gain) == ("angle", False, "rad", 12.0)
@@ -60,13 +60,13 @@ def test_a_push_of_a_rate_has_its_unit_and_one_of_an_output_that_of_the_output()
 
 def test_a_size_that_the_likelihood_does_not_bend_about_is_as_uncertain_as_it_is_large():
     prepared = Pendulum().prepare(swung("white", 1)[0])
-    (push,) = pushes_of(prepared, noise_of(TRUTH["slow"], errors=(math.inf,)))
+    (push,) = process_noise_of(prepared, noise_of(TRUTH["slow"], errors=(math.inf,)))
     assert push.standard_error == push.size
 
 
 def test_without_pushes_nothing_is_told():
     fit = at_the_truth("white", 1)
-    assert pushes_of(fit.model.prepared, noise_of()) == ()
+    assert process_noise_of(fit.model.prepared, noise_of()) == ()
     assert forcing_of(fit, noise_of()) == ()
 
 
@@ -92,22 +92,22 @@ def test_the_course_follows_what_lasts_and_little_of_what_does_not(push, least, 
 def test_whether_it_is_white_is_said(push):
     first = forcing(push, 1)[0].sentences[0]
     if push == "white":
-        assert first == "What pushes rate of rate is white: it is new at each sample."
+        assert first == "The disturbance of rate of rate is white."
     else:
         lasting = f"{TRUTH[push].lasting:.2g} s"
-        assert first == f"What pushes rate of rate is not white: it keeps its value for about {lasting}."
+        assert first == f"The disturbance of rate of rate is not white: its correlation time is about {lasting}."
 
 
 @pytest.mark.parametrize("push", ["white", "slow"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_push_by_itself_is_said_to_be_independent_of_the_input(push, seed):
-    assert forcing(push, seed)[0].sentences[1:] == ("It is independent of torque at every lag.",)
+    assert forcing(push, seed)[0].sentences[1:] == ("It is uncorrelated with torque at all lags.",)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_push_that_goes_along_with_an_input_is_said_to_with_its_lag(seed):
     (text,) = forcing("torque", seed)[0].sentences[1:]
-    assert text.startswith("It goes along with torque, 0.3 s after it (correlation 0.9")
+    assert text.startswith("It is correlated with torque with a delay of 0.3 s (correlation 0.9")
 
 
 def test_it_is_told_along_each_state_and_input_with_units():
@@ -136,7 +136,7 @@ def test_a_push_by_itself_is_nought_along_what_it_does_not_depend_on_within_the_
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
     world = swung_in_the_world(push)
-    first = pushes_of(world.fit.model.prepared, world.noise)[0]
+    first = process_noise_of(world.fit.model.prepared, world.noise)[0]
     true = TRUTH[push]
     assert (first.place, first.at_rate, first.unit) == ("rate", True, "rad/s/s")
     assert (first.correlation_time > 0.0) == (true.lasting > 0.0)
@@ -149,4 +149,4 @@ def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
 def test_nothing_pushes_where_nothing_does():
     world = swung_in_the_world()
     assert not world.has_disturbances
-    assert pushes_of(world.fit.model.prepared, world.noise) == ()
+    assert process_noise_of(world.fit.model.prepared, world.noise) == ()

@@ -122,7 +122,7 @@ def curve_of(values, low=-2.0, driver="speed", band=0.01):
 @pytest.mark.parametrize("low", [-2.0, 0.1])
 def test_a_power_law_is_read_off_exactly_beside_a_straight_line(power, low):
     drawn = curve_of(lambda x: -0.7 * x.abs() ** power * x.sign() + 0.4 * x - 1.2, low)
-    assert nearest_power(drawn) == f"-0.7 |speed|^{power:.2g} sign(speed), beside a straight line"
+    assert nearest_power(drawn) == f"-0.7 |speed|^{power:.2g} sign(speed) plus a straight line"
 
 
 def test_where_a_curve_is_hardly_known_it_hardly_counts():

@@ -1,4 +1,4 @@
-"""Residuals are judged by their distance from the wander: bursts are rejected, excursions of the wander are not."""
+"""Residuals about a drift: bursts are rejected, excursions of the drift are not."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ BURSTS = [(300, 12), (900, 15), (1500, 10)]
 
 
 def walk(steps, seed=5):
-    """A random walk on each axis, less its mean, in µT."""
+    """Return a random walk on each axis, less its mean, in µT."""
     course = np.cumsum(np.random.default_rng(seed).standard_normal((N, 3)), 0) * np.asarray(steps)
     return course - course.mean(0)
 
@@ -36,14 +36,14 @@ def local_of(sensor, use, noise=0.3):
 
 
 @pytest.mark.parametrize("use", ["norm", "attitude"])
-def test_excursions_of_a_wander_count(use):
+def test_excursions_of_a_drift_count(use):
     _, _, local = local_of(walk([0.05, 0.05, 0.05]), use)
     assert float(local.counts.mean()) > 0.98
 
 
 @pytest.mark.e2e
-def test_bursts_beside_a_wander_do_not_count():
-    """They are smaller than the wander's excursions: the plain fit lets most of them through."""
+def test_bursts_in_a_drift_are_rejected():
+    """The bursts are smaller than the drift's excursions, so the plain fit does not reject most of them."""
     burst = np.zeros((N, 3))
     for start, length in BURSTS:
         burst[start : start + length] = [3.5, 3.5, 3.5]
@@ -61,7 +61,7 @@ def test_bursts_beside_a_wander_do_not_count():
 
 
 def bursts_of_one_sign(seed, share=0.15):
-    """Outliers of 5 to 20 times the noise along one direction, in bursts of 15 to 60 samples, in µT; and where."""
+    """Return outliers of 5 to 20 times the noise in a direction, in bursts of 15 to 60 samples, and their mask."""
     draws = np.random.default_rng(seed)
     added, hit = np.zeros((N, 3)), np.zeros(N, dtype=bool)
     while hit.mean() < share:
@@ -74,8 +74,8 @@ def bursts_of_one_sign(seed, share=0.15):
 
 
 @pytest.mark.e2e
-def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
-    """Many bursts make the likeliest density a wide one, in which the smaller outliers count like samples."""
+def test_small_outliers_of_many_bursts_are_rejected():
+    """Many bursts make the most likely density wide, and smaller outliers would count."""
     kept = []
     for seed in (1, 2, 3):
         added, hit = bursts_of_one_sign(seed)
@@ -87,8 +87,8 @@ def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("step", "size"), [(0.0, 0.7), (0.05, 1.5)])
-def test_the_mild_samples_of_bursts_do_not_count(step, size):
-    """Most are within three scales of the noise, and beside a wander the fit's own parameters hide them."""
+def test_mild_samples_of_bursts_are_rejected(step, size):
+    """Most are within three scales of the noise, and in a drift the fit's own parameters hide them."""
     burst, hit = np.zeros((N, 3)), torch.zeros(N, dtype=torch.bool)
     for start, length in [(300, 25), (900, 30), (1500, 25)]:
         burst[start : start + length] = size
@@ -102,7 +102,7 @@ def test_the_mild_samples_of_bursts_do_not_count(step, size):
     assert of_others > 0.945
 
 
-def test_neighbours_to_one_side_together_do_not_count():
+def test_one_sided_neighbourhoods_are_rejected():
     draws = torch.from_numpy(np.random.default_rng(2).standard_normal((3000, 2)))
     slow = draws.clone()
     for n in range(1, 3000):
@@ -120,31 +120,31 @@ def test_neighbours_to_one_side_together_do_not_count():
     assert float(without_one_sided(draws, rejected, NoiseSettings())[:, 1].min()) == 1.0
 
 
-def test_what_is_in_the_midst_of_outliers_is_one():
+def test_samples_amid_outliers_are_rejected():
     near = torch.ones(100, 2, dtype=torch.float64)
     near[40:60, 0] = 0.0
-    near[45::4, 0] = 1.0  # a course that follows the burst lets some of it through
-    near[10::7, 1] = 0.0  # single outliers, however many, take nothing with them
+    near[45::4, 0] = 1.0  # a drift that follows the burst keeps some of it
+    near[10::7, 1] = 0.0  # scattered outliers do not reject their neighbours
     found = out_of_bursts(near, NoiseSettings())
     assert float(found[43:57, 0].sum()) == 0.0
     assert float(found[:35, 0].min()) == float(found[66:, 0].min()) == 1.0
     assert torch.equal(found[:, 1], near[:, 1])
 
 
-def test_outliers_that_come_together_count_in_no_channel():
+def test_coincident_outliers_are_rejected_in_all_channels():
     draws = torch.from_numpy(np.random.default_rng(4).random((2000, 3)))
     apart = (draws > 0.15).double()
     assert torch.equal(rejected_in_all(apart, NoiseSettings()), apart)
-    without_one_sided = apart.clone()
-    without_one_sided[:, 1] *= apart[:, 0]
-    without_one_sided[:, 2] *= (draws[:, 0] > 0.1).double()
-    assert torch.equal(rejected_in_all(without_one_sided, NoiseSettings()), without_one_sided.amin(1, keepdim=True).expand(-1, 3))
+    coincident = apart.clone()
+    coincident[:, 1] *= apart[:, 0]
+    coincident[:, 2] *= (draws[:, 0] > 0.1).double()
+    assert torch.equal(rejected_in_all(coincident, NoiseSettings()), coincident.amin(1, keepdim=True).expand(-1, 3))
     assert torch.equal(rejected_in_all(apart[:, :1], NoiseSettings()), apart[:, :1])
     assert torch.equal(rejected_in_all(torch.ones_like(apart), NoiseSettings()), torch.ones_like(apart))
 
 
-def slow_in_the_world(seed, keep=0.998, size=0.8):
-    """What an attitude that drifts by a degree adds to the body's axes, in µT."""
+def attitude_error(seed, keep=0.998, size=0.8):
+    """The error in the body's axes of an attitude that drifts by about a degree, in µT."""
     drift = np.random.default_rng(seed).standard_normal((N, 3)) * size * np.sqrt(1.0 - keep**2)
     for n in range(1, N):
         drift[n] += keep * drift[n - 1]
@@ -153,38 +153,38 @@ def slow_in_the_world(seed, keep=0.998, size=0.8):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_colour_beside_a_wander_is_the_likeliest(seed):
-    """What wanders in the sensor's axes and what is slow in the world's take long to tell apart."""
-    fit, tangents, local = local_of(walk([0.05] * 3, seed) + slow_in_the_world(seed), "attitude")
+def test_the_spectrum_without_the_drift_has_converged(seed):
+    """A drift in the sensor's axes and slow noise in the Earth's are hard to separate."""
+    fit, tangents, local = local_of(walk([0.05] * 3, seed) + attitude_error(seed), "attitude")
     found = local.noise
-    beside = replace(tangents.bare, slow=local.slow)
-    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, spectrum=found.stationary_spectrum())
+    bare = replace(tangents.bare, slow=local.slow)
+    step = linearise(fit.model, fit.parameters, local.values, local.counts, bare, spectrum=found.stationary_spectrum())
     assert step.evidence < found.evidence + 10.0
     slow = found.spectrum.root.square()
     assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
 
 
 @pytest.mark.e2e
-def test_what_counts_keeps_its_wander():
+def test_pseudo_residuals_keep_the_drift():
     fit, _, local = local_of(walk([0.05, 0.05, 0.05]), "attitude")
     counted = local.counts > 0
-    # the pseudo-residual is the wander, and beside it no more than the white noise
+    # the pseudo-residual is the drift plus the white noise
     assert float((local.values - fit.residual)[counted].square().mean().sqrt()) < 0.1
     assert float(local.values[counted].std()) > 1.0
 
 
 @pytest.mark.e2e
-def test_each_axis_has_its_own_share_of_the_wander():
+def test_each_axis_has_its_own_share_of_the_drift():
     steps = np.array([0.08, 0.02, 0.02])
     _, tangents, local = local_of(walk(steps), "attitude")
     share = (local.slow.scales / tangents.slow.scales).square()[:, :3]
     torch.testing.assert_close(share[0], share[1])
-    # the truth is 2.67, 0.17, 0.17; a few courses' worth of equal axes are in the estimate
+    # the truth is 2.67, 0.17, 0.17; the estimate includes a prior of equal axes
     assert float(share[0, 0]) == pytest.approx(2.67, rel=0.25)
     assert float(share[0, 1:].max()) < 0.55
 
 
-def test_the_noise_is_that_of_what_is_left():
+def test_the_noise_is_that_of_the_pseudo_residuals():
     fit, tangents, local = local_of(walk([0.05, 0.05, 0.05]), "norm")
     noise = local.noise.search.noise_fit(local.noise.series)
     assert noise.size > 0
@@ -194,8 +194,8 @@ def test_the_noise_is_that_of_what_is_left():
     torch.testing.assert_close(again.series, local.noise.series)
 
 
-def test_another_colour_is_the_search_that_begins_with_it():
-    """Beside what stands in for rejected samples, which is that of the colour before."""
+def test_changing_the_spectrum_equals_a_search_with_it():
+    """Except for the imputation of rejected samples, which keeps the previous spectrum."""
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=walk([0.05] * 3), attitude=True))
     model = JointModel(prepared)
     fit = fitted(model, prepared.start())
@@ -207,14 +207,14 @@ def test_another_colour_is_the_search_that_begins_with_it():
     found = linearise(model, fit.parameters, values, counts, tangents, white=True)
     spectrum = found.stationary_spectrum()
     built = linearise(model, fit.parameters, values, counts, tangents, spectrum=spectrum)
-    told = found.under(spectrum)
-    torch.testing.assert_close(told.series, built.series)
-    assert told.evidence == pytest.approx(built.evidence)
-    assert told.evidence > found.evidence + 10.0
+    changed = found.under(spectrum)
+    torch.testing.assert_close(changed.series, built.series)
+    assert changed.evidence == pytest.approx(built.evidence)
+    assert changed.evidence > found.evidence + 10.0
 
 
 @pytest.mark.e2e
-def test_white_noise_is_left_as_it_is():
+def test_white_noise_is_unchanged():
     fit, _, local = local_of(np.zeros((N, 3)), "attitude")
     values, counts = fit.pseudo(NoiseSettings())
     assert float((local.counts != counts).double().mean()) < 0.02
@@ -222,7 +222,7 @@ def test_white_noise_is_left_as_it_is():
     assert float((local.values - values)[both].square().mean().sqrt()) < 0.05
 
 
-def test_a_simulation_of_two_channels_is_served_alike():
+def test_a_simulation_of_two_channels_has_finite_residuals():
     line = Line(600)
     model = JointModel(line)
     fit = fitted(model, line.start())

@@ -1,4 +1,4 @@
-"""Tangents of candidates that are made a few at a time: the same as all at once, and never more of them in memory."""
+"""Tangents of candidates in blocks: the same as all at once, with bounded memory."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ from tests.diagnosis.search.test_locate import STEPS
 
 @pytest.fixture(scope="module")
 def sensor():
-    """A magnetometer's fit, and all candidates."""
+    """Return a magnetometer's fit, and all candidates."""
     recording, _ = demonstration.simulated_recording(0)
     prepared = Magnetometer("norm").prepare(recording)
     drivers = find_drivers(recording, Magnetometer("norm").columns, Settings().drivers)
@@ -31,15 +31,15 @@ def sensor():
 
 
 class Largest(TorchDispatchMode):
-    """Numbers of the largest tensor that an operation makes."""
+    """Record the size of the largest tensor that an operation creates."""
 
     numbers = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         made = func(*args, **(kwargs or {}))
         several = made if isinstance(made, (tuple, list)) else [made]
-        own = [one for one in several if isinstance(one, torch.Tensor) and not one._is_view()]
-        self.numbers = max([self.numbers, *(one.numel() for one in own)])
+        own = [tensor for tensor in several if isinstance(tensor, torch.Tensor) and not tensor._is_view()]
+        self.numbers = max([self.numbers, *(tensor.numel() for tensor in own)])
         return made
 
 
@@ -47,7 +47,7 @@ def of(fit, terms):
     return tangents_of(fit.model, fit.parameters, Settings().noise, terms)
 
 
-def test_they_are_the_slopes_of_the_joint_residual(sensor):
+def test_tangents_are_derivatives_of_the_joint_residual(sensor):
     fit, terms = sensor
     found = of(fit, terms).candidates
     assert len(found) == len(terms)
@@ -56,13 +56,13 @@ def test_they_are_the_slopes_of_the_joint_residual(sensor):
     independent = torch.tensor(fit.model.prepared.independent, dtype=torch.float64)
     for number in kinds.values():
         model = fit.model.with_term(terms[number])
-        none = torch.zeros(model.size - fit.model.size, dtype=torch.float64)
-        slope = torch.func.jacfwd(model.residual)(torch.cat([fit.parameters, none]))[..., fit.model.size :]
+        zero = torch.zeros(model.size - fit.model.size, dtype=torch.float64)
+        slope = torch.func.jacfwd(model.residual)(torch.cat([fit.parameters, zero]))[..., fit.model.size :]
         slope = independent[:, None] * slope if terms[number].effect.follows_signal else slope
         torch.testing.assert_close(found[number], slope, rtol=1e-9, atol=1e-9)
 
 
-def test_those_made_again_are_those_that_are_held(sensor, monkeypatch):
+def test_recomputed_tangents_equal_cached_tangents(sensor, monkeypatch):
     fit, terms = sensor
     held = of(fit, terms).candidates
     assert len(held.parts) > len(terms)
@@ -71,15 +71,15 @@ def test_those_made_again_are_those_that_are_held(sensor, monkeypatch):
     assert not made._held
     for number in range(len(terms)):
         assert torch.equal(held[number], made[number])
-    assert [one.shape for one in made[2:5]] == [held[number].shape for number in (2, 3, 4)]
+    assert [tangent.shape for tangent in made[2:5]] == [held[number].shape for number in (2, 3, 4)]
     assert made[-1].equal(held[len(terms) - 1])
 
 
-def test_only_so_many_numbers_are_held(sensor, monkeypatch):
+def test_the_cache_is_limited(sensor, monkeypatch):
     fit, terms = sensor
-    widest = max(one.numel() for one in of(fit, terms).candidates)
+    widest = max(tangent.numel() for tangent in of(fit, terms).candidates)
     monkeypatch.setattr(candidates, "HELD", 100_000)
-    held = sum(one.numel() for one in of(fit, terms).candidates._held.values())
+    held = sum(tangent.numel() for tangent in of(fit, terms).candidates._held.values())
     assert 100_000 <= held < 100_000 + widest
 
 
@@ -92,7 +92,7 @@ def test_trajectories_are_solved_for_once(monkeypatch):
     assert found[0] is found[0]
 
 
-def test_a_search_in_small_blocks_is_the_same(sensor, monkeypatch):
+def test_a_search_in_small_blocks_gives_the_same_gains(sensor, monkeypatch):
     fit, terms = sensor
     values, counts = fit.pseudo(Settings().noise)
 
@@ -103,7 +103,7 @@ def test_a_search_in_small_blocks_is_the_same(sensor, monkeypatch):
     whole = gains()
     monkeypatch.setattr(candidates, "HELD", 0)
     monkeypatch.setattr(candidates, "_CELLS", 1)
-    monkeypatch.setattr(seen, "FILLED_AT_ONCE", 1)
+    monkeypatch.setattr(cosine_projection, "FILLED_AT_ONCE", 1)
     torch.testing.assert_close(gains(), whole, rtol=1e-9, atol=1e-9)
 
 
@@ -118,21 +118,21 @@ def test_no_tensor_holds_all_candidates_of_a_long_recording(monkeypatch):
     with Largest() as largest:
         tangents = tangents_of(model, parameters, Settings().noise, terms)
         found = cosine_projection.CosineProjection.of(pseudo, torch.ones_like(pseudo), tangents, None)
-    widths = sum(one.shape[-1] for one in found.candidates)
-    assert widths == sum(one.shape[-1] for one in tangents.candidates) >= 60
+    widths = sum(tangent.shape[-1] for tangent in found.candidates)
+    assert widths == sum(tangent.shape[-1] for tangent in tangents.candidates) >= 60
     assert found.kept < N // 20
-    # a block is no more than so many numbers and a candidate's
+    # a block has at most that many numbers plus a candidate's
     bound = 1_000_000 + tangents.candidates[0].numel()
     assert largest.numbers <= 1.01 * bound < 0.2 * N * line.residual(parameters, {}).shape[1] * widths
 
 
-def test_several_sets_are_one_after_the_other(sensor):
+def test_several_sets_are_a_single_sequence(sensor):
     fit, terms = sensor
     first, second = of(fit, terms[:3]).candidates, of(fit, terms[3:5]).candidates
     both, whole = one_after_the_other(first, second), of(fit, terms[:5]).candidates
     assert len(both) == 5
-    assert all(torch.equal(one, other) for one, other in zip(both, whole, strict=True))
-    assert [one.shape for one in both[2:4]] == [one.shape for one in whole[2:4]]
-    assert {id(one) for one in (*parts_of(first), *parts_of(second))} <= {id(one) for one in parts_of(both)}
+    assert all(torch.equal(a, b) for a, b in zip(both, whole, strict=True))
+    assert [tangent.shape for tangent in both[2:4]] == [tangent.shape for tangent in whole[2:4]]
+    assert {id(part) for part in (*parts_of(first), *parts_of(second))} <= {id(part) for part in parts_of(both)}
     with pytest.raises(IndexError):
         both[5]

@@ -1,4 +1,4 @@
-"""The last step of generalised least squares, where it can be taken."""
+"""The final step of generalised least squares."""
 
 import torch
 
@@ -11,7 +11,7 @@ from tests.diagnosis.line import Line
 
 
 class Cliff(Line):
-    """A line that has an answer at the fitted parameters, and nowhere near."""
+    """A line that is finite at the fitted parameters only."""
 
     known = None
 
@@ -22,7 +22,7 @@ class Cliff(Line):
         return left * torch.nan
 
 
-def test_the_step_moves_the_parameters_by_less_than_their_errors():
+def test_the_step_is_smaller_than_the_errors():
     line = Line(600)
     fit = fitted(JointModel(line), line.start())
     found = estimate(fit, NoiseSettings())
@@ -32,7 +32,7 @@ def test_the_step_moves_the_parameters_by_less_than_their_errors():
     torch.testing.assert_close(found.fit.residual, found.fit.model.residual(found.fit.parameters))
 
 
-def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
+def test_a_step_to_a_residual_that_is_not_finite_is_rejected(monkeypatch):
     line = Cliff(600)
     fit = fitted(JointModel(line), line.start())
     monkeypatch.setattr("mkc_torch.diagnosis.linearised.estimate.tangents_of", tangents_before(line))
@@ -42,11 +42,11 @@ def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
 
 
 def tangents_before(line):
-    """The tangents of the plain line; from then on it has no answer but where it was fitted."""
+    """Return the tangents of the plain line; afterwards the line is finite only where it was fitted."""
 
-    def then_none(model, parameters, settings):
+    def then_not_finite(model, parameters, settings):
         found = tangents_of(model, parameters, settings)
         line.known = parameters.detach().clone()
         return found
 
-    return then_none
+    return then_not_finite

@@ -1,4 +1,4 @@
-"""The linearised search, against dense algebra on a few hundred samples."""
+"""The linear search, compared with dense algebra on a few hundred samples."""
 
 import numpy as np
 import pytest
@@ -27,31 +27,31 @@ CANDIDATES = [
     smooth(3)[:, :1] + 0.3 * randn(M, 1, seed=4),
     randn(M, 3, seed=5),
 ]
-WANDER = smooth(K) * (1.0 + 0.2 * randn(M, 1, seed=6))
+DRIFT = smooth(K) * (1.0 + 0.2 * randn(M, 1, seed=6))
 SCALES = torch.stack([1.0 / torch.arange(1, K + 1).double(), torch.ones(K).double()])
-NO_WANDER = (torch.zeros(M, 0).double(), torch.zeros(0, 0).double())
+NO_DRIFT = (torch.zeros(M, 0).double(), torch.zeros(0, 0).double())
 
 
 @pytest.fixture(scope="module")
 def plain():
-    return LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER, NoiseSettings().walk_first)
+    return LinearSearch(NUISANCE, CANDIDATES, *NO_DRIFT, NoiseSettings().walk_first)
 
 
 @pytest.fixture(scope="module")
 def search():
-    return LinearSearch(NUISANCE, CANDIDATES, WANDER, SCALES, NoiseSettings().walk_first)
+    return LinearSearch(NUISANCE, CANDIDATES, DRIFT, SCALES, NoiseSettings().walk_first)
 
 
 def squares(columns, y):
     return np.linalg.lstsq(columns, y, rcond=None)[1][0]
 
 
-def wandering(size, family, seed):
-    return randn(M, seed=seed) + WANDER @ (size**0.5 * SCALES[family] * randn(K, seed=seed + 1))
+def drifting(size, family, seed):
+    return randn(M, seed=seed) + DRIFT @ (size**0.5 * SCALES[family] * randn(K, seed=seed + 1))
 
 
 class Dense:
-    """The likelihood of what the nuisance leaves, with the covariance written out."""
+    """The likelihood of the series without the nuisance, with an explicit covariance."""
 
     def __init__(self, search):
         complement = torch.linalg.qr(NUISANCE, mode="complete").Q[:, P:]
@@ -59,13 +59,13 @@ class Dense:
         self.noises = [(0, 0.0), *((f, float(s)) for f, known in enumerate(search._families) for s in known.sizes[1:])]
 
     def covariance(self, family, size):
-        courses = self.complement.T @ (WANDER * SCALES[family]).numpy()
+        courses = self.complement.T @ (DRIFT * SCALES[family]).numpy()
         return np.eye(self.dof) + size * courses @ courses.T
 
     def fits(self, y, columns=None, price=0.0):
         """For each noise: log-likelihood with the white variance profiled out, γ and its covariance.
 
-        Other families than the first pay a price.
+        Other families than the first have a penalty.
         """
         z = self.complement.T @ np.asarray(y)
         for family, size in self.noises:
@@ -84,7 +84,7 @@ class Dense:
         return max(self.fits(y, columns, price), key=lambda fit: fit[0])
 
 
-def test_without_wander_gains_are_the_likelihood_ratios_of_least_squares(plain):
+def test_gains_without_drift_equal_likelihood_ratios_of_least_squares(plain):
     series = randn(M, 5, seed=7) + 0.5 * CANDIDATES[1][:, :1]
     found = plain.gains(series)
     assert found.ratio.shape == (4, 5)
@@ -101,37 +101,37 @@ def test_without_wander_gains_are_the_likelihood_ratios_of_least_squares(plain):
             assert float(found.log_p[c, b]) == pytest.approx(expected, rel=1e-8)
 
 
-def test_beside_the_likeliest_candidate_is_left_what_least_squares_leaves(plain):
-    series = randn(M, 4, seed=8) + torch.cat([2.0 * CANDIDATES[1][:, :1], CANDIDATES[0], 0 * WANDER[:, :2]], -1)
+def test_residuals_of_the_best_candidate_equal_least_squares(plain):
+    series = randn(M, 4, seed=8) + torch.cat([2.0 * CANDIDATES[1][:, :1], CANDIDATES[0], 0 * DRIFT[:, :2]], -1)
     possible = torch.tensor([True, True, True, False])
-    left, beside, dof = plain.residuals_of_best(series, possible)
+    left, with_best, dof = plain.residuals_of_best(series, possible)
     torch.testing.assert_close(left, series - NUISANCE @ torch.linalg.lstsq(NUISANCE, series).solution)
     assert dof[:2].tolist() == [3.0, 1.0]
     score = 0.5 * plain.gains(series).ratio - plain.dof.unsqueeze(-1)
     for b, number in enumerate(score[:3].argmax(0).tolist()):
         columns = torch.cat([NUISANCE, CANDIDATES[number]], -1)
         rest = series[:, b] - columns @ torch.linalg.lstsq(columns, series[:, b]).solution
-        torch.testing.assert_close(beside[:, b], rest)
+        torch.testing.assert_close(with_best[:, b], rest)
 
 
 @pytest.mark.parametrize(("family", "size"), [(0, 0.0), (0, 1.0), (0, 300.0), (1, 0.05), (1, 5.0)])
-def test_with_wander_gains_are_those_of_the_dense_covariance(search, family, size):
-    dense, series = Dense(search), wandering(size, family, seed=10) + 0.3 * CANDIDATES[2].squeeze(-1)
+def test_gains_with_drift_equal_the_dense_covariance(search, family, size):
+    dense, series = Dense(search), drifting(size, family, seed=10) + 0.3 * CANDIDATES[2].squeeze(-1)
     found = search.gains(series.unsqueeze(-1)).ratio[:, 0]
     null = dense.best(series)[0]
     expected = [2.0 * (dense.best(series, columns)[0] - null) for columns in CANDIDATES]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-def test_sizes_of_wander_can_be_tried_a_few_at_a_time(search, monkeypatch):
-    series = torch.stack([wandering(3.0, 0, seed=20), wandering(0.5, 1, seed=30)], -1)
+def test_drift_sizes_in_blocks_give_the_same_gains(search, monkeypatch):
+    series = torch.stack([drifting(3.0, 0, seed=20), drifting(0.5, 1, seed=30)], -1)
     together = search.gains(series).ratio
     monkeypatch.setattr("mkc_torch.diagnosis.linearised.linear_search._CELLS", 1)
     torch.testing.assert_close(search.gains(series).ratio, together, rtol=1e-9, atol=1e-9)
 
 
-def test_sizes_of_wander_reach_from_none_to_all_there_is(search):
-    gram = WANDER - NUISANCE @ torch.linalg.lstsq(NUISANCE, WANDER).solution
+def test_drift_sizes_cover_the_range(search):
+    gram = DRIFT - NUISANCE @ torch.linalg.lstsq(NUISANCE, DRIFT).solution
     for scale, known in zip(SCALES, search._families, strict=True):
         strongest = float(torch.linalg.matrix_norm(gram * scale, 2)) ** 2
         assert float(known.sizes[0]) == 0.0
@@ -139,8 +139,8 @@ def test_sizes_of_wander_reach_from_none_to_all_there_is(search):
         assert float(known.sizes[-1]) * strongest > 1e4
 
 
-def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
-    dense, series = Dense(search), wandering(30.0, 0, seed=20)
+def test_the_noise_of_a_series_is_the_most_likely_of_the_grid(search):
+    dense, series = Dense(search), drifting(30.0, 0, seed=20)
     values = [fit[0] for fit in dense.fits(series, price=NoiseSettings().walk_first)]
     found = search.noise_fit(series)
     best = int(np.argmax(values))
@@ -156,7 +156,7 @@ def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
 @pytest.mark.parametrize("number", [0, 1, 2])
 @pytest.mark.parametrize("size", [0.0, 100.0])
 def test_estimates_are_those_of_generalised_least_squares(search, number, size):
-    series = wandering(size, 0, seed=30) + 0.4 * CANDIDATES[number].sum(-1)
+    series = drifting(size, 0, seed=30) + 0.4 * CANDIDATES[number].sum(-1)
     _, expected, spread = Dense(search).best(series, CANDIDATES[number], NoiseSettings().walk_first)
     gamma, covariance = search.estimate(number, series)
     np.testing.assert_allclose(gamma, expected, rtol=1e-7, atol=1e-9)
@@ -165,7 +165,7 @@ def test_estimates_are_those_of_generalised_least_squares(search, number, size):
 
 @pytest.mark.parametrize("family", [0, 1])
 def test_a_size_is_as_unsure_as_the_least_favourable_family_that_is_nearly_as_likely(search, family):
-    series = wandering(100.0, family, seed=30) + 0.4 * CANDIDATES[2].sum(-1)
+    series = drifting(100.0, family, seed=30) + 0.4 * CANDIDATES[2].sum(-1)
     fits = list(Dense(search).fits(series, CANDIDATES[2], NoiseSettings().walk_first))
     highest = max(fit[0] for fit in fits)
     noises = Dense(search).noises
@@ -183,7 +183,7 @@ def test_a_size_is_as_unsure_as_the_least_favourable_family_that_is_nearly_as_li
 def test_standard_errors_are_those_of_repeated_draws(search):
     gammas, errors = [], []
     for seed in range(200):
-        gamma, covariance = search.estimate(2, wandering(20.0, 0, seed=1000 + 2 * seed))
+        gamma, covariance = search.estimate(2, drifting(20.0, 0, seed=1000 + 2 * seed))
         gammas.append(float(gamma))
         errors.append(float(covariance.sqrt()))
     assert np.std(gammas) == pytest.approx(np.median(errors), rel=0.2)
@@ -199,23 +199,23 @@ def test_ratios_of_empty_draws_are_chi_square(plain, seed):
     assert float(drawn.var()) == pytest.approx(1.0, abs=0.02)
 
 
-def test_p_values_of_draws_with_wander_are_not_too_small(search):
-    """Where the noise wanders and its size is fitted with each candidate, slow candidates raise no false alarms."""
-    noise = search.noise_fit(wandering(100.0, 0, seed=40))
+def test_p_values_of_surrogates_with_drift_keep_the_level(search):
+    """The drift's size is fitted with each candidate, so slow candidates raise no false alarms."""
+    noise = search.noise_fit(drifting(100.0, 0, seed=40))
     generator = torch.Generator().manual_seed(0)
     drawn = search.white(2000, generator) + search.drift(2000, noise, generator)
     p = search.gains(drawn).log_p.exp()
     share = (p < 0.05).double().mean(-1)
     assert float(share.max()) < 0.09
     assert float(share.min()) > 0.02
-    blind = LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER, NoiseSettings().walk_first).gains(drawn).log_p.exp()
+    blind = LinearSearch(NUISANCE, CANDIDATES, *NO_DRIFT, NoiseSettings().walk_first).gains(drawn).log_p.exp()
     assert float((blind[2] < 0.05).double().mean()) > 0.3
 
 
-def test_drawn_wander_has_its_covariance(search):
-    noise = search.noise_fit(wandering(100.0, 0, seed=40))
+def test_the_drawn_drift_has_its_covariance(search):
+    noise = search.noise_fit(drifting(100.0, 0, seed=40))
     drawn = search.drift(20_000, noise, torch.Generator().manual_seed(0))
-    courses = WANDER * SCALES[noise.family]
+    courses = DRIFT * SCALES[noise.family]
     expected = noise.size * courses @ courses.mT
     assert float((drawn @ drawn.mT / 20_000 - expected).abs().max()) < 0.05 * float(expected.max())
     still = search.noise_fit(randn(M, seed=3))
@@ -223,31 +223,31 @@ def test_drawn_wander_has_its_covariance(search):
         assert not bool(search.drift(3, still, torch.Generator()).any())
 
 
-def test_the_nuisance_is_taken_out_of_everything(search):
-    series = wandering(10.0, 0, seed=50)
+def test_the_nuisance_is_projected_out(search):
+    series = drifting(10.0, 0, seed=50)
     moved = series + NUISANCE @ (100.0 * randn(P, seed=9))
     torch.testing.assert_close(search.gains(moved.unsqueeze(-1)).ratio, search.gains(series.unsqueeze(-1)).ratio)
     torch.testing.assert_close(search.estimate(1, moved)[0], search.estimate(1, series)[0])
 
 
-def test_scales_of_columns_and_of_the_series_mean_nothing(search):
+def test_gains_do_not_depend_on_scales(search):
     scaled = LinearSearch(
         NUISANCE * torch.tensor([1e-6, 1.0, 1e6, 3.0]), [1e5 * CANDIDATES[0], *CANDIDATES[1:3], 1e-7 * CANDIDATES[3]],
-        WANDER, SCALES, NoiseSettings().walk_first,
+        DRIFT, SCALES, NoiseSettings().walk_first,
     )  # fmt: skip
-    series = wandering(10.0, 0, seed=60).unsqueeze(-1)
+    series = drifting(10.0, 0, seed=60).unsqueeze(-1)
     torch.testing.assert_close(scaled.gains(1e3 * series).ratio, search.gains(series).ratio, rtol=1e-6, atol=1e-8)
 
 
-def test_directions_that_the_nuisance_takes_over_are_dropped():
+def test_directions_in_the_nuisance_are_dropped():
     inside = NUISANCE @ randn(P, 2, seed=1)
     half = torch.cat([randn(M, 1, seed=2), inside[:, :1]], -1)
     twice = torch.cat([CANDIDATES[0], 2.0 * CANDIDATES[0]], -1)
     search = LinearSearch(
-        NUISANCE, [inside, half, twice, half[:, :1], CANDIDATES[0]], WANDER, SCALES, NoiseSettings().walk_first
+        NUISANCE, [inside, half, twice, half[:, :1], CANDIDATES[0]], DRIFT, SCALES, NoiseSettings().walk_first
     )
     assert search.dof.tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
-    series = wandering(10.0, 0, seed=70) + 0.3 * half[:, 0]
+    series = drifting(10.0, 0, seed=70) + 0.3 * half[:, 0]
     found = search.gains(series.unsqueeze(-1))
     assert float(found.ratio[0]) == 0.0
     assert float(found.log_p[0]) == 0.0
@@ -255,11 +255,11 @@ def test_directions_that_the_nuisance_takes_over_are_dropped():
     torch.testing.assert_close(found.ratio[2], found.ratio[4], rtol=1e-6, atol=1e-8)
 
 
-def test_the_estimate_is_nothing_along_directions_that_the_nuisance_takes_over():
+def test_the_estimate_is_zero_along_directions_in_the_nuisance():
     inside = NUISANCE @ randn(P, 1, seed=1)
     half = torch.cat([randn(M, 1, seed=2), inside], -1)
-    search = LinearSearch(NUISANCE, [half, half[:, :1]], WANDER, SCALES, NoiseSettings().walk_first)
-    series = wandering(10.0, 0, seed=70) + 0.3 * half[:, 0]
+    search = LinearSearch(NUISANCE, [half, half[:, :1]], DRIFT, SCALES, NoiseSettings().walk_first)
+    series = drifting(10.0, 0, seed=70) + 0.3 * half[:, 0]
     gamma, covariance = search.estimate(0, series)
     alone, spread = search.estimate(1, series)
     # along such a direction γ can be traded for the nuisance at no cost: the smallest one is taken
@@ -267,8 +267,8 @@ def test_the_estimate_is_nothing_along_directions_that_the_nuisance_takes_over()
     torch.testing.assert_close(covariance[0, 0], spread[0, 0], rtol=1e-6, atol=1e-9)
 
 
-def test_traces_are_what_the_nuisance_leaves(search):
-    series = wandering(0.0, 0, seed=80) + CANDIDATES[1] @ torch.tensor([1.0, -2.0, 0.5]).double()
+def test_traces_are_orthogonal_to_the_nuisance(search):
+    series = drifting(0.0, 0, seed=80) + CANDIDATES[1] @ torch.tensor([1.0, -2.0, 0.5]).double()
     trace, basis, share = search.trace(1, series)
     gamma = search.estimate(1, series)[0].numpy()
     whole = CANDIDATES[1].numpy() @ gamma
@@ -281,7 +281,7 @@ def test_traces_are_what_the_nuisance_leaves(search):
 
 
 @pytest.mark.parametrize("dof", [1.0, 2.0, 3.0, 7.0, 12.0, 36.0])
-def test_survival_is_scipys_and_goes_on_where_that_underflows(dof):
+def test_log_survival_equals_scipy_and_extends_beyond_underflow(dof):
     ratio = (
         torch.cat([torch.zeros(1), torch.logspace(-3, 4.5, 400), torch.tensor([599.9, 600.1])]).double().sort().values
     )
@@ -300,34 +300,34 @@ def test_survival_of_a_negative_ratio_is_one():
 
 
 @pytest.mark.parametrize("size", [0.0, 100.0])
-def test_the_stationary_power_has_what_nuisance_and_wander_took_given_back(search, size):
+def test_the_stationary_power_is_unbiased_by_nuisance_and_drift(search, size):
     """Its mean over draws is the white variance everywhere, also where tangents and slow courses are large."""
     total = torch.zeros(M, dtype=torch.float64)
     for seed in range(300):
-        total += search.stationary(wandering(size, 0, seed=5000 + 2 * seed))
+        total += search.stationary(drifting(size, 0, seed=5000 + 2 * seed))
     mean = total / 300
     assert float(mean.mean()) == pytest.approx(1.0, abs=0.03)
-    taken = torch.linalg.qr(torch.cat([NUISANCE, WANDER[:, :3]], -1)).Q.square().sum(-1)
+    taken = torch.linalg.qr(torch.cat([NUISANCE, DRIFT[:, :3]], -1)).Q.square().sum(-1)
     assert float(mean[taken > taken.quantile(0.9)].mean()) == pytest.approx(1.0, abs=0.08)
 
 
-def test_a_search_takes_other_candidates(search):
-    y = wandering(3.0, 0, seed=20).unsqueeze(-1)
-    other = LinearSearch(NUISANCE, CANDIDATES[2:], WANDER, SCALES, NoiseSettings().walk_first)
+def test_candidates_can_be_replaced(search):
+    y = drifting(3.0, 0, seed=20).unsqueeze(-1)
+    other = LinearSearch(NUISANCE, CANDIDATES[2:], DRIFT, SCALES, NoiseSettings().walk_first)
     torch.testing.assert_close(search.with_candidates(CANDIDATES[2:]).gains(y).ratio, other.gains(y).ratio)
     torch.testing.assert_close(search.gains(y).ratio[2:], other.gains(y).ratio)
 
 
-def test_rows_times_a_factor_are_a_search_of_such_tangents(search):
+def test_scaled_rows_equal_a_search_with_scaled_tangents(search):
     factor = 0.5 + torch.linspace(0.0, 2.0, M, dtype=torch.float64).unsqueeze(-1)
     built = LinearSearch(
-        factor * NUISANCE, [factor * c for c in CANDIDATES], factor * WANDER, SCALES, NoiseSettings().walk_first
+        factor * NUISANCE, [factor * c for c in CANDIDATES], factor * DRIFT, SCALES, NoiseSettings().walk_first
     )
-    series = factor * wandering(10.0, 0, seed=70).unsqueeze(-1)
+    series = factor * drifting(10.0, 0, seed=70).unsqueeze(-1)
     torch.testing.assert_close(search.scaled(factor.squeeze(-1)).gains(series).ratio, built.gains(series).ratio)
 
 
-def test_the_share_of_a_channel_is_its_variance():
+def test_channel_shares_are_their_variances():
     """Courses of two channels take turns; those of the first are three times the size of the others."""
     courses = torch.cat([smooth(30) * randn(M, 1, seed=6), smooth(30) * randn(M, 1, seed=7)], -1)
     courses = courses.unflatten(-1, (2, 30)).mT.flatten(-2)
@@ -342,9 +342,9 @@ def test_the_share_of_a_channel_is_its_variance():
     assert found.mean(0)[0] == pytest.approx(1.73, abs=0.08)
 
 
-def test_without_a_wander_channels_are_alike():
-    quiet = LinearSearch(NUISANCE, [], WANDER, SCALES, NoiseSettings().walk_first)
+def test_without_drift_channels_have_equal_shares():
+    quiet = LinearSearch(NUISANCE, [], DRIFT, SCALES, NoiseSettings().walk_first)
     y = randn(M, seed=5)
-    y = y - WANDER @ torch.linalg.lstsq(WANDER, y).solution
+    y = y - DRIFT @ torch.linalg.lstsq(DRIFT, y).solution
     assert quiet.noise_fit(y).size == 0
     assert quiet.shares(y, 2).tolist() == [1.0, 1.0]

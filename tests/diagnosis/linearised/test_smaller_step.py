@@ -1,4 +1,4 @@
-"""A step of integration that changes what is found is halved until it does not."""
+"""The integration step is halved until the result does not change."""
 
 import math
 
@@ -20,7 +20,7 @@ STEP, SAMPLES, PARTS = 0.02, 200, 60
 
 
 class Drive(Dynamics):
-    """A motor and its load taken as one rigid body."""
+    """A motor and its load as a rigid body."""
 
     states = ("speed",)
     inputs = ("torque",)
@@ -37,7 +37,7 @@ class GivenStep(Drive):
 
 @pytest.fixture(scope="module")
 def recording():
-    """Of a motor whose load is on a flexible shaft, integrated at a sixtieth of the sampling."""
+    """A recording of a motor whose load is on a flexible shaft, integrated at 1/60 of the sampling interval."""
     generator = torch.Generator().manual_seed(1)
     torque = 0.2 * torch.randn(SAMPLES, generator=generator, dtype=torch.float64)
     omega, h = 2.0 * math.pi / PERIOD, STEP / PARTS
@@ -47,12 +47,12 @@ def recording():
         return (u - LOSS * v) / INERTIA + SHARE * force, -force, w - v
 
     v = w = s = 0.0
-    speeds, pushes = [], torque.tolist()
+    speeds, torques = [], torque.tolist()
     for k in range(SAMPLES):
         speeds.append(v)
         for part in range(PARTS):
             share = (part + 0.5) / PARTS
-            u = (1.0 - share) * pushes[k] + share * pushes[min(k + 1, SAMPLES - 1)]
+            u = (1.0 - share) * torques[k] + share * torques[min(k + 1, SAMPLES - 1)]
             a = rates(v, w, s, u)
             b = rates(v + 0.5 * h * a[0], w + 0.5 * h * a[1], s + 0.5 * h * a[2], u)
             v, w, s = v + h * b[0], w + h * b[1], s + h * b[2]
@@ -69,7 +69,7 @@ def fit_of(prepared, period=PERIOD):
     return fitted(JointModel(prepared, (term,)), start)
 
 
-def test_the_step_is_halved_where_that_moves_a_size(recording):
+def test_the_step_is_halved_while_that_changes_a_size(recording):
     prepared, noise = Drive().prepare(recording), Settings().noise
     assert prepared.parts == 1
     sizes = [float(fit_of(prepared).parameters[-1])]
@@ -83,13 +83,13 @@ def test_the_step_is_halved_where_that_moves_a_size(recording):
     assert abs(sizes[0] - SHARE) > abs(sizes[-1] - SHARE)
 
 
-def test_a_step_that_the_user_set_stays(recording):
+def test_a_step_set_by_the_user_is_kept(recording):
     prepared = GivenStep().prepare(recording)
     assert prepared.finer() is None
     assert with_smaller_step(fit_of(prepared), Settings().noise) is None
 
 
-def test_the_step_is_an_eighth_of_the_sampling_at_least(recording):
+def test_the_smallest_step_is_an_eighth_of_the_sampling(recording):
     drive = Drive().prepare(recording)
     assert drive.finer().finer().finer().parts == 8
     assert drive.finer().finer().finer().finer() is None
@@ -99,7 +99,7 @@ def test_the_step_is_an_eighth_of_the_sampling_at_least(recording):
 def test_the_sizes_of_a_flexible_shaft_do_not_depend_on_the_sampling(recording):
     finding = diagnose(Drive(), recording, surrogates=19).findings[0]
     assert finding.effect == "hidden_mode"
-    sizes = {one.name: (one.value, one.standard_error) for one in finding.parameters}
+    sizes = {p.name: (p.value, p.standard_error) for p in finding.parameters}
     for name, truth in {"share": SHARE, "period": PERIOD, "damping": DAMPING}.items():
         value, error = sizes[name]
         assert abs(value - truth) < max(3.0 * error, 0.01 * truth), name

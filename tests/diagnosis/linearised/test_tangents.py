@@ -1,4 +1,4 @@
-"""Slopes that are not finite: a parameter's is an error that names it, a candidate's leaves the candidate out."""
+"""Derivatives that are not finite: a parameter raises an error that names it, a candidate is left out."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from tests.diagnosis.line import Line
 
 
 class Edge(Line):
-    """``+ √(slope²)``, whose slope is not a number at 0; forward mode does not say by which parameter."""
+    """``+ √(slope²)``, whose derivative is NaN at 0, in forward mode for all parameters."""
 
     def residual(self, theta, changes):
         return super().residual(theta, changes) - theta[1].square().sqrt()
@@ -35,13 +35,13 @@ class Vertical(Offset):
         return torch.full_like(context.time, torch.nan)
 
 
-def test_a_parameter_without_a_slope_is_named():
+def test_a_parameter_without_a_finite_derivative_is_named():
     model = JointModel(Edge())
     with pytest.raises(NoFitError, match="no finite derivative by level, slope"):
         tangents_of(model, torch.tensor([1.0, 0.0], dtype=torch.float64), NoiseSettings())
 
 
-def test_a_candidate_without_a_slope_is_left_out():
+def test_a_candidate_without_a_finite_derivative_is_left_out():
     model = JointModel(Line())
     terms = (Term(Offset(), None, {}), Term(Vertical(), None, {}))
     first, second = tangents_of(model, model.prepared.start(), NoiseSettings(), terms).candidates

@@ -1,4 +1,4 @@
-"""An offset that wanders must not take the name of physics that is beside it."""
+"""A drifting offset must not hide or imitate physics."""
 
 import pytest
 
@@ -9,14 +9,14 @@ from mkc_torch.simulation import Magnetometer
 pytestmark = pytest.mark.e2e
 
 
-def test_a_nonlinearity_beside_a_wandering_offset_is_named_alone():
+def test_a_nonlinearity_with_a_drifting_offset_is_the_only_finding():
     case = draw(7503, 42)
     assert case.key.effects[0].effect == "cubic_nonlinearity"
     result = diagnose(Magnetometer(), case.recording, surrogates=19)
     assert [finding.effect for finding in result.findings] == ["cubic_nonlinearity"]
 
 
-def test_holes_in_a_wandering_field_are_no_gradient():
+def test_rejected_samples_in_a_drifting_field_are_no_gradient():
     case = draw(8111, 113, empty=True)
     assert not case.key.effects
     assert diagnose(Magnetometer(), case.recording, surrogates=19).findings == ()

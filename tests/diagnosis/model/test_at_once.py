@@ -1,4 +1,4 @@
-"""Fits that copies of the process make come back whole."""
+"""Fits from other processes are complete."""
 
 import torch
 
@@ -15,7 +15,7 @@ from tests.diagnosis.line import Line
 
 
 class Along(GainEffect):
-    """One of several effects of the same name, which differ in the number that their shape has."""
+    """Effects of the same id that differ in the name of their shape number."""
 
     id = "along"
     port = "mixed"
@@ -41,10 +41,10 @@ def sent(fits, known):
     return parcels.unpacked(parcels.packed(fits))
 
 
-def test_a_fit_comes_back_with_its_own_effect_and_driver():
+def test_a_fit_keeps_its_effect_and_driver():
     line = Line()
     driver = Driver(("load",), "any", torch.sin(3.0 * line.time).unsqueeze(-1), torch.tensor([7.0]).double(), ("kg",))
-    terms = [Term(Along("one"), driver, {"one": 1.0}), Term(Along("other"), driver, {"other": 2.0})]
+    terms = [Term(Along("first"), driver, {"first": 1.0}), Term(Along("other"), driver, {"other": 2.0})]
     fits = []
     for term in terms:
         model = JointModel(line, [term])
@@ -58,7 +58,7 @@ def test_a_fit_comes_back_with_its_own_effect_and_driver():
         assert torch.equal(back.model.residual(back.parameters), fit.residual)
 
 
-def test_a_fit_comes_back_with_its_trajectory():
+def test_a_fit_keeps_its_trajectory():
     time = torch.linspace(0.0, 3.0, 61, dtype=torch.float64)
     noise = 0.01 * torch.randn(61, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     prepared = Decay().prepare(Recording({"time": time, "level": torch.exp(-1.5 * time) + noise}))

@@ -1,4 +1,4 @@
-"""Which columns can drive an effect."""
+"""The columns that can drive an effect."""
 
 import math
 
@@ -56,14 +56,14 @@ def test_position_is_one_driver_of_three_columns():
     assert driver.values.shape == (100, 3)
 
 
-def test_columns_of_the_simulation_and_the_experiment_drive_nothing():
+def test_columns_of_the_simulation_and_run_numbers_are_no_drivers():
     result = found({"mag_x": WAVES[0], "experiment": (RAMP > 0.5).double()}, taken=frozenset({"time", "mag_x"}))
     assert result.drivers == ()
     assert result.warnings == ()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -3e8])
-def test_a_constant_drives_nothing(value):
+def test_a_constant_column_is_no_driver(value):
     result = found({"state": torch.full((100,), value), "load": WAVES[0]})
     assert [d.columns for d in result.drivers] == [("load",)]
     assert result.warnings == ("Column `state` is constant and can drive nothing.",)
@@ -106,23 +106,23 @@ def test_copies_are_one_driver(gain, offset):
     result = found({"load": WAVES[0], "rpm": WAVES[1], "power": gain * WAVES[0] + offset})
     assert [(d.columns, d.copies) for d in result.drivers] == [(("load",), ("power",)), (("rpm",), ())]
     (warning,) = result.warnings
-    assert warning == "Column `load` and `power` are copies of one another: this data cannot tell them apart."
+    assert "`load` and `power` are copies" in warning
 
 
-def test_of_copies_the_one_of_a_known_role_stands_for_all():
+def test_a_copy_of_known_role_represents_the_others():
     result = found({"x1": WAVES[0], "rpm": WAVES[1], "x2": -WAVES[0], "temperature": 20.0 + 3.0 * WAVES[0]})
     assert [(d.columns, d.role, d.copies) for d in result.drivers] == [
         (("rpm",), "any", ()), (("temperature",), "temperature", ("x1", "x2")),
     ]  # fmt: skip
 
 
-def test_a_close_rival_is_no_copy():
+def test_a_similar_column_is_no_copy():
     near = WAVES[0] + 0.003 * WAVES[1]
     assert float(torch.corrcoef(torch.stack([near, WAVES[0]]))[0, 1]) > 0.9999
     assert len(found({"load": WAVES[0], "near": near}).drivers) == 2
 
 
-def test_the_order_of_columns_means_nothing():
+def test_drivers_do_not_depend_on_the_order_of_columns():
     columns = {"load": WAVES[0], "temperature": WAVES[1], "position_x": WAVES[2], "rpm": WAVES[3],
                "position_y": WAVES[4], "current": WAVES[5], "position_z": WAVES[6]}  # fmt: skip
     columns["gap"] = WAVES[7].clone()
@@ -143,7 +143,7 @@ def test_the_order_of_columns_means_nothing():
         assert [d.columns[0] for d in again.drivers if len(d.columns) == 1] == singles
 
 
-def test_hundreds_of_columns_are_hundreds_of_drivers():
+def test_hundreds_of_columns_are_separate_drivers():
     values = torch.randn(300, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     result = found({f"c{k}": row for k, row in enumerate(values)})
     assert [d.columns[0] for d in result.drivers] == [f"c{k}" for k in range(300)]
@@ -154,7 +154,7 @@ def test_no_columns_no_drivers():
     assert found({}).drivers == ()
 
 
-def test_effects_can_ask_for_roles_of_their_own():
+def test_effects_can_define_their_own_roles():
     columns = {"voltage_bus": WAVES[0], "overvoltage": WAVES[1], "temperature": WAVES[2]}
     recording = Recording({"time": RAMP} | columns)
     drivers = find_drivers(
@@ -165,7 +165,7 @@ def test_effects_can_ask_for_roles_of_their_own():
     ]  # fmt: skip
 
 
-def test_a_part_of_the_position_is_no_position():
+def test_an_incomplete_position_is_no_position():
     recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
     drivers = find_drivers(recording, frozenset({"time"}), DriverSettings(), frozenset({"position", "any"})).drivers
     assert [(d.columns, d.role) for d in drivers] == [(("position_x",), "any"), (("position_y",), "any")]
@@ -187,8 +187,8 @@ def test_a_few_values_far_from_all_others_count_as_missing(glitch, places):
     assert "far from all others" in sentence
 
 
-def test_pulses_of_a_driver_are_no_glitches():
-    """A motor that runs for a tenth of a second; and a switch that is rarely on."""
+def test_pulses_and_rare_switches_are_no_glitches():
+    """A motor that runs for 0.1 s, and a switch that is rarely on."""
     time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
     noise = torch.randn(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     on = (time - 5.0).abs() < 0.05
@@ -202,7 +202,7 @@ def test_pulses_of_a_driver_are_no_glitches():
     assert [float(driver.values.max()) > 0.9 for driver in result.drivers] == [True, True]
 
 
-def test_a_column_that_repeats_what_is_measured_drives_nothing():
+def test_a_column_that_repeats_a_measured_column_is_no_driver():
     time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
     measured = 40.0 * torch.sin(time)
     columns = {"time": time, "mag_x": measured, "raw_x": (6.842 * measured).round() + 17.0, "load": torch.cos(time)}
@@ -213,6 +213,6 @@ def test_a_column_that_repeats_what_is_measured_drives_nothing():
     assert result.warnings == ("Column `raw_x` repeats `mag_x` and is left out: it drives nothing.",)
 
 
-def test_time_itself_is_nothing_that_is_repeated():
+def test_a_column_that_repeats_time_is_a_driver():
     result = found({"temperature": 20.0 + 3.0 * RAMP})
     assert [driver.columns for driver in result.drivers] == [("temperature",)]

@@ -1,4 +1,4 @@
-"""First fits that diverge: other starts are tried, and a failure is told in words."""
+"""First fits that diverge: other starts are tried, and a failure is explained in words."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ N = 300
 
 
 class Motor(Dynamics):
-    """A first-order motor; the state is measured in another unit, and the friction begins with the wrong sign."""
+    """A first-order motor; its state is measured in another unit, and the given friction has the wrong sign."""
 
     states, inputs, outputs = ("speed",), ("voltage",), ("rpm",)
     parameters = {"friction": 30.0, "gain": 1.0}  # noqa: RUF012
@@ -32,7 +32,7 @@ class Motor(Dynamics):
 
 
 class Room(Dynamics):
-    """A heated room whose thermometer reads in another unit; the loss begins with the wrong sign."""
+    """A heated room; its thermometer has another unit, and the given loss has the wrong sign."""
 
     states, inputs, outputs = ("air",), ("heat", "ambient"), ("indoor",)
     parameters = {"loss": -3.0, "gain": 1.0}  # noqa: RUF012
@@ -79,13 +79,13 @@ def room():
 @pytest.mark.parametrize(
     ("simulation", "recording", "expected"), [(Motor(), motor(), [-2.5, 50.0]), (Room(), room(), [0.1, 2.0])]
 )
-def test_a_first_fit_that_diverges_begins_elsewhere(simulation, recording, expected):
+def test_a_first_fit_that_diverges_is_restarted_elsewhere(simulation, recording, expected):
     prepared = simulation.prepare(recording)
     found = fit_baseline(prepared, {}, Settings().noise)
     assert found.fit.parameters[:2].tolist() == pytest.approx(expected, rel=0.2)
 
 
-def test_a_domain_that_the_residual_does_not_fit_in_is_made_wider():
+def test_a_domain_smaller_than_the_residual_is_widened():
     time = torch.arange(60, dtype=torch.float64) / 10.0
     noise = 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     prepared = Decay().prepare(Recording({"time": time, "level": torch.exp(-time) + noise}))
@@ -97,27 +97,27 @@ def test_a_domain_that_the_residual_does_not_fit_in_is_made_wider():
     assert float(wider.bound) >= 2.9 * float(robust_scale(free.residual))
 
 
-def test_the_motors_first_start_alone_has_no_fit():
+def test_the_first_start_of_the_motor_has_no_fit():
     prepared = Motor().prepare(motor())
     with pytest.raises(NoFitError):
         fitted(JointModel(prepared), prepared.start())
 
 
-def test_no_fit_from_anywhere_is_told_in_words(monkeypatch):
+def test_a_failure_of_all_starts_is_explained(monkeypatch):
     def lost(*_, **__):
         raise NoFitError("Expected `residual` to be finite at `start` but got 5782 of 8150 values that are not.")
 
-    monkeypatch.setattr(in_the_world, "fitted", lost)
-    monkeypatch.setattr(in_the_world, "over_short_horizons", lambda *_, **__: None)
+    monkeypatch.setattr(process_noise, "fitted", lost)
+    monkeypatch.setattr(process_noise, "multiple_shooting_start", lambda *_, **__: None)
     with pytest.raises(NoFitError, match="motor: no fit of Motor to `rpm` was found") as error:
         diagnose(Motor(), motor(), effects=())
-    told = str(error.value)
+    message = str(error.value)
     for words in (
-        "With the values given, the equations have no finite solution: `rpm` is lost",
+        "the equations have no finite solution: `rpm` diverges",
         "With `friction` = ",
         "Tried:",
         "Check the sign",
     ):
-        assert words in told
+        assert words in message
     for word in ("`start`", "`residual`", "`bound`", "argument", "nan"):
-        assert word not in told
+        assert word not in message

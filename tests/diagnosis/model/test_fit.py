@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.fit import _begun, fitted
+from mkc_torch.diagnosis.model.fit import _finite_start, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -20,8 +20,8 @@ class Decay(Dynamics):
         return {"level": -p.rate * x.level}
 
 
-def test_a_scale_is_that_of_the_residuals_where_a_fit_ends():
-    """From a start whose residuals are as wide as the bursts of outliers, beside a domain far wider than either."""
+def test_the_scale_fits_the_final_residuals():
+    """The initial residuals are as wide as the bursts of outliers, and the domain is far wider than both."""
     random, time = np.random.default_rng(0), np.arange(300) * 0.02
     level = np.exp(-0.7 * time) + NOISE * random.standard_normal(300)
     for first in range(20, 300, 60):
@@ -36,8 +36,8 @@ def test_a_scale_is_that_of_the_residuals_where_a_fit_ends():
     assert abs(again.log_likelihood - found.log_likelihood) < 1.0
 
 
-def test_a_fit_begins_without_a_trajectory_nearby_from_which_none_is_found(monkeypatch):
-    """As one of another noise can be: its states stand for other things."""
+def test_a_fit_starts_without_a_nearby_trajectory_that_diverges(monkeypatch):
+    """The trajectory may belong to another noise model, with other states."""
     time = np.arange(100) * 0.05
     level = np.exp(-0.7 * time)
     prepared = Decay().prepare(Recording({"time": torch.from_numpy(time), "level": torch.from_numpy(level)}))
@@ -49,10 +49,10 @@ def test_a_fit_begins_without_a_trajectory_nearby_from_which_none_is_found(monke
         return found if model.near is None else torch.full_like(found, torch.nan)
 
     monkeypatch.setattr(JointModel, "residual", lost_nearby)
-    begun, same = _begun(JointModel(prepared, (), near), start, anew=True)
-    assert begun.near is None
+    variant, same = _finite_start(JointModel(prepared, (), near), start, fresh=True)
+    assert variant.near is None
     assert torch.equal(same, start)
-    assert _begun(JointModel(prepared, (), near), start, anew=False)[0].near is near
-    # with an answer nearby it is kept
+    assert _finite_start(JointModel(prepared, (), near), start, fresh=False)[0].near is near
+    # a nearby trajectory with a finite result is kept
     monkeypatch.setattr(JointModel, "residual", whole)
-    assert _begun(JointModel(prepared, (), near), start, anew=True)[0].near is near
+    assert _finite_start(JointModel(prepared, (), near), start, fresh=True)[0].near is near

@@ -57,7 +57,7 @@ def model(line, driver):
 PARAMETERS = torch.tensor([0.9, 0.6, 0.1, -0.2, 0.3, 0.01, 0.02, -0.03, 0.5], dtype=torch.float64)
 
 
-def test_terms_say_what_they_are(driver):
+def test_terms_have_columns_and_keys(driver):
     term = Term(Mixed(), driver, {"more": 1.0})
     assert term.columns == ("load",)
     assert term.key == ("mixed_offset", ("load",), "mixed") == Term(Mixed(), driver, {"more": 2.0}).key

@@ -1,4 +1,4 @@
-"""The joint fit of what the search names, from the search's own estimate, or from nothing."""
+"""The joint refit of a named candidate, from the size of the search or from size 0."""
 
 from types import SimpleNamespace
 
@@ -24,14 +24,14 @@ def base():
 
 
 def looked(base, *gamma):
-    """A look that estimates these amplitudes."""
+    """A stub of a search that estimates these sizes."""
     estimate = torch.tensor(gamma, dtype=torch.float64)
     return SimpleNamespace(scene=SimpleNamespace(base=base), estimate=lambda _: estimate)
 
 
-@pytest.mark.parametrize("astray", [0.0, -0.3, 30.0, -1e4])
-def test_a_fit_that_goes_astray_begins_again_from_nothing(base, astray):
+@pytest.mark.parametrize("wrong_size", [0.0, -0.3, 30.0, -1e4])
+def test_a_fit_that_diverges_restarts_from_size_zero(base, wrong_size):
     term = Term(EFFECT, None, {"terms": 2.0})
-    found = refitted(base, term, looked(base, *[astray] * 6), 0)
+    found = refitted(base, term, looked(base, *[wrong_size] * 6), 0)
     assert found.log_likelihood >= base.log_likelihood - 1e-6
     assert found.converged

@@ -1,4 +1,4 @@
-"""Once an effect is known, the numbers of its shape are fitted with all else, and not only tried on a grid."""
+"""Shape numbers of known effects are fitted jointly, between the points of the grid."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ N = 400
 
 
 class Lag(Dynamics):
-    """Follows what drives it."""
+    """A first-order lag."""
 
     states = ("level",)
     inputs = ("drive",)
@@ -32,7 +32,7 @@ class Lag(Dynamics):
 
 
 def driven(act, seed=0, behind=0.0):
-    """The level behind a drive that acts otherwise than it is told, by a sensor that may lag; in 20 steps a sample."""
+    """The level of a lag whose drive is distorted by ``act``, seen by a sensor with a lag of ``behind`` s."""
     generator = torch.Generator().manual_seed(seed)
     time = 0.05 * torch.arange(N, dtype=torch.float64)
     drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)
@@ -40,17 +40,17 @@ def driven(act, seed=0, behind=0.0):
     seen = act(2.0 * torch.sin(0.9 * fine) + torch.sin(2.3 * fine + 1.0))
     step = float(fine[1])
     level = [0.0]
-    for one, other in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
-        level.append(level[-1] + step * 1.7 * (0.5 * (one + other) - level[-1]))
+    for now, after in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
+        level.append(level[-1] + step * 1.7 * (0.5 * (now + after) - level[-1]))
     shown = [0.0]
-    for one in level[1:]:
-        shown.append(one if behind == 0.0 else shown[-1] + step / behind * (one - shown[-1]))
+    for true_level in level[1:]:
+        shown.append(true_level if behind == 0.0 else shown[-1] + step / behind * (true_level - shown[-1]))
     noise = 0.01 * torch.randn(N, generator=generator, dtype=torch.float64)
     return Recording({"time": time, "drive": drive, "level": torch.tensor(shown[::20], dtype=torch.float64) + noise})
 
 
 def found(recording, *known):
-    """The joint fit with effects, each followed by its shape on the grid."""
+    """Return the joint fit with effects, each followed by its shape on the grid."""
     prepared = Lag().prepare(recording)
     terms = []
     for effect, shape in zip(known[::2], known[1::2], strict=True):
@@ -61,13 +61,13 @@ def found(recording, *known):
     return fitted(JointModel(prepared, terms), torch.cat([base.parameters, half]), base.bound)
 
 
-def test_a_limit_between_two_of_the_grid_is_found():
+def test_a_limit_between_grid_points_is_found():
     recording = driven(lambda u: 1.37 * torch.tanh(u / 1.37))
     before = found(recording, OF["input_saturation"], {"limit": 1.8})
     after = shape_fitted(before)
     assert before.model.terms[-1].shape["limit"] == 1.8
     assert after.log_likelihood > before.log_likelihood + 100.0
-    # the limit of a hyperbolic tangent whose share is not known either, as nothing reaches it
+    # the drive does not reach the limit of the hyperbolic tangent, so limit and share are only known together
     shape = after.model.terms[-1].shape
     reached = after.parameters[-1] * (shape["limit"] - 2.8) + 2.8
     assert float(reached) == pytest.approx(1.37, abs=0.03)
@@ -100,7 +100,7 @@ def test_the_shape_of_an_earlier_effect_moves_with_that_of_a_later_one():
     assert all(isinstance(value, float) for value in (*limit.values(), *lag.values()))
 
 
-def test_an_effect_without_such_numbers_stays_as_it_is():
+def test_an_effect_without_shape_numbers_is_unchanged():
     prepared = Lag().prepare(driven(lambda u: u))
     (term,) = candidate_terms(prepared, (), (OF["constant_force"],))
     model = JointModel(prepared, (term,))
@@ -109,20 +109,20 @@ def test_an_effect_without_such_numbers_stays_as_it_is():
 
 
 class Broken(type(OF["input_saturation"])):
-    """An effect that has no value but at the limits of its grid."""
+    """An effect that is finite only for shapes of the grid."""
 
     def waveform(self, shape, context):
         course = super().waveform(shape, context)
         return course if isinstance(shape["limit"], float) else course * torch.nan
 
 
-def test_where_the_simulation_has_no_answer_the_grid_s_shape_stays():
+def test_the_grid_shape_stays_if_the_simulation_is_not_finite():
     recording = driven(lambda u: u.clamp(-1.37, 1.37))
     fit = found(recording, Broken(), {"limit": 1.2})
     assert shape_fitted(fit) is fit
 
 
-def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
+def test_parameters_are_followed_by_logarithms_of_the_shape():
     recording = driven(lambda u: u.clamp(-1.37, 1.37))
     fit = found(recording, OF["input_saturation"], {"limit": 1.2})
     reach = reach_of(fit.model.terms[-1], fit.model.prepared)
@@ -139,13 +139,13 @@ def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
     assert model.prior is None or len(model.prior.mean) == model.size
 
 
-def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters():
+def test_errors_equal_least_squares_with_the_shape_as_a_parameter():
     """In white normal noise: σ² (JᵀJ)⁻¹, J by differences of parameters and limit."""
     fit = shape_fitted(found(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), OF["input_saturation"], {"limit": 1.2}))
     final = estimate(fit, NoiseSettings())
     shape, theta = final.fit.model.terms[-1].shape, final.fit.parameters
     (errors,) = final.shape_errors
-    assert set(errors) == {"limit"}  # its corner is as hard as can be
+    assert set(errors) == {"limit"}  # the softness is at the end of its range
 
     def residual(values):
         moved = final.fit.model.with_shape({**shape, "limit": float(values[-1])})
@@ -163,12 +163,12 @@ def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters()
     assert errors["limit"] == pytest.approx(float(known[-1]), rel=0.2)
     assert float(final.standard_error[-1]) == pytest.approx(float(known[-2]), rel=0.2)
     alone = float(torch.linalg.inv(covariance).diagonal()[-2].rsqrt())
-    assert float(final.standard_error[-1]) > 2.0 * alone  # without the limit's freedom it is far too sure
+    assert float(final.standard_error[-1]) > 2.0 * alone  # with the limit fixed, the error is far too small
     assert shape["limit"] == pytest.approx(1.37, abs=3.0 * errors["limit"])
 
 
 @pytest.mark.parametrize("wrong", [{"limit": (1.0, 1.0)}, {"limit": (2.0, 1.0)}, {"magic": (1.0, 2.0)}])
-def test_a_range_that_is_none_is_refused(wrong):
+def test_an_empty_range_raises(wrong):
     fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
     term = fit.model.terms[-1]
     effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()

@@ -1,4 +1,4 @@
-"""Cosine transforms, the colour of noise, and pseudo-residuals."""
+"""Cosine transforms, noise spectra, and pseudo-residuals."""
 
 import itertools
 import math
@@ -35,7 +35,7 @@ def randn(*size, seed=0):
 
 
 def coloured(phi, N, seed=0):
-    """A long-run autoregression by SciPy's filter."""
+    """Return a stationary autoregression by SciPy's filter."""
     noise = np.random.default_rng(seed).standard_normal(N + 2000)
     return torch.from_numpy(signal.lfilter([1.0], np.concatenate([[1.0], -np.asarray(phi)]), noise)[2000:].copy())
 
@@ -59,13 +59,13 @@ def test_the_transform_of_modulated_courses_is_that_of_their_products(N, kept, c
     torch.testing.assert_close(found, torch.from_numpy(expected), rtol=1e-12, atol=1e-12)
 
 
-def test_the_cosine_transform_keeps_the_precision_and_takes_nothing():
+def test_the_cosine_transform_keeps_the_dtype_and_accepts_no_columns():
     assert dct(torch.ones(8)).dtype == torch.float32
     assert dct(torch.zeros(5, 0)).shape == (5, 0)
     np.testing.assert_allclose(dct(randn(64).float()), scipy.fft.dct(randn(64).numpy(), norm="ortho"), atol=1e-5)
 
 
-def test_white_noise_stays_white():
+def test_the_cosine_transform_of_white_noise_is_white():
     coefficients = dct(randn(500, 400))
     power = coefficients.square().mean(1)
     assert float((power - 1.0).abs().max()) < 5.0 * math.sqrt(2.0 / 400)
@@ -74,7 +74,7 @@ def test_white_noise_stays_white():
 
 
 def test_a_random_walk_is_nearly_diagonal_in_cosines():
-    """Its coefficients are independent but for its end, with standard deviations that fall like 1/k."""
+    """Its coefficients are independent except for its end, with standard deviations proportional to 1/k."""
     walk = randn(300, 20_000, seed=1).cumsum(0)
     coefficients = dct(walk - walk.mean(0))
     spread = coefficients.std(1)
@@ -84,7 +84,7 @@ def test_a_random_walk_is_nearly_diagonal_in_cosines():
     assert float(correlation.abs().max()) < 0.05
 
 
-def test_courses_are_orthogonal_cosines_of_mean_square_one():
+def test_cosines_are_orthogonal_with_unit_mean_square():
     courses = cosines(40, 300)
     assert courses.shape == (300, 40)
     torch.testing.assert_close(courses.mT @ courses / 300.0, torch.eye(40, dtype=torch.float64))
@@ -102,24 +102,24 @@ def test_draws_have_the_autocovariance_of_their_autoregression(phi):
     expected = [np.trapezoid(np.abs(response) ** 2 * np.cos(lag * frequency), frequency) / np.pi for lag in range(8)]
     found = [float((drawn[: 400 - lag] * drawn[lag:]).mean()) for lag in range(8)]
     np.testing.assert_allclose(found, expected, atol=0.03 * expected[0])
-    # stationary: the ends are like the middle
+    # stationary: the variance is constant in time
     power = drawn.square().mean(1)
     assert float((power / expected[0] - 1.0).abs().max()) < 6.0 * math.sqrt(2.0 / 1500)
 
 
-def test_draws_do_not_close_in_a_circle():
+def test_draws_are_not_periodic():
     drawn = autoregressive(torch.tensor([0.95], dtype=torch.float64), 200, 4000, generator())
     ends = torch.corrcoef(drawn[[0, -1]])[0, 1]
     assert abs(float(ends)) < 0.06
 
 
 @pytest.mark.parametrize("phi", [[], [0.8], [0.97], [1.2, -0.5]])
-def test_the_colour_makes_an_autoregression_white(phi):
+def test_the_spectrum_whitens_an_autoregression(phi):
     noise = torch.stack([coloured(phi, 4000, seed) for seed in (1, 2)], -1)
     noise_spectrum = spectrum_of(dct(noise).square())
     white = noise_spectrum.whiten(noise).unflatten(0, (4000, 2))
     assert float(white.square().mean()) == pytest.approx(1.0, abs=0.03)
-    # the periodogram is flat in eight bands, the slowest of them narrow
+    # the periodogram is flat in eight bands
     edges = [0, 40, 100, 250, 500, 1000, 2000, 3000, 4000]
     for low, high in itertools.pairwise(edges):
         level = white[low:high].square().mean()
@@ -129,14 +129,14 @@ def test_the_colour_makes_an_autoregression_white(phi):
     assert float(lags.abs().max()) < 0.06
 
 
-def test_the_colour_knows_the_autoregression():
+def test_the_spectrum_has_the_autoregression():
     found = spectrum_of(dct(coloured(AR2.numpy(), 6000).unsqueeze(-1)).square())
     assert found.order == 2
     torch.testing.assert_close(found.coefficients[0], AR2, rtol=0.0, atol=0.05)
     assert spectrum_of(dct(randn(6000, 2)).square()).order == 0
 
 
-def test_channels_have_a_colour_each():
+def test_each_channel_has_its_own_spectrum():
     noise = torch.stack([coloured([0.9], 4000), 5.0 * randn(4000, seed=3)], -1)
     noise_spectrum = spectrum_of(dct(noise).square())
     assert [len(phi) for phi in noise_spectrum.coefficients] == [1, 0]
@@ -146,7 +146,7 @@ def test_channels_have_a_colour_each():
 
 @pytest.fixture(scope="module")
 def whitened_walks():
-    """Mean power of white noise and a random walk once whitened; a dozen samples of memory do not reach so far."""
+    """Mean power of whitened white noise plus a random walk, which an autoregression of order 12 cannot describe."""
     power = torch.zeros(4000, dtype=torch.float64)
     for seed in range(40):
         noise = randn(4000, 1, seed=100 + seed) + 0.01 * randn(4000, 1, seed=200 + seed).cumsum(0)
@@ -157,15 +157,15 @@ def whitened_walks():
 
 
 @pytest.mark.parametrize(("low", "high", "most"), [(1, 4, 3.5), (4, 10, 1.5), (10, 30, 1.2), (30, 4000, 1.05)])
-def test_slow_noise_beside_the_autoregression_is_followed(whitened_walks, low, high, most):
+def test_the_spectrum_includes_slow_noise(whitened_walks, low, high, most):
     assert 0.75 < float(whitened_walks[low:high].mean()) < most
 
 
-def test_the_slowest_noise_is_followed_too(whitened_walks):
+def test_the_spectrum_includes_the_slowest_noise(whitened_walks):
     assert float(whitened_walks[1:4].mean()) < 1.75
 
 
-def test_a_silent_channel_has_no_colour():
+def test_a_zero_channel_has_order_zero():
     noise_spectrum = spectrum_of(torch.zeros(500, 1, dtype=torch.float64))
     assert noise_spectrum.order == 0
 
@@ -179,14 +179,14 @@ def test_whitening_keeps_the_slowest_coefficients_and_stacks_channels():
 
 
 def turning(rate, N=12_000):
-    """Three slow axes, seen along a direction that turns: residual, and the direction it is seen along."""
+    """Return the residual of three slow axes along a turning direction, and the direction."""
     angle = rate * torch.arange(N, dtype=torch.float64)
     direction = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1).unsqueeze(1)
     noise = torch.stack([coloured([0.9], N, seed) for seed in range(3)], -1)
     return torch.einsum("nmc,nc->nm", direction, noise), direction
 
 
-def test_noise_of_a_turning_port_is_read_through_the_turns():
+def test_the_autoregression_of_a_turning_port_is_recovered():
     residual, direction = turning(0.1)
     assert spectrum_of(dct(residual).square()).order > 1
     assert port_autoregression(residual, direction).tolist() == [pytest.approx(0.9, abs=0.02)]
@@ -202,20 +202,20 @@ def test_noise_of_a_turning_port_is_read_through_the_turns():
         ([1.0, 1.002, 1.002, 1.003, 1.008, 1.007, 1.002, 1.006, 1.0035, 1.0036, 1.0036, 1.0036, 1.006], [0.999]),
     ],
 )
-def test_covariances_that_no_series_has_are_gone_by_as_far_as_they_can_be(covariance, kept):
-    """As those of what hardly changes behind a turning port are, once the turns are divided out."""
+def test_invalid_autocovariances_are_used_up_to_the_last_valid_lag(covariance, kept):
+    """Nearly constant noise at a turning port has such autocovariances once the rotation is divided out."""
     found = _levinson(torch.tensor(covariance).double().unsqueeze(-1), 1000)[:, 0]
     assert found.tolist() == pytest.approx([*kept, *[0.0] * (len(covariance) - 1 - len(kept))])
     assert bool(autoregressive(found, 500, 3, generator()).isfinite().all())
 
 
-def test_noise_of_a_port_that_turns_fast_has_a_stationary_colour():
+def test_the_autoregression_of_a_fast_turning_port_is_stationary():
     phi = port_autoregression(*turning(0.4))
     poles = np.abs(np.roots([1.0, *(-phi).tolist()]))
     assert poles.size == 0 or poles.max() < 1.0
 
 
-def test_without_a_tail_the_pseudo_residual_is_the_residual():
+def test_the_pseudo_residual_of_least_squares_is_the_residual():
     error = randn(100, 2)
     values, counts = pseudo_residual(
         error, torch.tensor([math.inf, math.inf]).double(), torch.tensor([1.0, 0.3]).double(), 0.1
@@ -242,7 +242,7 @@ def test_the_pseudo_residual_is_the_score_over_its_mean_slope():
 
 
 def test_least_squares_on_pseudo_residuals_is_the_robust_estimate_to_first_order():
-    """One step from the truth: nearly the maximum-likelihood location, and far more precise than the mean."""
+    """A step from the truth is nearly the maximum-likelihood location, and far more precise than the mean."""
     draws = []
     for seed in range(40):
         error = randn(400, 1, seed=seed)
@@ -263,7 +263,7 @@ def test_the_spread_of_pseudo_residuals_is_that_of_the_estimate():
     assert predicted == pytest.approx(1.4, abs=0.15)
 
 
-def test_where_noise_enters_is_seen_by_the_turns():
+def test_the_entry_of_noise_at_a_port_is_detected():
     axes = torch.from_numpy(turns(np.arange(3000) / 50.0).as_matrix().copy())
     right = 0
     for seed in range(10):
@@ -274,7 +274,7 @@ def test_where_noise_enters_is_seen_by_the_turns():
     assert right >= 18
 
 
-def test_an_offset_is_no_colour():
+def test_an_offset_does_not_change_the_spectrum():
     power = torch.randn(400, 2, generator=torch.Generator().manual_seed(12), dtype=torch.float64).square()
     shifted = power.clone()
     shifted[0] = 1e5

@@ -1,4 +1,4 @@
-"""Shapes by the noise of the search, after a joint fit that takes it for white."""
+"""Shapes by the noise of the search, after a joint fit that assumes white noise."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ TRUE = (FIRST + LAST) / 2.0 / RATE
 
 @pytest.fixture(scope="module")
 def burst():
-    """A step of 2 µT in the middle of a second in which all samples are far off."""
+    """A step of 2 µT in the middle of a second of outliers."""
     sensor = np.zeros((N, 3))
     sensor[(FIRST + LAST) // 2 :] = [2.0, -1.0, 1.0]
     sensor[FIRST:LAST] += 400.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))
@@ -36,7 +36,7 @@ def burst():
 
 
 def with_shape(base, effect, shape):
-    """A fit with an effect, and the search beside it."""
+    """Return a fit with an effect, and the search at it."""
     model = base.model.with_term(Term(effect, None, shape))
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
@@ -70,7 +70,7 @@ def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
 
 
 @pytest.mark.e2e
-def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
+def test_a_fit_without_shape_numbers_or_convergence_is_unchanged(burst, monkeypatch):
     best, look = with_shape(burst, CUBIC, {})
     assert with_spectrum(best, look) is best
     best, look = with_shape(burst, STEP, {"onset": FIRST / RATE + 0.02})
@@ -78,13 +78,13 @@ def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
     def lost(*args, **kwargs):
         return dataclasses.replace(fitted_with_effect(*args, **kwargs), converged=False)
 
-    monkeypatch.setattr(closing_in, "fitted_beside", lost)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.shape_refinement.fitted_with_effect", lost)
     assert with_spectrum(best, look) is best
 
 
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=20), st.data())
 @settings(deadline=None)
-def test_the_middle_is_never_told_apart_from_the_place(values, data):
+def test_values_between_place_and_middle_are_alike(values, data):
     place = data.draw(st.integers(0, len(values) - 1))
     found = middle(values, place, 0.5)
     between = values[min(found, place) : max(found, place) + 1]

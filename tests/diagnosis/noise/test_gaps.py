@@ -1,4 +1,4 @@
-"""What stands in for rejected samples, against the dense conditional expectation, and what a search makes of it."""
+"""Imputation of rejected samples, compared with the dense conditional expectation, and its effect on a search."""
 
 import math
 
@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mkc_torch.diagnosis.noise import imputation
 from mkc_torch.diagnosis.noise.cosine_basis import dct
 from mkc_torch.diagnosis.noise.imputation import MissingSamples
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
@@ -35,7 +36,7 @@ def mask(seed, size=N, channels=1, share=0.2):
 
 
 def expected(values, counts, spectrum):
-    """Series with the conditional expectation at rejected samples, and the log-determinant of the precision there."""
+    """Return series with the conditional expectation at rejected samples, and log det of the precision there."""
     rows = basis(len(values), len(values))
     precision = rows.mT @ torch.diag(1.0 / spectrum) @ rows
     lost = counts == 0
@@ -47,13 +48,13 @@ def expected(values, counts, spectrum):
 
 @settings(deadline=None)
 @given(st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.6]))
-def test_it_is_the_conditional_expectation(seed, share):
+def test_the_imputation_is_the_conditional_expectation(seed, share):
     counts = mask(seed, channels=2, share=share)
     spectra = falling(N), 0.5 + 10.0 * torch.linspace(0.0, 1.0, N, dtype=torch.float64).square()
     values = counts * torch.randn(N, 2, generator=torch.Generator().manual_seed(seed)).double()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaps, "_PLAIN", 0.0)
-        patch.setattr(gaps, "_END", N)  # the level of the last frequency alone
+        patch.setattr(imputation, "_PLAIN", 0.0)
+        patch.setattr(imputation, "_END", N)  # the level of the last frequency only
         filling = MissingSamples(counts, N).filling(noise_spectrum(*spectra))
     found = filling(dct(values))
     total = 0.0
@@ -64,18 +65,18 @@ def test_it_is_the_conditional_expectation(seed, share):
     assert filling.log_det == pytest.approx(total, abs=1e-8)
 
 
-@pytest.mark.parametrize("level", [1.0, 9.0])  # of 1, the noise is nowhere below it
+@pytest.mark.parametrize("level", [1.0, 9.0])  # at level 1 the noise is nowhere below it
 @pytest.mark.parametrize("share", [0.1, 0.7])
-def test_solving_for_samples_or_for_frequencies_is_the_same(share, level):
+def test_solving_by_samples_equals_solving_by_frequencies(share, level):
     counts = mask(11, share=share)
     known, rows = MissingSamples(counts, N), torch.arange(0, N, 2)
     excess = (level / falling(N) - 1.0)[rows]
     assert bool((excess < 0).all()) == (level == 1.0)
-    one, other = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
+    by_sample, by_frequency = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
     values = torch.randn(N, 3, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
-    assert float((one(values) - values).abs().max()) > 0.01
-    torch.testing.assert_close(one(values), other(values))
-    assert one.log_det == pytest.approx(other.log_det)
+    assert float((by_sample(values) - values).abs().max()) > 0.01
+    torch.testing.assert_close(by_sample(values), by_frequency(values))
+    assert by_sample.log_det == pytest.approx(by_frequency.log_det)
 
 
 def test_frequencies_that_are_left_out_count_as_white():
@@ -109,18 +110,18 @@ def test_amplitudes_are_left_what_they_are():
 
 
 @pytest.mark.parametrize(("limit", "value"), [("_MOST", 12), ("_CELLS", 12 * N + 5)])
-def test_many_frequencies_are_reduced_to_those_that_matter_most(limit, value, monkeypatch):
+def test_only_the_most_coloured_frequencies_are_kept(limit, value, monkeypatch):
     counts = mask(7)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(8)).double()
-    monkeypatch.setattr(gaps, limit, value)
+    monkeypatch.setattr(imputation, limit, value)
     found = MissingSamples(counts, N).filling(noise_spectrum(falling(N)))(dct(values))
     end = falling(N)[-3:].mean()
     series, _ = expected(values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling(N), end) / end)
     torch.testing.assert_close(found[:, 0], dct(series))
 
 
-def test_holes_in_a_walk_do_not_look_like_an_effect():
-    """Likelihood ratios of three slow courses that are not there, in a walk with white noise, 15 % of it rejected.
+def test_rejected_samples_of_a_random_walk_give_no_false_gain():
+    """Likelihood ratios of three absent slow courses, in a random walk plus white noise with 15 % rejected samples.
 
     Both have the same holes.
     """

@@ -1,4 +1,4 @@
-"""The search beside pushes: what is left out has its name, in a fit of its own under the pushes that it leaves."""
+"""The search with process noise: the missing effect is named in a fit under its own remaining process noise."""
 
 import dataclasses
 import importlib
@@ -31,7 +31,7 @@ def located(fit, draws=39, level=0.05):
 
 
 @pytest.mark.e2e
-def test_drag_that_is_hidden_beside_pushes_is_named_and_sized():
+def test_hidden_drag_is_named_and_sized_under_process_noise():
     base = swung_in_the_world("slow", drag=0.4).fit
     terms, found = candidates(base, DYNAMICS), located(base)
     assert found.p_value == pytest.approx(1.0 / 40.0)
@@ -39,42 +39,42 @@ def test_drag_that_is_hidden_beside_pushes_is_named_and_sized():
     assert found.fit.model.terms[-1] is found.term
     (drag,) = found.fit.model.gammas(found.fit.parameters)[-1].tolist()
     assert drag == pytest.approx(0.4, abs=0.15)
-    # each of those that gain most is fitted, under its own noise
+    # the leading candidates are fitted, each under its own noise
     assert 2 <= len(found.compared) <= 4  # both, and free curves over angle and rate that gain enough
     assert found.term.key in [fit.model.terms[-1].key for fit in found.compared]
     assert found.fit.log_likelihood > base.log_likelihood
-    # the ranking begins with it, each physics once
-    gaps = [one.gap for one in found.ranking]
+    # the ranking begins with it, and lists each effect once
+    gaps = [rival.gap for rival in found.ranking]
     assert gaps[0] == 0.0
     assert gaps == sorted(gaps)
-    keys = [terms[one.number].key for one in found.ranking]
+    keys = [terms[rival.number].key for rival in found.ranking]
     assert keys[0] == found.term.key
     assert len(keys) == len(set(keys))
 
 
 @pytest.mark.parametrize("seed", [2])
-def test_beside_pushes_from_which_nothing_is_missing_nothing_is_compared(seed):
+def test_process_noise_alone_gives_no_finding(seed):
     found = located(at_the_truth("white", seed))
     assert found.p_value > 0.05
     assert found.compared == ()
 
 
-def test_a_lost_trajectory_is_told(monkeypatch):
+def test_a_diverging_trajectory_raises(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.with_process_noise.joint_likelihood", lambda *_, **__: None)
-    with pytest.raises(NoFitError, match="trajectory is lost"):
+    with pytest.raises(NoFitError, match="no finite trajectory"):
         located(at_the_truth("white", 1))
 
 
-def test_what_is_far_behind_at_first_is_not_fitted_any_further():
+def test_candidates_far_behind_are_not_refitted():
     fits, behind = ("best", "near", "far"), Settings(search=dataclasses.replace(SearchSettings(), behind=50.0))
     scores = [400.0, 151.0, 149.0]
     assert _within_reach([7, 3, 5], fits, scores, behind) == ([7, 3], ["best", "near"])
-    # one that gains nothing is no measure of what others have to gain
+    # a candidate without a gain sets no share for the others
     assert _within_reach([7, 3, 5], fits, [-10.0, -59.0, -61.0], behind) == ([7, 3], ["best", "near"])
 
 
 @pytest.mark.e2e
-def test_the_one_that_is_left_out_is_still_in_the_ranking():
+def test_candidates_without_a_refit_stay_in_the_ranking():
     base = swung_in_the_world("slow", drag=0.4).fit
     strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))
     found = search_with_process_noise(
@@ -82,19 +82,19 @@ def test_the_one_that_is_left_out_is_still_in_the_ranking():
         declared={}, fixed={}, settings=strict,
     )  # fmt: skip
     assert len(found.compared) == 1
-    assert len({one.number for one in found.ranking}) > 4
-    assert found.ranking[0].gap == 0.0 <= min(one.gap for one in found.ranking[1:])
+    assert len({rival.number for rival in found.ranking}) > 4
+    assert found.ranking[0].gap == 0.0 <= min(rival.gap for rival in found.ranking[1:])
 
 
 def of_likelihood(value, size, shape=()):
-    """What prices of a fit ask of it: a free run of 400 samples."""
+    """A stub of an open-loop fit of 400 samples, with the fields that penalties need."""
     effect = types.SimpleNamespace(fitted_shape=shape)
     term = types.SimpleNamespace(effect=effect, key=("drag", (), "rate"))
     model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=None)
     return types.SimpleNamespace(log_likelihood=value, model=model, residual=torch.zeros(400, 1), value=value)
 
 
-def test_an_effect_that_gains_no_more_than_its_numbers_over_the_same_noise_is_needless():
+def test_an_effect_that_gains_less_than_its_penalty_is_needless():
     bare = of_likelihood(1000.0, 3)
     # two numbers: six nats by Schwarz, two by Akaike where the draws were of that noise
     for gain, drawn, needless in ((5.9, False, True), (6.1, False, False), (1.9, True, True), (2.1, True, False)):
@@ -102,33 +102,31 @@ def test_an_effect_that_gains_no_more_than_its_numbers_over_the_same_noise_is_ne
 
 
 @pytest.mark.parametrize(("bare", "counts"), [(1000.0, True), (1095.0, False), (None, False)])
-def test_without_draws_a_free_run_has_to_be_likelier_than_the_simulation_under_the_noise_beside_it_too(
-    bare, counts, monkeypatch
-):
+def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_effect(bare, counts, monkeypatch):
     base, run = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4)
     module = "mkc_torch.diagnosis.search.with_process_noise"
     monkeypatch.setattr(f"{module}.with_own_noise", lambda fit, *_: fit)
     monkeypatch.setattr(f"{module}._under_own_noise", lambda fit, *_: fit)
-    monkeypatch.setattr(f"{module}.at_once", lambda works, *_: [work() for work in works])
+    monkeypatch.setattr(f"{module}.run_parallel", lambda works, *_: [work() for work in works])
     monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
     monkeypatch.setattr(f"{module}._without", lambda *_: None if bare is None else of_likelihood(bare, 3))
     assert _plain(base, [run], run.model.terms, {}, FEW) is counts
 
 
 @pytest.mark.e2e
-def test_the_search_is_done_again_with_the_simulation_under_a_likelier_noise(monkeypatch):
-    bases, once = [], of_diagnosis.begun
+def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
+    bases, original = [], of_diagnosis.first_step
 
-    def begun(base, terms, *rest):
+    def first_step(base, terms, *rest):
         bases.append(base)
-        found = once(base, terms, *rest)
-        likelier = dataclasses.replace(base) if len(bases) == 1 else None
-        return dataclasses.replace(found, first=dataclasses.replace(found.first, without_candidate=likelier))
+        found = original(base, terms, *rest)
+        better = dataclasses.replace(base) if len(bases) == 1 else None
+        return dataclasses.replace(found, first=dataclasses.replace(found.first, without_candidate=better))
 
-    monkeypatch.setattr(of_diagnosis, "begun", begun)
-    told = []
-    found = of_diagnosis.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=told.append)
-    assert sum("under a likelier noise" in line for line in told) == 1
+    monkeypatch.setattr(of_diagnosis, "first_step", first_step)
+    messages = []
+    found = of_diagnosis.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=messages.append)
+    assert sum("more likely noise" in line for line in messages) == 1
     assert len(bases) == 2
     assert bases[1] is not bases[0]
     assert found.verdict == "unexplained"

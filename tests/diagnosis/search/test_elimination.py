@@ -1,4 +1,4 @@
-"""Findings whose effect others have taken over are dropped, and those that pay their price are kept."""
+"""Backward elimination: needless findings are dropped, findings worth their penalty stay."""
 
 import dataclasses
 import functools
@@ -21,13 +21,13 @@ def with_effects(*names):
     terms = candidates(base, DYNAMICS)
     model, start = base.model, base.parameters
     for name in names:
-        term = next(one for one in terms if one.effect.id == name and one.port == "rate of rate")
+        term = next(t for t in terms if t.effect.id == name and t.port == "rate of rate")
         model = model.with_term(term)
         start = torch.cat([start, start.new_zeros(model.size - len(start))])
     return fitted(model, start, base.bound, graduate=False)
 
 
-def test_an_effect_that_does_nothing_beside_the_true_one_is_dropped():
+def test_a_needless_effect_is_dropped_and_the_true_one_stays():
     fit = with_effects("constant_force", "quadratic_drag")
     assert needless_term(fit, {}, Settings()) == 0
     less = without(fit, 0, {}, Settings())
@@ -40,7 +40,7 @@ def test_a_single_effect_is_never_dropped():
     assert needless_term(with_effects("quadratic_drag"), {}, Settings()) is None
 
 
-def test_each_disturbance_of_a_fit_has_its_price():
+def test_each_disturbance_of_a_fit_has_its_penalty():
     fit, settings = with_effects("quadratic_drag"), Settings()
     count = len(noise_of_fit(fit, {}).selected.disturbances)
     assert count > 0

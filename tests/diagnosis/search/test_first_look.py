@@ -1,4 +1,4 @@
-"""A first look beside a finding: what is there is seen, and where nothing is, nothing is searched."""
+"""Screening after a finding: it detects a further effect, and ends the search if there is none."""
 
 import dataclasses
 import importlib
@@ -21,7 +21,7 @@ from tests.simulation.tumbling import RATE, tumbling
 
 pytestmark = pytest.mark.e2e
 
-rounds = importlib.import_module("mkc_torch.diagnosis.stepwise")
+stepwise = importlib.import_module("mkc_torch.diagnosis.stepwise")
 
 N = 2000
 TIME = np.arange(N) / RATE
@@ -35,7 +35,7 @@ def recording(*effects, seed=0):
 
 
 def located(*effects, seed=0):
-    """What is found first."""
+    """The result of the first search."""
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording(*effects, seed=seed))
     roles = frozenset(role for effect in CATALOGUE for role in effect.roles)
@@ -54,28 +54,28 @@ def p_value(found, others=lambda term: term.columns != ("current",)):
     return screening_p_value(found, [others(term) for term in found.scene.terms], 99, generator)
 
 
-def test_another_effect_is_seen():
+def test_a_further_effect_is_detected():
     assert p_value(located(ALONG_CURRENT, STEP)) == 0.01
 
 
-def test_beside_the_only_effect_p_values_are_those_of_chance():
+def test_p_values_after_the_only_effect_are_not_small():
     found = [p_value(located(ALONG_CURRENT, seed=seed)) for seed in range(3)]
     assert min(found) > 0.02
     assert max(found) > 0.2
 
 
-def test_the_effect_itself_is_taken_out_of_everything():
+def test_the_tangents_of_the_effect_are_projected_out():
     found = located(ALONG_CURRENT)
-    beside = found.look.gains.ratio
-    assert float(beside.max()) > 1000.0
+    ratio = found.look.gains.ratio
+    assert float(ratio.max()) > 1000.0
     assert p_value(found, lambda _: True) > 0.02
 
 
-def test_where_no_other_candidate_is_left_there_is_nothing():
+def test_p_value_without_further_candidates_is_one():
     assert p_value(located(ALONG_CURRENT), lambda _: False) == 1.0
 
 
-def test_trajectories_are_for_the_search_itself():
+def test_p_value_is_zero_for_effects_through_a_trajectory():
     found = located(ALONG_CURRENT)
     tangents = dataclasses.replace(found.scene.tangents, pointwise=dict.fromkeys(found.scene.tangents.pointwise))
     look = dataclasses.replace(found.look, scene=dataclasses.replace(found.scene, tangents=tangents))
@@ -86,20 +86,20 @@ def test_trajectories_are_for_the_search_itself():
     ((ALONG_CURRENT,), 1, ["current_field"]),
     ((ALONG_CURRENT, STEP), 2, ["current_field", "hard_iron_step"]),
 ])  # fmt: skip
-def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(monkeypatch, effects, searches, names):
-    run_search, begun, seen = rounds.locate, [], []
+def test_a_further_search_runs_only_after_a_small_screening_p_value(monkeypatch, effects, searches, names):
+    located_by, searched, p_values = stepwise.run_search, [], []
 
     def counted(*arguments, **options):
-        begun.append(1)
-        return run_search(*arguments, **options)
+        searched.append(1)
+        return located_by(*arguments, **options)
 
-    def looked(*arguments, **options):
-        seen.append(screening_p_value(*arguments, **options))
-        return seen[-1]
+    def screened(*arguments, **options):
+        p_values.append(screening_p_value(*arguments, **options))
+        return p_values[-1]
 
-    monkeypatch.setattr(rounds, "locate", counted)
-    monkeypatch.setattr(rounds, "p_value_beside", looked)
+    monkeypatch.setattr(stepwise, "run_search", counted)
+    monkeypatch.setattr(stepwise, "screening_p_value", screened)
     diagnosis = diagnose(Magnetometer("attitude"), recording(*effects))
     assert [finding.effect for finding in diagnosis.findings] == names
-    assert len(begun) == searches + (seen[-1] <= 0.1)
-    assert len(seen) == searches
+    assert len(searched) == searches + (p_values[-1] <= 0.1)
+    assert len(p_values) == searches

@@ -1,4 +1,4 @@
-"""Free runs of candidates find what process noise around a simulation that is far off hides."""
+"""Open-loop fits of candidates find an effect that process noise around a poor simulation hides."""
 
 import math
 
@@ -24,7 +24,7 @@ STEP, SAMPLES, DRAG = 0.05, 240, 0.3
 
 
 class Cart(Dynamics):
-    """A cart that is driven by a force; nothing slows it."""
+    """A cart driven by a force, without drag."""
 
     states = ("speed",)
     inputs = ("force",)
@@ -42,8 +42,8 @@ def recording(drag, noise=0.01, seed=0):
         found.append(speed)
         ahead = force[min(k + 1, SAMPLES - 1)]
         for part in range(parts):
-            pushed = torch.lerp(force[k], ahead, (part + 0.5) / parts)
-            speed += STEP / parts * float(pushed - drag * speed * abs(speed))
+            driving_force = torch.lerp(force[k], ahead, (part + 0.5) / parts)
+            speed += STEP / parts * float(driving_force - drag * speed * abs(speed))
     generator = torch.Generator().manual_seed(seed)
     seen = torch.tensor(found, dtype=torch.float64) + noise * torch.randn(SAMPLES, generator=generator).double()
     return Recording({"time": time, "force": force, "speed": seen})
@@ -54,15 +54,15 @@ def free_fit(drag):
     return fitted(JointModel(prepared), prepared.start())
 
 
-def of_physics(fit):
+def all_terms(fit):
     return candidate_terms(fit.model.prepared, (), DYNAMICS)
 
 
-def test_the_drag_that_is_left_out_leads_and_is_sized():
+def test_missing_drag_leads_and_is_sized():
     fit = free_fit(DRAG)
-    terms = of_physics(fit)
+    terms = all_terms(fit)
     runs = free_runs(fit, terms, Settings())
-    number, best = max(runs, key=lambda one: one[1].log_likelihood)
+    number, best = max(runs, key=lambda run: run[1].log_likelihood)
     by_effect = {terms[n].effect.id: run for n, run in runs}
     assert "quadratic_drag" in by_effect
     drag = by_effect["quadratic_drag"]
@@ -73,9 +73,9 @@ def test_the_drag_that_is_left_out_leads_and_is_sized():
     assert best.model.terms[-1].key == terms[number].key
 
 
-def test_gains_are_those_of_least_squares_within_the_range_of_the_physics():
+def test_gains_equal_least_squares_within_the_bounds():
     fit = free_fit(DRAG)
-    terms = of_physics(fit)
+    terms = all_terms(fit)
     gains, sizes = linear_gains(fit, terms, Settings())
     assert len(gains) == len(sizes) == len(terms)
     for term, gain, size in zip(terms, gains, sizes, strict=True):
@@ -95,22 +95,22 @@ def test_gains_are_those_of_least_squares_within_the_range_of_the_physics():
     assert sizes[place].tolist() == pytest.approx([-float(left[-1])], rel=1e-3)
 
 
-def test_a_drag_that_pushes_gains_nothing():
+def test_drag_of_the_wrong_sign_gains_nothing():
     fit = free_fit(-0.03)
-    terms = of_physics(fit)
+    terms = all_terms(fit)
     gains, sizes = linear_gains(fit, terms, Settings())
     drags = [n for n, term in enumerate(terms) if term.effect.id == "quadratic_drag"]
     assert [gains[n] for n in drags] == [0.0]
     assert [sizes[n].tolist() for n in drags] == [[0.0]]
 
 
-def test_what_is_far_behind_is_given_up():
+def test_fits_far_behind_are_dropped():
     fit = free_fit(DRAG)
-    gains = [run.log_likelihood - fit.log_likelihood for _, run in free_runs(fit, of_physics(fit), Settings())]
+    gains = [run.log_likelihood - fit.log_likelihood for _, run in free_runs(fit, all_terms(fit), Settings())]
     assert min(gains) >= min(max(gains) - BEHIND_NATS, (1.0 - BEHIND_SHARE) * max(gains)) - 1e-6
 
 
-def test_each_leading_physics_is_fitted_from_its_best_shapes(monkeypatch):
+def test_each_leading_effect_is_fitted_from_its_best_shapes(monkeypatch):
     tried = []
 
     def fit_of(free, term, size):  # noqa: ARG001
@@ -120,7 +120,7 @@ def test_each_leading_physics_is_fitted_from_its_best_shapes(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs._fit", fit_of)
     monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs.PHYSICS", 3)
     fit = free_fit(DRAG)
-    terms = of_physics(fit)
+    terms = all_terms(fit)
     free_runs(fit, terms, Settings())
     gains = dict(zip(map(id, terms), linear_gains(fit, terms, Settings())[0], strict=True))
     keys = {term.key for term in tried}

@@ -1,4 +1,4 @@
-"""Noise and physics chosen together beside a pendulum that something unrecorded drives."""
+"""Joint selection of noise and physics for a pendulum with an unrecorded disturbance."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ SEEDS = tuple(range(1, 5))
 
 @functools.cache
 def scene(noise, seed):
-    """Fit, candidates, tangents, and what counts of the residual."""
+    """Return fit, candidates, tangents, and the mask of the residual."""
     fit = at_the_truth(noise, seed)
     terms = candidates(fit, DYNAMICS)
     return fit, terms, tangents_of(fit.model, fit.parameters, NoiseSettings(), terms), torch.ones_like(fit.residual)
@@ -36,14 +36,14 @@ def searched(noise, seed):
 
 
 def strongest(found, terms):
-    """Name and number of the candidate that gains most for its numbers."""
+    """Return name and number of the candidate with the largest gain less its numbers."""
     number = int((found.gain - found.dof).argmax())
     return terms[number].effect.id, number
 
 
 @pytest.mark.parametrize("noise", ["white", "slow"])
-def test_p_values_are_not_small_where_process_noise_is_all_that_is_missing(noise):
-    """Of four recordings: two p-values below 0.05 come about by chance once in seventy times."""
+def test_p_values_under_process_noise_alone_are_not_small(noise):
+    """Two p-values of four below 0.05 have a probability of 1/70 by chance."""
     values = sorted(searched(noise, seed).p_value for seed in SEEDS)
     assert values[1] > 0.05
     assert values[2] > 0.1
@@ -51,7 +51,7 @@ def test_p_values_are_not_small_where_process_noise_is_all_that_is_missing(noise
 
 @functools.cache
 def hidden():
-    """A search beside the fit of a pendulum with a hidden quadratic drag."""
+    """Search at the fit of a pendulum with a hidden quadratic drag."""
     fit = swung_in_the_world("slow", drag=0.4).fit
     terms = candidates(fit, DYNAMICS)
     tangents = tangents_of(fit.model, fit.parameters, NoiseSettings(), terms)
@@ -59,7 +59,7 @@ def hidden():
     return parts, search(parts)
 
 
-def test_hidden_drag_is_beyond_all_draws_and_has_its_name_and_size():
+def test_hidden_drag_is_beyond_all_surrogates_and_has_its_name_and_size():
     (_, terms, *_), found = hidden()
     assert found.p_value == pytest.approx(1.0 / (1 + DRAWS))
     assert found.beyond > 3.0
@@ -72,7 +72,7 @@ def test_hidden_drag_is_beyond_all_draws_and_has_its_name_and_size():
 
 
 def test_a_candidate_that_the_parameters_span_gains_nothing():
-    """The simulation has a damping of its own."""
+    """The simulation has its own damping."""
     found, terms = searched("white", 1), scene("white", 1)[1]
     number = [(term.effect.id, term.port) for term in terms].index(("linear_drag", "rate of rate"))
     assert float(found.dof[number]) == 0.0
@@ -82,7 +82,7 @@ def test_a_candidate_that_the_parameters_span_gains_nothing():
 @pytest.mark.parametrize("factor", [1e-9, 1e6])
 def test_gains_do_not_depend_on_the_units_of_a_candidate(factor):
     fit, terms, tangents, counts = scene("slow", 1)
-    other = dataclasses.replace(tangents, candidates=tuple(factor * one for one in tangents.candidates))
+    other = dataclasses.replace(tangents, candidates=tuple(factor * columns for columns in tangents.candidates))
     known, found = searched("slow", 1), search((fit, terms, other, counts))
     torch.testing.assert_close(found.gain, known.gain, rtol=1e-4, atol=1e-4)
     assert found.p_value == known.p_value
@@ -91,27 +91,27 @@ def test_gains_do_not_depend_on_the_units_of_a_candidate(factor):
     torch.testing.assert_close(factor * found.start(number).gamma, known.start(number).gamma, rtol=1e-4, atol=0.0)
 
 
-def test_a_candidate_without_a_trace_gains_nothing():
+def test_a_candidate_with_zero_tangents_gains_nothing():
     fit, terms, tangents, counts = scene("white", 1)
-    none = dataclasses.replace(tangents, candidates=tuple(0.0 * one for one in tangents.candidates))
-    found = search((fit, terms, none, counts), draws=9)
+    zero = dataclasses.replace(tangents, candidates=tuple(0.0 * columns for columns in tangents.candidates))
+    found = search((fit, terms, zero, counts), draws=9)
     assert float(found.gain.abs().max()) < 1e-6
     assert not bool(found.dof.any())
 
 
-def test_one_sided_candidates_gain_by_no_value_of_the_other_sign():
+def test_one_sided_candidates_gain_only_with_the_allowed_sign():
     found, terms = searched("white", 2), scene("white", 2)[1]
     for number, term in enumerate(terms):
         if term.effect.one_sided and float(found.gain[number]) > 1e-9:
             assert bool((found.start(number).gamma >= 0.0).any()), term.effect.id
 
 
-def test_a_lost_trajectory_is_not_searched(monkeypatch):
+def test_a_diverging_trajectory_is_not_searched(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood.flow_of", lambda *_: None)
     assert search(scene("white", 1), draws=9) is None
 
 
-def test_process_noise_is_no_larger_than_the_rates_of_the_recording():
+def test_process_noise_is_limited_by_the_rates_of_the_recording():
     found = searched("white", 1)
     scene = found.scene
     least = dataclasses.replace(scene, largest=np.array([1e-12, 1e-12]))

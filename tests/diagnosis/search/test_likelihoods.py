@@ -1,4 +1,4 @@
-"""Restricted log-likelihoods with and without candidates, against regressions written out."""
+"""Restricted log-likelihoods with and without candidates, compared with explicit regressions."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def scene(sizes=(1, 2), one_sided=(False, False), seed=0):
     return flow, y, own, candidates, Columns(series(np.concatenate([own, candidates], 1)), 2, sizes, one_sided)
 
 
-def test_under_white_noise_they_are_those_of_restricted_least_squares():
+def test_log_likelihoods_in_white_noise_equal_restricted_least_squares():
     flow, y, own, candidates, columns = scene()
     found = log_likelihoods(flow, [WHITE], series(y), columns)
     used = flow.counts[:, 0] > 0
@@ -54,7 +54,7 @@ def test_sizes_are_minus_the_slopes_of_the_first_series():
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
+def test_a_one_sided_candidate_gains_only_with_its_sign(sign):
     flow, _, own, candidates, columns = scene(sizes=(1,), one_sided=(True,))
     y = sign * 5.0 * candidates[:, :1] + 0.1 * own[:, :1]
     found = log_likelihoods(flow, [WHITE], series(y), columns)
@@ -64,17 +64,17 @@ def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
 
 
 def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
-    pushed = NoiseModel((0.5,), ((0, 0.7, 1.0),), (False,))
+    disturbed = NoiseModel((0.5,), ((0, 0.7, 1.0),), (False,))
     flow, y, _, _, columns = scene(sizes=(1, 3, 1, 2), one_sided=(False, False, True, False))
-    whole = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
-    monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the least, 16 samples
-    monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # a model at a time
-    blocks = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
+    whole = log_likelihoods(flow, [WHITE, disturbed], series(y), columns)
+    monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the smallest block, 16 samples
+    monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # one model per block
+    blocks = log_likelihoods(flow, [WHITE, disturbed], series(y), columns)
     for name in ("without", "with_candidate", "sizes", "rank", "scale"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
 
 
-def test_a_candidate_that_changes_nothing_gains_nothing():
+def test_a_candidate_with_zero_tangents_gains_nothing():
     flow, y, own, candidates, _ = scene()
     columns = Columns(series(np.concatenate([own, 0.0 * candidates], 1)), 2, (1, 2), (False, False))
     found = log_likelihoods(flow, [WHITE], series(y), columns)
@@ -82,9 +82,9 @@ def test_a_candidate_that_changes_nothing_gains_nothing():
     np.testing.assert_allclose(found.with_candidate[0], found.without[0][None].repeat(2, 0))
 
 
-def test_each_disturbance_has_its_price():
+def test_each_disturbance_has_its_penalty():
     flow, y, _, _, columns = scene()
-    # a disturbance of size 0 changes nothing else
+    # a disturbance of size 0 changes only the penalty
     idle = NoiseModel((0.5,), ((1, 1e-200, 1.0),), (False,))
     found = log_likelihoods(flow, [WHITE, idle], series(y), columns)
     np.testing.assert_allclose(found.without[0] - found.without[1], PRICE)
@@ -93,14 +93,14 @@ def test_each_disturbance_has_its_price():
 def test_a_declared_noise_has_no_free_scale():
     flow, y, _, _, columns = scene()
     declared = NoiseModel((0.5,), (), (True,))
-    one = log_likelihoods(flow, [declared], series(y), columns).without
-    other = log_likelihoods(flow, [declared], series(2.0 * y), columns).without
+    original = log_likelihoods(flow, [declared], series(y), columns).without
+    doubled = log_likelihoods(flow, [declared], series(2.0 * y), columns).without
     free = log_likelihoods(flow, [WHITE], series(y), columns).without
-    assert ((one - other) > 20.0).all()
-    assert (free > one).all()
+    assert ((original - doubled) > 20.0).all()
+    assert (free > original).all()
 
 
-def test_the_scale_is_no_smaller_than_the_floor_of_the_noise_model():
+def test_the_floor_of_the_noise_model_limits_the_scale():
     flow, y, _, _, columns = scene()
     free = log_likelihoods(flow, [WHITE], series(y), columns)
     held = log_likelihoods(flow, [replace(WHITE, floor=(2.0,))], series(y), columns)

@@ -1,4 +1,4 @@
-"""Rivals are compared at their own best shapes, under one noise."""
+"""The search compares rivals at their own best shapes, under a common noise."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ STEPS = tuple(Term(STEP, None, {"onset": onset}, "mixed") for onset in (0.4, 0.9
 
 @pytest.fixture(scope="module")
 def found():
-    """A search beside a step of 0.7 µT a third of the way, between two of the onsets that are tried."""
+    """The search of a recording with a step of 0.7 µT, at a third of its length, between two onsets of the grid."""
     sensor = np.zeros((N, 3))
     sensor[671:] = [0.4, -0.4, 0.4]
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
@@ -41,7 +41,7 @@ def found():
 
 
 @pytest.mark.e2e
-def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
+def test_the_best_candidate_has_a_shape_between_grid_points(found):
     prepared, terms, located = found
     first = located.scene.terms[located.ranking[0].number]
     assert first.effect.id == located.term.effect.id == "hard_iron_step"
@@ -51,14 +51,14 @@ def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
 
 
 @pytest.mark.e2e
-def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
+def test_its_gain_is_the_largest_of_all_shapes(found):
     _, _, located = found
     gains = located.look.gains.ratio[:, 0]
     steps = [k for k, term in enumerate(located.scene.terms) if term.effect.id == "hard_iron_step"]
     assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
 
 
-def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
+def test_a_fit_without_finite_tangents_is_skipped(monkeypatch):
     line = Line(100)
     model = JointModel(line)
     fit = fitted(model, line.start())
@@ -77,7 +77,7 @@ def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
         _with_tangents(fits[:1], terms, Settings())
 
 
-def test_gains_of_other_candidates_are_those_of_a_search_with_them():
+def test_gains_of_other_candidates_equal_a_search_with_them():
     line = Line(600)
     model = JointModel(line)
     fit = fitted(model, line.start())
@@ -87,15 +87,15 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     tangents = tangents_of(model, fit.parameters, NoiseSettings(), STEPS)
     whole = linearise(model, fit.parameters, values, counts, tangents)
     bare = linearise(model, fit.parameters, values, counts, tangents.bare, spectrum=whole.spectrum)
-    beside = Candidates(model, fit.parameters, STEPS, tangents.pointwise)
-    assert len(beside) == 3
+    others = Candidates(model, fit.parameters, STEPS, tangents.pointwise)
+    assert len(others) == 3
     torch.testing.assert_close(
-        bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
+        bare.gains_of(others, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
     )
 
 
 @pytest.mark.e2e
-def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypatch):
+def test_a_joint_fit_at_a_wrong_onset_is_replaced_by_the_search(monkeypatch):
     sensor = np.zeros((N, 3))
     sensor[671:] = [0.7, -0.7, 0.7]
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
@@ -116,7 +116,7 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
     assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)
 
 
-def test_a_fit_that_ran_out_of_steps_is_begun_anew():
+def test_a_fit_that_did_not_converge_is_restarted():
     line = Line(200)
     base = fitted(JointModel(line), line.start())
     settled = fitted(base.model.with_term(STEPS[0]), torch.cat([base.parameters, torch.zeros(3)]), base.bound)
@@ -131,7 +131,7 @@ def test_a_fit_that_ran_out_of_steps_is_begun_anew():
 
 
 class Driven(Line):
-    """One whose last parameter is a state at the beginning."""
+    """A line whose last parameter is an initial state."""
 
     beginnings = 1
 
@@ -139,14 +139,14 @@ class Driven(Line):
 @pytest.mark.parametrize(
     ("line", "now", "starts"),
     [
-        (Driven(), [4.1, 0.4], 1),  # more than five times its start
-        (Driven(), [0.1, 0.4], 1),  # and less than a fifth
+        (Driven(), [4.1, 0.4], 1),  # more than five times its initial value
+        (Driven(), [0.1, 0.4], 1),  # less than a fifth of it
         (Driven(), [-0.9, 0.4], 0),
-        (Driven(), [0.9, 9.0], 0),  # a state begins wherever it does
-        (Line(), [4.1, 0.4], 0),  # its start is no guess of a user's
+        (Driven(), [0.9, 9.0], 0),  # initial states do not count
+        (Line(), [4.1, 0.4], 0),  # the simulation has no initial values of a user
     ],
 )
-def test_where_a_fit_began_is_looked_at_if_it_went_far_from_there(line, now, starts):
+def test_initial_values_are_a_start_if_a_parameter_moved_far(line, now, starts):
     fit = fitted(JointModel(line), line.start())
     found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)), 5.0)
     assert len(found) == starts

@@ -1,4 +1,4 @@
-"""An effect whose evidence is one burst of outliers among others is not named; one that comes back is."""
+"""Localised evidence: an effect that explains only one of several bursts is not named; a repeated effect is."""
 
 import numpy as np
 import pytest
@@ -18,11 +18,11 @@ POSITION = {
     for axis, period, phase in zip("xyz", (7.3, 9.1, 11.7), (0.3, 1.2, 2.5), strict=True)
 }
 MILD, OTHERS = {400: -1.0}, {1200: 12.0, 1900: -9.0}
-"""Sample at which a burst begins, and how much it adds along the field, in µT."""
+"""First sample of a burst, and its size along the field in µT."""
 
 
-def in_the_body(world):
-    return turns(TIME).inv().apply(world)
+def in_the_body(field):
+    return turns(TIME).inv().apply(field)
 
 
 def bursts(sizes, length=40):
@@ -33,7 +33,7 @@ def bursts(sizes, length=40):
 
 
 def pole(place, strength=0.02):
-    """Of a pole in µT·m², the field along the path."""
+    """Return the field of a magnetic pole, strength in µT·m², along the path."""
     away = place - np.stack(list(POSITION.values()), -1)
     return in_the_body(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
 
@@ -42,27 +42,27 @@ def diagnosis_of(sensor):
     return diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, sensor=sensor, seed=1, **POSITION))
 
 
-def told(diagnosis):
+def burst_warnings(diagnosis):
     return [warning for warning in diagnosis.warnings if "another burst of outliers" in warning]
 
 
 @pytest.mark.e2e
-def test_one_burst_among_others_is_no_effect():
-    """A pole beside the path would explain the mild one, and nothing else."""
+def test_a_single_burst_among_others_is_no_finding():
+    """A pole near the path would explain the mild burst only."""
     diagnosis = diagnosis_of(bursts(MILD | OTHERS))
-    assert diagnosis.verdict == "unexplained"  # bursts are no white noise
+    assert diagnosis.verdict == "unexplained"  # bursts are not white noise
     assert diagnosis.findings == ()
-    (warning,) = told(diagnosis)
+    (warning,) = burst_warnings(diagnosis)
     assert warning.startswith("From 6.8 to 8.8 s")
     assert "field_gradient by position_x, position_y, position_z" in warning
 
 
 @pytest.mark.e2e
-def test_what_is_passed_more_than_once_is_an_effect():
+def test_a_pole_passed_repeatedly_is_a_finding():
     place = np.array([values[420] for values in POSITION.values()]) + 0.05
     diagnosis = diagnosis_of(pole(place) + bursts(OTHERS))
     assert [finding.effect for finding in diagnosis.findings] == ["field_gradient"]
-    assert told(diagnosis) == []
+    assert burst_warnings(diagnosis) == []
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def stretch():
     return trace, counts, torch.ones(1000, 2, 1, dtype=torch.float64)
 
 
-def test_the_stretch_holds_the_evidence(stretch):
+def test_the_stretch_contains_the_evidence(stretch):
     trace, counts, nuisance = stretch
     first, end = localised_stretch(trace, counts, trace, nuisance, Settings())
     assert first <= 400
@@ -82,28 +82,28 @@ def test_the_stretch_holds_the_evidence(stretch):
     assert end - first == 40
 
 
-def test_evidence_that_is_spread_is_in_no_stretch(stretch):
+def test_spread_evidence_has_no_stretch(stretch):
     trace, counts, nuisance = stretch
     for begin in (100, 250):
         trace[begin : begin + 30, 0] = 1.0
     assert localised_stretch(trace, counts, trace, nuisance, Settings()) is None
 
 
-def test_without_other_bursts_a_stretch_is_evidence(stretch):
+def test_no_stretch_without_other_bursts(stretch):
     trace, _, nuisance = stretch
     assert localised_stretch(trace, torch.ones_like(trace), trace, nuisance, Settings()) is None
-    beside = torch.ones_like(trace)
-    beside[395:405] = 0.0  # its own edge
-    assert localised_stretch(trace, beside, trace, nuisance, Settings()) is None
+    edge_rejected = torch.ones_like(trace)
+    edge_rejected[395:405] = 0.0  # its own edge
+    assert localised_stretch(trace, edge_rejected, trace, nuisance, Settings()) is None
 
 
-def test_what_the_simulation_itself_explains_is_no_evidence(stretch):
+def test_parameters_of_the_simulation_are_projected_out(stretch):
     trace, counts, nuisance = stretch
     offset = counts * (trace + 2.0)
     assert localised_stretch(offset, counts, offset, nuisance, Settings()) is not None
     assert localised_stretch(offset, counts, offset, nuisance[..., :0], Settings()) is None
 
 
-def test_a_trace_against_the_residual_is_no_evidence(stretch):
+def test_an_anticorrelated_trace_is_no_evidence(stretch):
     trace, counts, nuisance = stretch
     assert localised_stretch(-trace, counts, trace, nuisance, Settings()) is None

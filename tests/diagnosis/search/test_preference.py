@@ -1,4 +1,4 @@
-"""Named physics goes before a curve that has no name, the more so where the curve is over the motion itself."""
+"""Penalties of candidates: named physics comes before curves without a name."""
 
 import pytest
 import torch
@@ -33,19 +33,19 @@ def search():
     return ModelPrior(terms, prepared, NamingSettings()), terms
 
 
-def test_a_named_force_gives_nothing(search):
+def test_a_named_force_has_no_penalty(search):
     prefer, terms = search
     drag = next(term for term in terms if term.effect.id == "linear_drag")
     assert prefer.penalty(drag, 100.0) == 0.0
 
 
-def test_a_form_that_has_others_as_special_cases_gives_five_nats(search):
+def test_a_generalisation_has_a_penalty_of_five_nats(search):
     prefer, terms = search
     forms = {term.effect.id: prefer.penalty(term, 100.0) for term in terms if term.effect.is_generalisation}
     assert forms == {"power_law": 5.0, "hidden_lag": 5.0, "hidden_mode": 5.0}
 
 
-def test_a_curve_over_the_motion_gives_half_of_its_gain_and_ten_nats(search):
+def test_a_curve_over_the_motion_is_penalised_by_half_its_gain_and_ten_nats(search):
     prefer, terms = search
     curves = [term for term in terms if term.effect.is_curve and term.driver is None]
     assert curves

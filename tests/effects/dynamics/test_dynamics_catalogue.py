@@ -39,7 +39,7 @@ def change(effect, gamma, shape, context):
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_what_brakes_takes_energy_out(name):
+def test_losses_dissipate_energy(name):
     effect, context = OF[name], dynamic_context(OF[name])
     for shape in effect.shapes(context.time):
         for gamma in torch.eye(size_of(effect, shape, context), dtype=torch.float64):
@@ -57,7 +57,7 @@ def test_signs_of_amplitudes():
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
 
 
-def test_what_acts_on_equations_follows_their_states_or_inputs_alone():
+def test_effects_on_equations_depend_on_states_or_inputs_only():
     for effect in DYNAMICS:
         assert effect.follows_signal
         assert effect.roles == () or effect.driver_optional
@@ -74,10 +74,10 @@ class TestPhysics:
         effect = OF[name]
         context = dynamic_context(effect)
         carried = context.carries or context.channels
-        row = torch.tensor([values.get(one, 0.0) for one in carried], dtype=torch.float64)
+        row = torch.tensor([values.get(name, 0.0) for name in carried], dtype=torch.float64)
         return change(effect, gamma, shape or {}, replace(context, signal=row.expand(N, -1)))[0].tolist()
 
-    def test_a_push(self):
+    def test_constant_force(self):
         assert self.at("constant_force", [0.3], speed=-5.0) == [0.3]
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -87,10 +87,10 @@ class TestPhysics:
         assert self.at("cubic_stiffness", [0.3], angle=2.0 * sign) == pytest.approx([-2.4 * sign])
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_friction_is_of_one_size(self, sign):
+    def test_friction_has_constant_size(self, sign):
         for speed in (0.1, 10.0):
-            rubbed = self.at("coulomb_friction", [0.3], {"width": 0.01}, speed=speed * sign)
-            assert rubbed == pytest.approx([-0.3 * sign])
+            braked = self.at("coulomb_friction", [0.3], {"width": 0.01}, speed=speed * sign)
+            assert braked == pytest.approx([-0.3 * sign])
         shape = {"width": 0.01, "stribeck_speed": 1.0}
         assert self.at("stribeck_friction", [0.3, 0.2], shape, speed=10.0 * sign) == pytest.approx([-0.3 * sign])
         slow = -(0.3 + 0.2 * math.exp(-0.01)) * sign
@@ -99,21 +99,21 @@ class TestPhysics:
         assert loaded == pytest.approx([-0.8 * sign])
 
     def test_a_periodic_force(self):
-        pushed = self.at("position_periodic_force", [0.3, 0.2], {"order": 4.0}, angle=0.5)
-        assert pushed == pytest.approx([0.3 * math.sin(2.0) + 0.2 * math.cos(2.0)])
+        force = self.at("position_periodic_force", [0.3, 0.2], {"order": 4.0}, angle=0.5)
+        assert force == pytest.approx([0.3 * math.sin(2.0) + 0.2 * math.cos(2.0)])
 
-    def test_exchange_evens_out(self):
+    def test_exchange_reduces_the_difference(self):
         assert self.at("coupling", [0.3, 0.2], speed=1.0, other=3.0) == pytest.approx([0.6, -0.4])
 
-    def test_stops_push_back(self):
+    def test_stops_act_against_the_position(self):
         shape = {"place": 1.0, "exponent": 1.0}
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=1.2) == pytest.approx([-1.0])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=-1.2) == pytest.approx([0.6])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=0.9) == [0.0]
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
-    def test_a_whole_power_is_a_drag_or_a_spring(self, sign):
-        """γ is what there is at the scale; near 0, a thousandth of it, the curve is straight."""
+    def test_integer_powers_equal_drags_and_springs(self, sign):
+        """γ is the size at the scale; below a thousandth of the scale the curve is linear."""
         of = {(e.id, e.plot_axis, "surroundings" in e.needs): e for e in DYNAMICS}
         context = dynamic_context(OF["power_law"])
         speed, angle, wind = (sign * context.component(name) for name in ("speed", "angle", "other"))
@@ -133,7 +133,7 @@ class TestPhysics:
             found = change(OF["power_law"], [0.3 * 5.0**exponent], shape, context)[:, 0]
             torch.testing.assert_close(found, named[name], rtol=0.0, atol=1e-4)
 
-    def test_what_is_beside_surroundings_evens_out_with_them(self):
+    def test_losses_to_surroundings_vanish_at_equality(self):
         for name in ("linear_drag", "thermal_loss"):
             (effect,) = [e for e in DYNAMICS if e.id == name and "surroundings" in e.needs]
             context = dynamic_context(effect)
@@ -144,18 +144,18 @@ class TestPhysics:
             lost = change(effect, [0.3], shape, context)[:, 0] * (context.part("own") - context.part("surroundings"))
             assert float(lost.max()) <= 0.0
 
-    def test_only_what_is_above_the_rim_runs_over(self):
+    def test_overflow_acts_above_the_rim_only(self):
         assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=1.5) == pytest.approx([-1.0])
         assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=0.5) == [0.0]
 
-    def test_weirs_and_balls_are_stiffer_the_farther_they_are_in(self):
+    def test_exponents_of_overflow_and_stops(self):
         for lost, exponent in ((0.5, 1.0), (0.5**1.5, 1.5), (0.5**2.5, 2.5)):
             shape = {"rim": 1.0, "exponent": exponent}
             assert self.at("overflow", [2.0], shape, speed=1.5) == pytest.approx([-2.0 * lost])
             shape = {"place": 1.0, "exponent": exponent}
             assert self.at("hard_stop", [2.0, 4.0], shape, angle=-1.5) == pytest.approx([4.0 * lost])
 
-    def test_radiation_in_either_unit(self):
+    def test_radiation_in_both_units(self):
         effect = OF["thermal_loss"]
         for unit, room in (("°C", 20.0), ("K", 293.15)):
             context = replace(dynamic_context(effect), part_units={"own": unit})
@@ -165,14 +165,14 @@ class TestPhysics:
             lost = float(change(effect, [1.0], {}, replace(context, signal=hot))[0])
             assert lost == pytest.approx(-0.01, rel=1e-3)
 
-    def test_inputs_are_limited_and_small_ones_lost(self):
+    def test_saturation_and_dead_zone(self):
         limit, width = {"limit": 1.0, "softness": 0.01}, {"width": 1.0, "softness": 0.01}
         for u, limited, dead in ((3.0, 1.0, 2.0), (-3.0, -1.0, -2.0), (0.5, 0.5, 0.0)):
             assert u + self.at("input_saturation", [1.0], limit, force=u)[0] == pytest.approx(limited)
             assert u + self.at("dead_zone", [1.0], width, force=u)[0] == pytest.approx(dead, abs=1e-9)
 
 
-def test_a_delay_shows_what_was_also_between_the_samples():
+def test_a_delay_interpolates_between_samples():
     effect = OF["input_delay"]
     context = dynamic_context(effect)
     course = (3.0 * context.time + 1.0).unsqueeze(-1)
@@ -183,7 +183,7 @@ def test_a_delay_shows_what_was_also_between_the_samples():
 
 
 def test_a_delay_does_not_reach_into_another_run():
-    """Where time goes back another run begins, at rest at its first value."""
+    """A run begins where time goes back, in steady state at its first value."""
     effect = OF["input_delay"]
     time = torch.cat([torch.linspace(0.0, 2.0, 40), torch.linspace(0.0, 1.0, 40)]).double()
     course = torch.cat([7.0 + 0.0 * time[:40], 1.0 + time[40:]]).unsqueeze(-1)
@@ -194,17 +194,17 @@ def test_a_delay_does_not_reach_into_another_run():
 
 
 @pytest.mark.parametrize("name", ["input_delay", "input_lag", "sensor_lag", "backlash"])
-def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
-    """On one clock that goes on, and on clocks that begin anew, what is remembered of a run ends with it."""
+def test_runs_are_separated_by_their_number_for_any_clock(name):
+    """On a common clock, and on separate clocks, the memory of a run ends with the run."""
     effect = OF[name]
-    one, other = torch.linspace(0.0, 2.0, 40).double(), torch.linspace(2.1, 3.9, 40).double()
-    course = torch.cat([7.0 + torch.sin(5.0 * one), torch.cos(5.0 * other)]).unsqueeze(-1)
+    first, second = torch.linspace(0.0, 2.0, 40).double(), torch.linspace(2.1, 3.9, 40).double()
+    course = torch.cat([7.0 + torch.sin(5.0 * first), torch.cos(5.0 * second)]).unsqueeze(-1)
     run = torch.arange(2).repeat_interleave(40)
-    shape = effect.shapes(one)[-1]
-    for later in (other, other - 2.1):
-        both = replace(dynamic_context(effect), time=torch.cat([one, later]), signal=course, run=run)
+    shape = effect.shapes(first)[-1]
+    for later in (second, second - 2.1):
+        both = replace(dynamic_context(effect), time=torch.cat([first, later]), signal=course, run=run)
         together = change(effect, [1.0], shape, both)
-        for part, time in ((slice(0, 40), one), (slice(40, 80), later)):
+        for part, time in ((slice(0, 40), first), (slice(40, 80), later)):
             alone = replace(both, time=time, signal=course[part], run=None)
             torch.testing.assert_close(together[part], change(effect, [1.0], shape, alone))
 
@@ -220,7 +220,7 @@ def test_an_actuator_lags_by_its_time_constant():
     assert not effect.within_a_sample({"lag": 0.2}, 0.1)
 
 
-def test_a_square_input_is_itself_at_its_largest_and_a_quarter_at_half():
+def test_square_input_equals_the_largest_input_and_a_quarter_at_half():
     effect = OF["input_square"]
     context = dynamic_context(effect)
     signal = torch.linspace(-4.0, 4.0, 5, dtype=torch.float64).unsqueeze(-1)
@@ -321,7 +321,7 @@ REVERSING = {"coulomb_friction", "stribeck_friction"}
 
 
 class TestNeeds:
-    """Effects are tried where they can mean something."""
+    """Effects are tried only where they have a meaning."""
 
     @pytest.mark.e2e
     def test_of_a_pendulum(self):
@@ -347,7 +347,7 @@ class TestNeeds:
         assert places["rate of speed"] & set(IDS) == EVERYWHERE | {"hard_stop", "added_mass"}
         assert "hysteretic rate of speed" not in places
 
-    def test_what_floats_has_a_height(self):
+    def test_buoyancy_needs_a_height(self):
         assert "buoyancy" in tried(prepared(Fall, height=torch.cos(TIME)))["rate of speed"]
 
         class Sway(Fall):
@@ -369,13 +369,13 @@ class TestNeeds:
         terms = [t for t in candidate_terms(simulation, drivers.drivers, DYNAMICS) if t.effect.id == "magnus_lift"]
         assert [term.columns for term in terms] == [(), ("spin_z",)]
 
-    def test_what_turns_is_not_driven_sideways(self):
+    def test_magnus_lift_is_not_tried_on_angles(self):
         class Joints(Ball):
             units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}  # noqa: RUF012
 
         assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
 
-    def test_what_has_surroundings_may_lose_to_them(self):
+    def test_losses_to_surroundings_are_tried_where_they_are_known(self):
         class Room(Dynamics):
             states, inputs = ("inner", "wall"), ("power", "outside")
             parameters = {"loss": 0.1}  # noqa: RUF012
@@ -386,7 +386,7 @@ class TestNeeds:
                 return {"inner": u.power + away, "wall": p.loss * (u.outside - x.wall) - away}
 
         class Wind(Fall):
-            inputs = ("wind", "push")
+            inputs = ("wind", "drive")
             units = {"height": "m", "speed": "m/s", "wind": "m/s"}  # noqa: RUF012
 
         warm = {"inner": 30.0 + 0.0 * TIME, "wall": 20.0 + TIME, "power": TIME, "outside": 5.0 + 0.1 * TIME}
@@ -396,14 +396,14 @@ class TestNeeds:
         assert room.ports["rate of wall"].part_units["surroundings"] == "°C"
         assert room.ports["rate of wall"].sizes["surroundings"].highest == pytest.approx(15.0 + 0.9 * 5.95)
         forms = {(t.port, t.effect.of) for t in candidate_terms(room, (), DYNAMICS) if t.effect.id == "power_law"}
-        # a power of degrees Celsius is no physics
+        # a power of a temperature in °C has no meaning
         assert forms == {("rate of wall", "difference"), ("rate of inner", "excess")}
-        falling = prepared(Wind, height=100.0 - 0.5 * TIME**2, wind=TIME, push=TIME)
+        falling = prepared(Wind, height=100.0 - 0.5 * TIME**2, wind=TIME, drive=TIME)
         assert falling.ports["rate of speed"].parts["surroundings"] == "wind"
         forms = {t.effect.of for t in candidate_terms(falling, (), DYNAMICS) if t.effect.id == "power_law"}
         assert forms == {"difference", "own"}
 
-    def test_segments_of_a_run_remember_nothing_of_each_other(self):
+    def test_effects_with_memory_are_not_tried_with_restarts(self):
         class Pieces(Pendulum):
             restart_after = 2.0
 
@@ -413,12 +413,12 @@ class TestNeeds:
         decay = torch.exp(-0.1 * TIME)
         places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
         assert places["exchange of inner and outer"] == {"coupling"}
-        # heat is stored elsewhere too, and has no inertia to swing with
+        # heat can be stored elsewhere, and has no inertia
         assert places["lagged rate of inner"] == {"hidden_lag"}
         assert "resonant rate of inner" not in places
         assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss", "power_law"}
 
-    def test_every_need_is_a_part_that_some_port_has(self):
+    def test_needs_are_known_parts(self):
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
             "height", "sideways", "flowing", "surroundings",
@@ -428,7 +428,7 @@ class TestNeeds:
 
 
 def test_shapes_are_in_the_units_of_the_recording():
-    """A width is a share of the typical speed; a stop stands at a share of the largest deflection."""
+    """A width is a share of the typical speed, the position of a stop a share of the largest deflection."""
     ports = {}
     for size in (1.0, 1000.0):
         simulation = prepared(Pendulum, angle=size * torch.cos(3.0 * TIME))
@@ -443,8 +443,8 @@ def test_shapes_are_in_the_units_of_the_recording():
 
 
 @EFFECTS
-def test_a_found_effect_acts_on_a_recording_that_shows_less(effect):
-    """What was needed to tell it from others, such as a reversal, need not happen again."""
+def test_a_found_effect_acts_on_a_recording_with_fewer_parts(effect):
+    """Conditions of the search, such as a reversal, are not required in another recording."""
     context = dynamic_context(effect)
     lasting = {"own", "position", "angle", "other", "load", "temperature", "rate", "surroundings"}
     fewer = {part: name for part, name in context.parts.items() if part in lasting}

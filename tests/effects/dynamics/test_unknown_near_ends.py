@@ -1,4 +1,4 @@
-"""A force without a name that is steep near the ends of the way."""
+"""An unnamed force that is steep near the ends of the range."""
 
 import numpy as np
 import pytest
@@ -23,18 +23,18 @@ class Hover(Dynamics):
 
 
 def basis(values, lowest, highest):
-    return torch.stack([curve_within(values, lowest, highest, one) for one in torch.eye(NUMBERS).double()], -1)
+    return torch.stack([curve_within(values, lowest, highest, unit) for unit in torch.eye(NUMBERS).double()], -1)
 
 
-def left(design, values):
-    """What is left of values beside a design and a constant, root mean square."""
+def remaining_rms(design, values):
+    """RMS residual of a regression of values on a design and a constant."""
     design = torch.cat([design, torch.ones_like(design[:, :1])], -1)
     return float(
         (values - design @ torch.linalg.lstsq(design, values.unsqueeze(-1)).solution[:, 0]).square().mean().sqrt()
     )
 
 
-def test_it_is_a_cubic_and_what_rises_towards_the_ends():
+def test_basis_is_a_cubic_and_terms_that_rise_towards_the_ends():
     x = torch.linspace(-3.0, 3.0, 121, dtype=torch.float64)
     found = basis(x, -1.0, 2.0).numpy()
     t = np.clip(x.numpy() / 2.0, -1.0, 1.0)
@@ -45,15 +45,15 @@ def test_it_is_a_cubic_and_what_rises_towards_the_ends():
         np.testing.assert_allclose(found[:, k + 1], np.clip(1.0 - (2.0 - inside) / width, 0.0, None) ** 3, atol=1e-12)
 
 
-def test_the_push_of_a_ground_is_followed_seven_times_as_closely_as_by_a_polynomial():
+def test_ground_effect_is_fitted_seven_times_as_closely_as_by_a_polynomial():
     height = 0.2 + 1.3 * torch.linspace(0.0, 1.0, 1301, dtype=torch.float64)
-    push = 9.81 / (1.0 - 0.0055 / height.square()) - 9.81
+    lift = 9.81 / (1.0 - 0.0055 / height.square()) - 9.81
     powers = torch.stack([(height / 1.5) ** k for k in range(1, 5)], -1)
-    assert 7.0 * left(basis(height, 0.2, 1.5), push) < left(powers, push)
-    assert left(basis(height, 0.2, 1.5), push) < 0.02 * float(push.std())
+    assert 7.0 * remaining_rms(basis(height, 0.2, 1.5), lift) < remaining_rms(powers, lift)
+    assert remaining_rms(basis(height, 0.2, 1.5), lift) < 0.02 * float(lift.std())
 
 
-def test_the_range_is_that_of_the_recording():
+def test_range_is_from_the_recording():
     time = torch.arange(0.0, 6.0, 0.05, dtype=torch.float64)
     height = 0.5 + 0.3 * torch.cos(3.0 * time)
     terms = candidate_terms(Hover().prepare(Recording({"time": time, "height": height, "thrust": time})), (), DYNAMICS)
@@ -61,16 +61,16 @@ def test_the_range_is_that_of_the_recording():
     assert curve.port == "rate of climb"
     assert curve.shape["lowest_of_position"] == pytest.approx(0.2, abs=0.01)
     assert curve.shape["highest_of_position"] == pytest.approx(0.8, abs=0.01)
-    # one physics with the polynomial over the same position, so that the better of them is told
+    # it has the key of the polynomial over the same position, so that only the better curve is reported
     assert len({term.key for term in terms if term.effect.id == "unknown" and term.port == curve.port}) == 1
 
 
-def test_a_range_without_width_is_no_trouble():
+def test_a_range_without_width_is_finite():
     found = basis(torch.tensor([-1.0, 0.0, 2.0], dtype=torch.float64), 0.0, 0.0)
     assert bool(found.isfinite().all())
 
 
-def test_its_line_of_python_is_the_curve():
+def test_code_equals_the_curve():
     x, gamma = (
         torch.linspace(0.0, 2.0, 41, dtype=torch.float64),
         torch.linspace(-1.0, 1.0, NUMBERS, dtype=torch.float64),

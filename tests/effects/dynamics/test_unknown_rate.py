@@ -1,4 +1,4 @@
-"""A force without a name: the curve itself, its line of Python, and that it is found where nothing else will do."""
+"""An unnamed force: its curve, its code, and its detection."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def along(context, of):
 
 
 @pytest.mark.parametrize("of", FORMS)
-def test_the_curve_is_legendres_and_goes_on_as_a_constant(context, of):
+def test_curve_is_a_legendre_series_and_constant_beyond_its_reach(context, of):
     effect = UnknownRate(of)
     found = effect.change(GAMMA, {f"reach_of_{of}": REACH}, context)[:, 0]
     inside = np.clip(along(context, of).numpy() / REACH, -1.0, 1.0)
@@ -42,7 +42,7 @@ def test_the_curve_is_legendres_and_goes_on_as_a_constant(context, of):
 
 
 @pytest.mark.parametrize("of", FORMS)
-def test_its_line_of_python_is_the_curve(context, of):
+def test_code_equals_the_curve(context, of):
     effect, shape = UnknownRate(of), {f"reach_of_{of}": REACH}
     names = {part: part for part in ("own", "position", "surroundings")}
     (line,) = effect.code(GAMMA.tolist(), shape, names)
@@ -52,15 +52,15 @@ def test_its_line_of_python_is_the_curve(context, of):
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """A push to one side that grows with the square of the speed, whichever way the pendulum swings."""
+    """A force to one side that grows with the square of the speed, in both directions of the pendulum."""
     recording = swung(lambda _, speed: 0.12 * speed**2)
-    # a catalogue that has forces along the motion alone
+    # a catalogue of forces along the motion only
     effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
     return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
 
 
 @pytest.mark.e2e
-def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
+def test_a_force_outside_the_catalogue_is_found_as_unknown(diagnosis):
     assert diagnosis.verdict == "unexplained"
     (finding,) = diagnosis.findings
     assert finding.effect == "unknown"
@@ -73,7 +73,7 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
 
 
 @pytest.mark.e2e
-def test_its_model_comes_back_with_the_same_curve(diagnosis):
+def test_model_is_restored_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
     assert again.terms[0].effect.plot_axis == diagnosis.model.terms[0].effect.plot_axis
     assert again.terms[0].shape == diagnosis.model.terms[0].shape

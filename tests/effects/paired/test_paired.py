@@ -1,4 +1,4 @@
-"""Effects between what was simulated and what was measured: units, bounds, and shifts in time."""
+"""Effects between simulated and measured outputs: units, bounds, and shifts in time."""
 
 import math
 

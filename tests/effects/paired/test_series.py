@@ -1,4 +1,4 @@
-"""Effects on one output or one input act in series; those on several outputs have a number for each."""
+"""Effects on an output or an input act in series; effects on several outputs have an amplitude for each."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ JOINTS = {"pan": torch.sin(TIME), "tilt": 0.5 * torch.cos(1.7 * TIME)}
 
 def arm(**units):
     table = Recording({"time": TIME, **JOINTS}, units=units)
-    return Paired(table), Recording({"time": TIME, **{name: one + 0.1 for name, one in JOINTS.items()}}, units=units)
+    return Paired(table), Recording({"time": TIME, **{name: y + 0.1 for name, y in JOINTS.items()}}, units=units)
 
 
 def terms(prepared, *names, port=None):
@@ -28,7 +28,7 @@ def terms(prepared, *names, port=None):
     return [next(t for t in every if t.effect.id == name and t.port in (port, "all outputs")) for name in names]
 
 
-def test_play_stands_still_after_a_reversal_and_a_limit_does_not():
+def test_play_stands_still_after_a_reversal():
     context = paired_context(OutputBacklash())
     y = context.part("own")
     shown = y + OutputBacklash().change(torch.tensor([0.3]).double(), {}, context)[:, 0]
@@ -36,7 +36,7 @@ def test_play_stands_still_after_a_reversal_and_a_limit_does_not():
     assert float((shown - y).abs().max()) == pytest.approx(0.3)
 
 
-def test_the_slope_at_no_gap_is_the_direction_of_motion():
+def test_derivative_at_no_gap_is_the_direction_of_motion():
     context = paired_context(SeveralBacklash())
     at = torch.zeros(2, dtype=torch.float64)
     slope = torch.func.jacfwd(lambda g: SeveralBacklash().change(g, {}, context))(at)
@@ -47,16 +47,16 @@ def test_the_slope_at_no_gap_is_the_direction_of_motion():
         assert not bool(slope[:, k, 1 - k].any())
 
 
-def test_play_and_a_delay_are_one_after_the_other():
+def test_play_and_a_delay_act_in_series():
     simulator, recording = arm()
     prepared = simulator.prepare(recording)
     model = JointModel(prepared, terms(prepared, "backlash", "delay"))
-    expected = torch.stack([shifted(played(one, TIME, 0.05), TIME, -0.13) for one in JOINTS.values()], -1)
+    expected = torch.stack([shifted(played(joint, TIME, 0.05), TIME, -0.13) for joint in JOINTS.values()], -1)
     parameters = torch.tensor([0.0, 0.0, 0.05, 0.05, 0.13, 0.13]).double()
     torch.testing.assert_close(prepared.measured - model.residual(parameters), expected, atol=1e-7, rtol=0)
 
 
-def test_what_comes_next_sees_what_those_before_made():
+def test_the_signal_of_an_effect_includes_the_previous_effects():
     simulator, recording = arm()
     prepared = simulator.prepare(recording)
     found, other = terms(prepared, "delay", "backlash")
@@ -64,11 +64,11 @@ def test_what_comes_next_sees_what_those_before_made():
     parameters = torch.tensor([0.0, 0.0, 0.5, 0.5]).double()
     plain = model.signals(parameters)["all outputs"]
     behind = model.signals_before(parameters, {other.key})["all outputs"]
-    torch.testing.assert_close(behind, torch.stack([shifted(one, TIME, -0.5) for one in JOINTS.values()], -1))
+    torch.testing.assert_close(behind, torch.stack([shifted(joint, TIME, -0.5) for joint in JOINTS.values()], -1))
     assert torch.equal(model.signals_before(parameters, {found.key})["all outputs"], plain)
 
 
-def test_joints_sag_and_others_do_not():
+def test_sag_is_tried_on_angles_only():
     def tried(units):
         simulator, recording = arm(**units)
         every = candidate_terms(simulator.prepare(recording), (), PAIRED)
@@ -79,11 +79,11 @@ def test_joints_sag_and_others_do_not():
     assert sags <= tried({})  # by their names
     assert tried({"pan": "rad", "tilt": "V"}) & sags == {("gravity_sag", "output pan")}
     assert not tried({"pan": "V", "tilt": "V"}) & sags
-    assert ("backlash", "all outputs") not in tried({"pan": "rad", "tilt": "V"})  # no unit would be that of all gaps
+    assert ("backlash", "all outputs") not in tried({"pan": "rad", "tilt": "V"})  # the gaps would have no common unit
 
 
 @pytest.mark.parametrize("port", ["output pan", "all outputs"])
-def test_models_come_back_from_their_files(port):
+def test_models_are_restored_from_json(port):
     simulator, recording = arm()
     prepared = simulator.prepare(recording)
     found = terms(prepared, "backlash", "offset", "delay", "gravity_sag", port=port)
@@ -105,7 +105,7 @@ class Drive(Dynamics):
 
 
 @pytest.mark.parametrize("order", [("input_lag", "input_square"), ("input_square", "input_lag")])
-def test_a_lag_comes_before_the_square_whichever_was_found_first(order):
+def test_a_lag_acts_before_the_square_in_any_order(order):
     volt = torch.where(TIME.remainder(4.0) < 2.0, 1.0, 0.25).double()
     prepared = Drive().prepare(Recording({"time": TIME, "volt": volt, "speed": torch.cos(TIME)}))
     shapes = {"input_lag": {"lag": 0.4}, "input_square": {"scale_of_input": 1.0}}

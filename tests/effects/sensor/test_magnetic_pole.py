@@ -1,4 +1,4 @@
-"""The field of a pole, and what a diagnosis makes of one beside the path."""
+"""The field of a pole, and the diagnosis of a pole near the path."""
 
 import json
 import math
@@ -29,13 +29,13 @@ def field(point):
     return POLE.change(ONE, AT, replace(ONE_POINT, drivers=point.unsqueeze(0)))[0]
 
 
-def test_one_µt_m2_is_one_µt_a_metre_away_and_a_quarter_two_metres_away():
+def test_field_falls_with_the_square_of_the_distance():
     for far in (1.0, 2.0):
         away = far * torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3.0
         torch.testing.assert_close(field(CENTRE + away), away / far**3)
 
 
-def test_beside_the_pole_the_field_has_neither_sources_nor_curl():
+def test_field_outside_the_pole_has_neither_sources_nor_curl():
     for point in torch.randn(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64):
         slope = torch.func.jacfwd(field)(point)
         assert float(slope.trace()) == pytest.approx(0.0, abs=1e-9 * float(slope.abs().max()))
@@ -55,7 +55,7 @@ def test_the_strength_alone_is_the_field_along_a_direction_that_is_not_known():
 
 
 def columns(seed=0, N=1500):
-    """A sensor that is turned and carried about in a room, and its noise of 0.3 µT."""
+    """Time, direction and position of a sensor that moves in a room, and its noise of 0.3 µT."""
     generator = torch.Generator().manual_seed(seed)
     time = 0.02 * torch.arange(N, dtype=torch.float64)
     turn = torch.stack([torch.sin(0.9 * time), torch.cos(1.3 * time), torch.sin(1.7 * time + 1.0)], -1)
@@ -66,7 +66,7 @@ def columns(seed=0, N=1500):
 
 
 def recording(source, moment):
-    """Lengths of the field, so much longer where the pole at ``source`` adds to a field that points north and down."""
+    """A recording of the strength of a field with a pole of this ``moment`` at ``source``."""
     time, direction, place, noise = columns()
     away = place - torch.tensor(source, dtype=torch.float64)
     pole = moment * away / (away.square().sum(-1, keepdim=True) + 0.3**2) ** 1.5
@@ -78,7 +78,7 @@ def recording(source, moment):
 
 
 @pytest.mark.e2e
-def test_a_pole_beside_the_path_is_found_where_it_is():
+def test_a_pole_near_the_path_is_located():
     source = (4.9, 0.8, 1.6)
     diagnosis = diagnose(Magnetometer(), recording(source, 4.0))
     finding = diagnosis.findings[0]
@@ -93,11 +93,13 @@ def test_a_pole_beside_the_path_is_found_where_it_is():
         assert place.value == pytest.approx(there - mean, abs=0.25)
         assert 0.0 < place.standard_error < 0.25
     assert known["pole"].components == ("q_x", "q_y", "q_z")
-    # a number that is chosen is told with the equation and is no parameter
+    # a chosen number is in the equation and not a parameter
     assert "radius" not in known
     assert f"s = {diagnosis.model.terms[0].shape['radius']:.4g} m, chosen" in finding.equation
-    assert [(one.column, one.unit) for one in finding.references] == [(name, "m") for name in finding.drivers]
-    assert [one.value for one in finding.references] == pytest.approx(middle.tolist())
+    assert [(reference.column, reference.unit) for reference in finding.references] == [
+        (name, "m") for name in finding.drivers
+    ]
+    assert [reference.value for reference in finding.references] == pytest.approx(middle.tolist())
     assert finding.location_specific
     size = math.hypot(*known["pole"].value)
     assert size == pytest.approx(4.0, rel=0.3)
@@ -107,7 +109,7 @@ def test_a_pole_beside_the_path_is_found_where_it_is():
     assert again.terms[0].shape == diagnosis.model.terms[0].shape
 
 
-def test_its_places_are_around_the_middle_of_the_path():
+def test_grid_is_around_the_middle_of_the_path():
     seen = recording((9.0, 9.0, 9.0), 0.0)
     prepared = Magnetometer().prepare(seen)
     drivers = find_drivers(prepared.recording, Magnetometer().columns, DriverSettings()).drivers

@@ -1,4 +1,4 @@
-"""Compile for a GPU what losses launch, on a machine that need not have one.
+"""Compile the kernels of the losses for a GPU, on a machine with or without a GPU.
 
     python -m tests.losses.kernels.compilation
 
@@ -31,7 +31,7 @@ _TYPES = {
 
 
 def compiled(kernel: Any, tensors: Any, numbers: Any, constants: Any, warps: int) -> Any:
-    """A kernel as Triton compiles it for such a launch."""
+    """The kernel compiled by Triton for this launch."""
     given = (*tensors, *numbers, *constants)
     signature, constant, attributes = {}, {}, {}
     for place, (name, value) in enumerate(zip(kernel.arg_names, given, strict=True)):
@@ -93,7 +93,7 @@ def training_steps() -> Iterator[str]:
 
 
 def main() -> None:
-    """Compile every launch; a word on each that reads four numbers at once."""
+    """Compile every launch and print whether it has vector loads of four numbers."""
     launches: list[tuple[Any, ...]] = []
 
     def launch(self: CachedKernel, grid: Any, *arguments: Any) -> None:  # noqa: ARG001

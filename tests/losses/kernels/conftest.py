@@ -1,4 +1,4 @@
-"""The kernels on a GPU where there is one, and under Triton's interpreter elsewhere."""
+"""The kernels on a GPU if there is one, else under Triton's interpreter."""
 
 import pytest
 import torch

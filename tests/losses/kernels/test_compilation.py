@@ -1,4 +1,4 @@
-"""The compiler of a GPU takes what the interpreter runs."""
+"""The kernels that the interpreter runs also compile for a GPU."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 pytestmark = pytest.mark.e2e
 
 
-def test_kernels_compile_for_a_gpu_and_read_four_numbers_at_once():
+def test_kernels_compile_for_a_gpu_with_vector_loads_of_four_numbers():
     triton = pytest.importorskip("triton")
     if not (Path(triton.__file__).parent / "backends/nvidia/bin/ptxas").exists():
         pytest.skip("this Triton has no ptxas")

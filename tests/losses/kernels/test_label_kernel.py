@@ -15,7 +15,7 @@ compiler = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's c
 
 
 def data(rows, classes, dtype=torch.float64, ignored=-100, labels=torch.int64):
-    """Logits and labels, a third of which do not count."""
+    """Logits and labels, of which a third is ignored."""
     generator = torch.Generator().manual_seed(0)
     logits = 3.0 * torch.randn(rows, classes, generator=generator, dtype=torch.float64)
     target = torch.randint(0, classes, (rows,), generator=generator)
@@ -47,7 +47,7 @@ def assert_agrees(device, logits, target, upstream=1.0, **options):
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("sigma", [0.5, 1.2, INF])
-def test_value_and_gradient_are_those_of_the_formulas(device, dtype, reduction, weighted, sigma):
+def test_value_and_gradient_equal_the_formulas(device, dtype, reduction, weighted, sigma):
     weight = torch.tensor([1.0, 0.5, 0.0, 2.0, 0.1]) if weighted else None
     upstream = 1700.0 if dtype == torch.float16 else 1.7
     assert_agrees(device, *data(30, 5, dtype), upstream, sigma=sigma, weight=weight, reduction=reduction)
@@ -67,7 +67,7 @@ def test_labels_of_any_integer_type(device, labels, ignored):
     assert_agrees(device, *data(20, 4, torch.float32, ignored, labels), ignore_index=ignored)
 
 
-def test_each_row_may_have_its_own_upstream_gradient_and_logits_gaps_in_memory(device):
+def test_upstream_gradients_per_row_and_strided_logits(device):
     logits, target = data(20, 4, torch.float32)
     upstream = torch.randn(20, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for grad in (upstream, upstream[:1].expand(20)):
@@ -78,7 +78,7 @@ def test_each_row_may_have_its_own_upstream_gradient_and_logits_gaps_in_memory(d
 
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 @pytest.mark.parametrize("classes", [3, 4500])
-def test_what_ignored_rows_hold_reaches_nothing(device, reduction, classes):
+def test_ignored_rows_affect_neither_value_nor_gradient(device, reduction, classes):
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
     logits, target = (value.to(device) for value in data(4, classes, torch.float32))
     expected = differentiated(loss, logits, target)
@@ -92,9 +92,9 @@ def test_what_ignored_rows_hold_reaches_nothing(device, reduction, classes):
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
 @pytest.mark.parametrize("sigma", [0.7, INF])
 @pytest.mark.parametrize("classes", [3, 4500])
-def test_impossible_classes(device, sigma, classes):
+def test_infinite_negative_logits_are_impossible_classes(device, sigma, classes):
     logits, target = data(4, classes, torch.float32)
-    logits[:, 1] = -INF  # a class that cannot be
+    logits[:, 1] = -INF  # an impossible class
     target = torch.where(target == -100, target, logits.argmax(1))
     assert_agrees(device, logits, target, sigma=sigma)
     target[0] = 1
@@ -108,7 +108,7 @@ def test_impossible_classes(device, sigma, classes):
 @pytest.mark.parametrize("bad", [NAN, INF])
 @pytest.mark.parametrize("sigma", [1.2, INF])
 @pytest.mark.parametrize("classes", [3, 4500])
-def test_nan_and_infinite_logits_and_labels_out_of_range_come_out_as_nan(device, bad, sigma, classes):
+def test_nan_and_infinite_logits_and_labels_out_of_range_give_nan(device, bad, sigma, classes):
     loss = GeneralizedCrossEntropyLoss(sigma, reduction="none", impl="triton").to(device)
     logits, target = (entry.to(device) for entry in data(4, classes, torch.float32))
     logits[0, 2] = bad
@@ -133,12 +133,12 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
             (second,) = torch.autograd.grad(2.0 * value.sum(), leaf, retain_graph=True)
             assert torch.equal(first, kept)
             (slope,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
-            bends = torch.autograd.grad((slope**2).sum(), leaf)
-            results.append([entry.cpu() for entry in (first, second, slope, *bends)])
+            second_slopes = torch.autograd.grad((slope**2).sum(), leaf)
+            results.append([entry.cpu() for entry in (first, second, slope, *second_slopes)])
         torch.testing.assert_close(*results, rtol=1e-10, atol=1e-12)
 
 
-def test_a_new_sigma_leaves_the_gradient_of_a_pass_before_as_it_was(device):
+def test_setting_sigma_does_not_change_the_gradient_of_an_earlier_forward_pass(device):
     loss = GeneralizedCrossEntropyLoss(impl="triton").to(device)
     logits, target = (entry.to(device) for entry in data(6, 3, torch.float32))
     _, expected = differentiated(loss, logits, target)
@@ -148,7 +148,7 @@ def test_a_new_sigma_leaves_the_gradient_of_a_pass_before_as_it_was(device):
     assert torch.equal(found.cpu().double(), expected)
 
 
-def test_other_targets_shapes_and_transforms_take_the_formulas(device):
+def test_other_targets_shapes_and_transforms_use_the_formulas(device):
     own, other = (GeneralizedCrossEntropyLoss(impl=impl).double().to(device) for impl in ("triton", "eager"))
     logits, target = (value.to(device) for value in data(6, 4))
     target = target.clamp(min=0)
@@ -187,7 +187,7 @@ def test_operators_are_well_formed(device, dtype, weighted):
 @compiler
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-def test_compiled_is_eager(device, reduction, dtype):
+def test_compiled_loss_equals_eager(device, reduction, dtype):
     torch.compiler.reset()
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
@@ -197,7 +197,7 @@ def test_compiled_is_eager(device, reduction, dtype):
 
 
 @compiler
-def test_impl_compile_is_impl_eager(monkeypatch):
+def test_impl_compile_equals_impl_eager(monkeypatch):
     from mkc_torch.losses import generalized_cross_entropy
 
     torch.compiler.reset()

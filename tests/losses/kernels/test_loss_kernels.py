@@ -73,7 +73,7 @@ def assert_agrees(
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_value_gradients_and_state_are_those_of_torch(device, mode, dtype):
+def test_value_gradients_and_state_equal_torch(device, mode, dtype):
     assert_agrees(device, (37, 3), mode, dtype, weighted=dtype == torch.float64)
 
 
@@ -107,7 +107,7 @@ def test_strided_predictions_and_targets(device, make):
 
 
 @pytest.mark.e2e
-def test_the_schedule_is_annealed_as_by_torch(device):
+def test_the_schedule_equals_that_of_torch(device):
     kernel, eager = (MKCLoss(1, impl=impl).double().to(device) for impl in ("triton", "eager"))
     for loss in (kernel, eager):
         loss.schedule.warmup_steps, loss.schedule.anneal_step = 4, 0.1
@@ -133,7 +133,7 @@ def test_two_backward_passes_of_one_graph_give_the_same_bits(device, mode):
 
 
 @pytest.mark.parametrize("mode", ["learned", "as it comes"])
-def test_second_derivatives_are_those_of_torch(device, mode):
+def test_second_derivatives_equal_torch(device, mode):
     curves = []
     x, y = data((12, 2))
     for impl in ("triton", "eager"):
@@ -147,7 +147,7 @@ def test_second_derivatives_are_those_of_torch(device, mode):
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the interpreter computes by NumPy
 @pytest.mark.parametrize("value", [NAN, INF])
 @pytest.mark.parametrize("mode", ["learned", "as it comes"])
-def test_what_is_not_finite_shows_in_the_gradient_and_stays_out_of_the_state(device, mode, value):
+def test_non_finite_values_reach_the_gradient_but_not_the_state(device, mode, value):
     loss = MKCLoss(1, impl="triton", **MODES[mode]).to(device)
     x, y = (entry.to(device) for entry in data((30, 1), torch.float32))
     y[3] = value
@@ -155,18 +155,18 @@ def test_what_is_not_finite_shows_in_the_gradient_and_stays_out_of_the_state(dev
     assert all(buffer.isfinite().all() for buffer in loss.buffers())
 
 
-def test_what_is_masked_reaches_neither_value_nor_gradient_nor_state(device):
+def test_masked_elements_affect_neither_value_nor_gradient_nor_state(device):
     x, y = (value.to(device) for value in data((30, 2), torch.float32))
     mask = torch.rand(30, 2, generator=torch.Generator().manual_seed(1)).to(device) < 0.7
     clean, dirty = (MKCLoss(2, impl="triton").to(device) for _ in range(2))
     found = step(clean, x, y, mask)
     other = step(dirty, torch.where(mask, x, NAN), torch.where(mask, y, INF), mask)
-    for value, spoilt in zip(found, other, strict=True):
-        torch.testing.assert_close(value, spoilt)
+    for value, contaminated in zip(found, other, strict=True):
+        torch.testing.assert_close(value, contaminated)
     assert all(torch.equal(a, b) for a, b in zip(clean.buffers(), dirty.buffers(), strict=True))
 
 
-def test_a_loss_that_has_seen_nothing_takes_its_scale_from_the_batch_it_evaluates(device):
+def test_a_fresh_loss_takes_its_scale_from_the_evaluated_batch(device):
     x, y = (value.to(device) for value in data((60, 2), torch.float32))
     kernel, eager = (MKCLoss(2, impl=impl).to(device).eval() for impl in ("triton", "eager"))
     torch.testing.assert_close(kernel(x, 100.0 * y), eager(x, 100.0 * y))
@@ -177,7 +177,7 @@ def test_a_loss_that_has_seen_nothing_takes_its_scale_from_the_batch_it_evaluate
 @pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @compiler
-def test_compiled_training_is_eager_training_over_sizes(device, mode, reduction):
+def test_compiled_training_equals_eager_for_any_batch_size(device, mode, reduction):
     torch.compiler.reset()
     eager = MKCLoss(3, impl="triton", reduction=reduction, **MODES[mode]).to(device)
     own = copy.deepcopy(eager)

@@ -61,7 +61,7 @@ def assert_agrees(device, tensors, weight=None, bound=30.0, upstream=1.0, **opti
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 @pytest.mark.parametrize("weighted", ["none", "weighted", "masked"])
-def test_value_and_gradients_are_those_of_the_formulas(device, dtype, reduction, weighted):
+def test_value_and_gradients_equal_the_formulas(device, dtype, reduction, weighted):
     shape, upstream = (50, 3), 1700.0 if dtype == torch.float16 else 1.7
     assert_agrees(device, data(*shape, dtype=dtype), weights(weighted, *shape), reduction=reduction, upstream=upstream)
 
@@ -86,7 +86,7 @@ def test_bounds_of_channels(device, shape, channel_dim, reduction):
     assert_agrees(device, mixed, weight, bound=bound, channel_dim=channel_dim, reduction=reduction)
 
 
-def test_each_element_may_have_its_own_upstream_gradient_and_dtype(device):
+def test_upstream_gradients_per_element_and_mixed_dtypes(device):
     x, y, sigma, d = data(40, 3, dtype=torch.bfloat16)
     tensors = [x, y.float(), sigma.float(), d.float()]
     upstream = uniform(-1.0, 1.0, 40, 3, seed=7)
@@ -94,7 +94,7 @@ def test_each_element_may_have_its_own_upstream_gradient_and_dtype(device):
         assert_agrees(device, tensors, reduction="none", upstream=grad)
 
 
-def test_infinite_sigma_is_the_gaussian(device):
+def test_infinite_sigma_gives_the_gaussian(device):
     x, y, _, d = data(6, 3, dtype=torch.float32)
     sigma = torch.full_like(x, INF)
     assert_agrees(device, [x, y, sigma, d], bound=100.0)
@@ -107,7 +107,7 @@ def test_infinite_sigma_is_the_gaussian(device):
 
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 @pytest.mark.parametrize("poison", [NAN, -1.0])
-def test_what_is_masked_reaches_neither_value_nor_gradient(device, reduction, poison):
+def test_masked_elements_affect_neither_value_nor_gradient(device, reduction, poison):
     loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
     mask = torch.ones(5, 3, dtype=torch.bool, device=device)
     mask[1, 2] = mask[4, 0] = False
@@ -124,7 +124,7 @@ def test_what_is_masked_reaches_neither_value_nor_gradient(device, reduction, po
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
 @pytest.mark.parametrize("which", range(4))
-def test_nan_comes_out_as_nan(device, which):
+def test_nan_gives_nan(device, which):
     tensors = [entry.to(device) for entry in data(5, 3, dtype=torch.float32)]
     tensors[which][2, 1] = NAN
     value, *slopes = differentiated(
@@ -161,12 +161,12 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
             second = torch.autograd.grad(2.0 * value.sum(), leaves, retain_graph=True)
             assert all(map(torch.equal, first, kept))
             slopes = torch.autograd.grad(value.sum(), leaves, create_graph=True)
-            bends = torch.autograd.grad(sum((slope**2).sum() for slope in slopes), leaves)
-            results.append([entry.cpu() for entry in (*first, *second, *slopes, *bends)])
+            second_slopes = torch.autograd.grad(sum((slope**2).sum() for slope in slopes), leaves)
+            results.append([entry.cpu() for entry in (*first, *second, *slopes, *second_slopes)])
         torch.testing.assert_close(*results, rtol=1e-9, atol=1e-11)
 
 
-def test_gradients_that_are_not_wanted_are_not_made(device):
+def test_only_required_gradients_are_computed(device):
     loss = HeteroscedasticMKCLoss(30.0, impl="triton").to(device)
     x, y, sigma, d = (value.to(device) for value in data(5, 3, dtype=torch.float32))
     expected = differentiated(loss, [x, y, sigma, d], None)
@@ -180,7 +180,7 @@ def test_gradients_that_are_not_wanted_are_not_made(device):
         assert loss(x, y, sigma, d).cpu().double() == expected[0]
 
 
-def test_shared_scales_transforms_and_differentiable_weights_take_the_formulas(device):
+def test_shared_scales_transforms_and_differentiable_weights_use_the_formulas(device):
     own, other = (HeteroscedasticMKCLoss(30.0, impl=impl).double().to(device) for impl in ("triton", "eager"))
     x, y, sigma, d = (value.to(device) for value in data(5, 3))
     assert torch.equal(own(x, y, sigma[:, :1], d), other(x, y, sigma[:, :1], d))
@@ -218,7 +218,7 @@ def test_operators_are_well_formed(device, dtype, weighted):
 @compiler
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-def test_compiled_is_eager(device, reduction, dtype):
+def test_compiled_loss_equals_eager(device, reduction, dtype):
     torch.compiler.reset()
     loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
@@ -231,7 +231,7 @@ def test_compiled_is_eager(device, reduction, dtype):
 
 
 @compiler
-def test_impl_compile_is_impl_eager(monkeypatch):
+def test_impl_compile_equals_impl_eager(monkeypatch):
     from mkc_torch.losses import heteroscedastic
 
     torch.compiler.reset()

@@ -1,4 +1,4 @@
-"""Files that are cut off, damaged, empty or foreign: whole rows, or a sentence that says what to do."""
+"""Truncated, damaged, empty or foreign files give complete rows, or a message with a remedy."""
 
 import functools
 import io
@@ -19,7 +19,7 @@ from tests.recording.formats.writers import samples
 GIVEN = samples(60)
 FILES = {kind: row for kind, row in KINDS.items() if row[0]}
 SEQUENTIAL = ("ULog", "DataFlash", "DataFlash text", "MCAP", "ROS 1")
-"""Formats whose messages can be read up to where the file ends."""
+"""Formats whose messages are readable up to the end of a truncated file."""
 
 
 @functools.cache
@@ -36,17 +36,17 @@ def tmp(tmp_path_factory):
 
 
 def rows_or_sentence(path):
-    """The topics, or the sentence of the one error that is allowed; a warning of a library is an error, too."""
+    """The topics, or the message of a RecordingError; no other error and no library warning is allowed."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
             topics = read_topics(path)
         except RecordingError as error:
-            topics, said = [], str(error)
+            topics, message = [], str(error)
     if not topics:
-        assert str(path) in said
-        assert "\n" not in said
-        return [], said
+        assert str(path) in message
+        assert "\n" not in message
+        return [], message
     for topic in topics:
         lengths = {len(series) for series in topic.table.series}
         assert len(lengths) == 1
@@ -62,27 +62,27 @@ few = settings(max_examples=25, deadline=None)
 @pytest.mark.parametrize("kind", FILES)
 @many
 @given(share=st.floats(0.0, 1.0))
-def test_a_file_cut_off_anywhere_gives_its_whole_rows_or_says_why_not(kind, tmp, share):
+def test_a_file_truncated_anywhere_gives_complete_rows_or_a_message(kind, tmp, share):
     whole = content(kind, tmp)
     cut = whole[: int(share * (len(whole) - 1))]
     path = tmp / f"cut{FILES[kind][0]}"
     path.write_bytes(cut)
-    topics, said = rows_or_sentence(path)
+    topics, message = rows_or_sentence(path)
     _, _, name, columns, time, *_ = FILES[kind]
     if not topics:
-        assert said
+        assert message
         return
     full = {topic.name: topic for topic in _read(tmp, kind, whole)}
-    # what is cut where a message ends is a whole file, and some bytes at the end of others mean nothing
+    # a file cut at the end of a message is complete, and some formats ignore bytes at the end
     at_end = any(whole[len(cut) :].startswith(begin) for begin in (b"\xa3\x95", b"MAG", b"BARO", b"\x22\x00D"))
     same = [len(topic.table.series[0]) for topic in topics] == [len(topic.table.series[0]) for topic in full.values()]
-    assert said or at_end or same
+    assert message or at_end or same
     for topic in topics:
         if topic.name == name and kind in SEQUENTIAL:
             for column in (time, *columns):
                 here = numbers(topic, column).tolist()
                 there = numbers(full[name], column).tolist()
-                last = -1 if kind == "DataFlash text" else None  # within a number, which is told
+                last = -1 if kind == "DataFlash text" else None  # within a number, with a warning
                 assert here[:last] == there[: len(here)][:last]
 
 
@@ -94,15 +94,15 @@ def _read(tmp, kind, whole):
 
 
 @pytest.mark.parametrize("kind", SEQUENTIAL)
-def test_what_is_whole_of_a_file_cut_in_its_middle_is_kept_and_the_loss_told(kind, tmp):
+def test_complete_rows_of_a_truncated_file_are_kept_with_a_warning(kind, tmp):
     whole = content(kind, tmp)
     path = tmp / f"half{FILES[kind][0]}"
     path.write_bytes(whole[: (3 * len(whole)) // 4 + 1])
-    topics, said = rows_or_sentence(path)
+    topics, message = rows_or_sentence(path)
     found = next(topic for topic in topics if topic.name == FILES[kind][2])
-    # the index of a bag or an MCAP file takes some of its end
+    # the index of a bag or an MCAP file is part of its end
     assert len(found.table.series[0]) >= (30 if kind not in ("MCAP", "ROS 1") else 15)
-    assert "cut off" in said
+    assert "cut off" in message
 
 
 @pytest.mark.e2e
@@ -126,13 +126,13 @@ def test_a_parquet_file_over_which_polars_breaks_off_is_damaged(tmp_path, capfd)
     noise = np.random.default_rng(0).normal(size=1000)
     pl.DataFrame({"time": np.arange(1000.0), "mag_x": noise}).write_parquet(path)
     whole = path.read_bytes()
-    # the end, which says where all is, without the numbers themselves
+    # the footer with all offsets, without the values themselves
     end = 8 + int.from_bytes(whole[-8:-4], "little")
     with pytest.raises((pl.exceptions.PanicException, pl.exceptions.PolarsError)):
         pl.read_parquet(io.BytesIO(whole[:4] + whole[-end:]))
     capfd.readouterr()
     path.write_bytes(whole[:4] + whole[-end:])
-    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
+    assert "is damaged; copy it again" in rows_or_sentence(path)[1]
     assert capfd.readouterr().err == ""
 
 
@@ -144,12 +144,12 @@ def test_a_parquet_file_over_which_polars_would_end_this_process_is_damaged(tmp_
     assert damaged[13:16] == b"\x15\xd0\x0f"  # 1000 values in the first page, twice that as a zigzag number
     damaged[14] |= 1  # as many below zero: more than the memory there is
     path.write_bytes(damaged)
-    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
+    assert "is damaged; copy it again" in rows_or_sentence(path)[1]
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.e2e
-def test_an_hdf5_file_that_leads_its_library_round_in_a_circle_is_damaged(tmp_path, monkeypatch):
+def test_an_hdf5_file_over_which_the_library_loops_forever_is_damaged(tmp_path, monkeypatch):
     h5py = pytest.importorskip("h5py")
     monkeypatch.setattr(trial, "_PATIENCE", (4.0, 0.0))
     path = tmp_path / "log.h5"
@@ -158,18 +158,18 @@ def test_an_hdf5_file_that_leads_its_library_round_in_a_circle_is_damaged(tmp_pa
             file.create_dataset(name, data=np.arange(20.0)).attrs["units"] = "s"
     assert rows_or_sentence(path)[0]
     damaged = bytearray(path.read_bytes())
-    heap = damaged.index(b"GCOL")  # where texts lie, each after its length: one that leads from the first to itself
+    heap = damaged.index(b"GCOL")  # the heap of texts, each after its length: make the first refer to itself
     damaged[heap + 24 : heap + 32] = (2**64 - 16).to_bytes(8, "little")
     path.write_bytes(damaged)
-    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
+    assert "is damaged; copy it again" in rows_or_sentence(path)[1]
 
 
-def test_a_ulog_that_ends_within_an_unknown_message_leads_nobody_round_in_a_circle(tmp_path):
+def test_a_ulog_that_ends_within_an_unknown_message_does_not_loop_forever(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "log.ulg"
     flags = b"\x28\x00B" + bytes(40)
     path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + flags + b"\x20\x00\x00" + b"\x01" * 5)
-    assert "copy it anew" in rows_or_sentence(path)[1]
+    assert "copy it again" in rows_or_sentence(path)[1]
 
 
 MAGIC = {
@@ -196,21 +196,21 @@ def test_random_bytes_behind_a_right_beginning_give_rows_or_a_sentence(ending, t
 
 
 @pytest.mark.parametrize("ending", [*MAGIC, ".hdf5", ".mdf", ".ulog"])
-def test_an_empty_file_and_one_of_another_kind_are_named(ending, tmp):
+def test_an_empty_file_and_a_file_of_another_format_are_reported(ending, tmp):
     path = tmp / f"foreign{ending}"
     path.write_bytes(b"")
     assert "empty" in rows_or_sentence(path)[1]
     path.write_bytes(b"time,mag_x,mag_y,mag_z\n0,1,2,3\n")
-    said = rows_or_sentence(path)[1]
-    assert "this is no " in said
-    assert "rename it to end in .csv" in said
+    message = rows_or_sentence(path)[1]
+    assert re.search(r"this is not an? ", message)
+    assert "rename it to end in .csv" in message
     for other, magic in MAGIC.items():
         if {ending, other} & {".log"} or {ending, other} in ({".h5", ".hdf5"}, {".mdf", ".mf4"}, {".ulg", ".ulog"}):
             continue
         if other != ending and (ending, other) != (".mat", ".h5"):  # version 7.3 is HDF5
             path.write_bytes(magic + b"\0" * 700)
-            said = rows_or_sentence(path)[1]
-            assert f"rename it to end in {other}" in said, (ending, other, said)
+            message = rows_or_sentence(path)[1]
+            assert f"rename it to end in {other}" in message, (ending, other, message)
 
 
 def test_a_folder_that_is_no_bag_and_a_bag_without_its_files_are_named(tmp_path):
@@ -223,20 +223,20 @@ def test_a_folder_that_is_no_bag_and_a_bag_without_its_files_are_named(tmp_path)
 def test_a_bag_whose_metadata_is_damaged_is_read_by_what_lies_in_it(tmp_path):
     writers.rosbag2(tmp_path / "bag", GIVEN)
     (tmp_path / "bag" / "metadata.yaml").write_text("{[")
-    topics, said = rows_or_sentence(tmp_path / "bag")
+    topics, message = rows_or_sentence(tmp_path / "bag")
     assert len(topics[0].table.series[0]) == len(GIVEN.time)
-    assert "metadata.yaml is damaged" in said
+    assert "metadata.yaml is damaged" in message
 
 
 def test_the_loss_of_a_dataflash_log_is_counted(tmp_path):
     writers.dataflash(tmp_path / "log.bin", GIVEN)
     whole = (tmp_path / "log.bin").read_bytes()
     row = whole.rindex(b"\xa3\x95\x82")
-    # a message whose header is gone, in the middle of the log, and eleven bytes of one at its end
+    # a message without its header in the middle of the log, and eleven bytes of a message at its end
     middle = whole.index(b"\xa3\x95\x82", len(whole) // 2)
     damaged = whole[:middle] + b"\0\0" + whole[middle + 2 : row + 11]
     (tmp_path / "log.bin").write_bytes(damaged)
-    topics, said = rows_or_sentence(tmp_path / "log.bin")
+    topics, message = rows_or_sentence(tmp_path / "log.bin")
     mag = next(topic for topic in topics if topic.name == "MAG[0]")
     assert len(mag.table.series[0]) == len(GIVEN.time) - 2
-    assert f"{24 + 11} of its {len(damaged)} bytes" in said.replace(",", "")
+    assert f"{24 + 11} of its {len(damaged)} bytes" in message.replace(",", "")

@@ -1,4 +1,4 @@
-"""What each format does beyond the same samples: instances, nesting, text, units, and what is left out and told."""
+"""Features of each format: instances, nesting, text, units, and warnings about what is left out."""
 
 import builtins
 import sqlite3
@@ -43,14 +43,14 @@ def test_each_instance_of_a_sensor_is_a_topic(ending, write, tmp_path):
         assert np.abs(found - GIVEN.mag[:, 0] - place).max() < 1e-6
 
 
-def test_text_in_a_ulog_is_told_and_padding_is_not(tmp_path):
+def test_text_in_a_ulog_is_reported_and_padding_is_not(tmp_path):
     writers.ulog(tmp_path / "log.ulg", GIVEN)
     (topic,) = read_topics(tmp_path / "log.ulg")
     assert topic.table.names == ["timestamp", "timestamp_sample", "x", "y", "z"]
     assert topic.warnings == ("Column `tag` holds text and is left out.",)
 
 
-def test_dropouts_of_a_ulog_are_told(tmp_path):
+def test_dropouts_of_a_ulog_are_reported(tmp_path):
     writers.ulog(tmp_path / "log.ulg", GIVEN)
     with (tmp_path / "log.ulg").open("ab") as file:
         file.write(struct.pack("<HBH", 2, ord("O"), 120))
@@ -58,7 +58,7 @@ def test_dropouts_of_a_ulog_are_told(tmp_path):
     assert topic.warnings[0] == "The logger lost 0.12 s of data in 1 dropout."
 
 
-def test_formats_of_a_ulog_that_nest_without_measure_are_refused(tmp_path):
+def test_excessively_nested_formats_of_a_ulog_are_rejected(tmp_path):
     bodies = [f"a{place}:a{place + 1}[60000] x;" for place in range(3)] + ["a3:float y;", "loop:loop x;"]
     for some in (bodies[:4], bodies[4:]):
         messages = [struct.pack("<HB", len(body), ord("F")) + body.encode() for body in some]
@@ -69,14 +69,14 @@ def test_formats_of_a_ulog_that_nest_without_measure_are_refused(tmp_path):
             read_topics(tmp_path / "log.ulg")
 
 
-def test_a_dataset_that_is_said_to_be_larger_than_its_file_can_hold_is_not_made_room_for(tmp_path):
+def test_a_dataset_that_claims_more_bytes_than_its_file_is_left_out(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "log.h5", "w") as file:
         file.create_dataset("huge", (10**12,), "f8", chunks=(1000,))
         file["mag"] = np.zeros((5, 3))
     (topic,) = read_topics(tmp_path / "log.h5")
     assert topic.table.names == ["mag_x", "mag_y", "mag_z"]
-    assert "`huge` is said to hold 8,000,000,000,000 bytes" in topic.warnings[0]
+    assert "`huge` claims 8,000,000,000,000 bytes" in topic.warnings[0]
 
 
 def test_a_dataflash_log_without_units_has_those_that_never_changed(tmp_path):
@@ -116,7 +116,7 @@ def test_the_whole_messages_of_the_last_broken_chunk_of_an_mcap_file_are_kept(co
     given = samples(4000)  # compressors keep the last tens of kilobytes to themselves
     writers.mcap_of(tmp_path / "log.mcap", given, "ros2", compression, chunk=10**7)
     whole = (tmp_path / "log.mcap").read_bytes()
-    # one chunk holds all messages: without what is in its half, nothing would be left
+    # a single chunk holds all messages: without its first half, no rows would remain
     (tmp_path / "log.mcap").write_bytes(whole[: len(whole) // 2])
     (topic,) = read_topics(tmp_path / "log.mcap")
     found = numbers(topic, "magnetic_field.x").tolist()
@@ -125,7 +125,7 @@ def test_the_whole_messages_of_the_last_broken_chunk_of_an_mcap_file_are_kept(co
     assert "cut off" in topic.warnings[0]
 
 
-def test_a_wrong_checksum_of_an_mcap_file_is_told(tmp_path):
+def test_a_wrong_checksum_of_an_mcap_file_is_reported(tmp_path):
     writers.mcap_of(tmp_path / "log.mcap", GIVEN, "json", "NONE")
     whole = (tmp_path / "log.mcap").read_bytes()
     assert whole.count(b'"x": 0.') > 5
@@ -136,7 +136,7 @@ def test_a_wrong_checksum_of_an_mcap_file_is_told(tmp_path):
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
 def test_a_ros1_bag_that_was_not_closed_is_read(compression, tmp_path):
-    # bz2 gives nothing of a chunk that is not whole, so that there must be another
+    # bz2 decompresses nothing of an incomplete chunk, so there must be another chunk
     given = samples(9000 if compression == "bz2" else 4000)
     writers.rosbag1(tmp_path / "log.bag", given, compression)
     whole = (tmp_path / "log.bag").read_bytes()
@@ -162,14 +162,14 @@ def test_a_ros2_bag_with_and_without_definitions_in_it(storage, version, tmp_pat
     assert numbers(topic, "magnetic_field.x").tolist() == GIVEN.mag[:, 0].tolist()
 
 
-def test_reading_a_ros2_bag_leaves_nothing_beside_it_and_changes_nothing(tmp_path):
+def test_reading_a_ros2_bag_creates_and_changes_no_files(tmp_path):
     writers.rosbag2(tmp_path / "bag", GIVEN)
     before = {path: path.read_bytes() for path in (tmp_path / "bag").iterdir()}
     read_topics(tmp_path / "bag")
     assert {path: path.read_bytes() for path in (tmp_path / "bag").iterdir()} == before
 
 
-def test_a_database_that_is_no_bag_is_refused_even_where_a_view_stands_for_rows_without_end(tmp_path):
+def test_a_database_that_is_not_a_bag_is_rejected_even_with_an_endless_view(tmp_path):
     base = sqlite3.connect(tmp_path / "log.db3")
     base.execute("CREATE TABLE topics (id, name, type, serialization_format)")
     base.execute(
@@ -213,11 +213,11 @@ def test_messages_of_all_kinds_of_fields_are_what_rosbags_wrote(ros1):
     }  # fmt: skip
 
 
-def test_a_definition_that_nests_without_end_or_without_measure_is_refused():
+def test_a_recursive_or_excessively_nested_definition_is_rejected():
     line = "=" * 80
     with pytest.raises(ValueError, match="contains itself"):
         RosReader("pkg/msg/A", parsed_definitions(f"B b\n{line}\nMSG: pkg/B\nA a\n", "pkg/msg/A") | {}, True)
-    # ten of each in each of the one above: 10²⁰ empty messages, in no byte at all
+    # ten nested messages on each level: 10²⁰ empty messages in zero bytes
     parts = "".join(f"{line}\nMSG: pkg/T{place}\nT{place + 1}[10] t\n" for place in range(20))
     text = f"T0 t\n{parts}{line}\nMSG: pkg/T20\nint8 C=1\n"
     reader = RosReader("pkg/msg/A", parsed_definitions(text, "pkg/msg/A"), True)
@@ -225,7 +225,7 @@ def test_a_definition_that_nests_without_end_or_without_measure_is_refused():
         reader.read(b"")
 
 
-def test_columns_of_messages_that_change_are_left_out_and_told():
+def test_message_arrays_that_change_length_are_left_out_with_a_warning():
     rows = MessageRows("t", {"a": "m"})
     rows.add({"a": 1, "l": (1, 2), "s": "x", "n": 1})
     rows.add({"a": 2, "l": (1,), "s": "y"})
@@ -248,7 +248,7 @@ def test_messages_out_of_the_order_of_the_log_are_put_into_it():
     assert numbers(topic, "a").tolist() == [10, 20, 30]
 
 
-def test_groups_of_an_hdf5_file_are_topics_with_their_units_and_what_is_left_out_is_told(tmp_path):
+def test_groups_of_an_hdf5_file_are_topics_with_units_and_warnings(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "log.h5", "w") as file:
         file["mag/t"] = np.arange(4.0)
@@ -267,10 +267,10 @@ def test_groups_of_an_hdf5_file_are_topics_with_their_units_and_what_is_left_out
     assert mag.table.names == ["t", "field_x", "field_y", "field_z", "when"]
     assert numbers(mag, "field_y").tolist() == [4.0, 5.0, 6.0, 7.0]
     assert mag.units == {"field_x": "T", "field_y": "T", "field_z": "T"}
-    told = " ".join(mag.warnings)
-    assert "`rate`: single values" in told
-    assert "`name` holds text" in told
-    assert "`elsewhere` is a link to elsewhere" in told
+    warnings = " ".join(mag.warnings)
+    assert "`rate`: single values" in warnings
+    assert "`name` holds text" in warnings
+    assert "`elsewhere` is a link to elsewhere" in warnings
     assert numbers(topics["table"], "x").tolist() == [2.5, 3.5]
 
 
@@ -291,7 +291,7 @@ def test_structs_cells_and_columns_of_other_lengths_of_a_matlab_file(tmp_path):
         },
     )
     topics = {topic.name: topic for topic in read_topics(tmp_path / "log.mat")}
-    # a struct without a time of its own, and of the length of the one above it, joins that
+    # a struct of the same length as its parent and without its own time is merged into the parent
     assert topics[""].table.names == ["tout", "signals.values_x", "signals.values_y", "signals.values_z"]
     assert topics["imu"].table.names == ["time", "q[0]", "q[1]", "q[2]", "q[3]"]
     assert topics["[11 rows]"].table.names == ["fast"]
@@ -353,5 +353,5 @@ def test_without_its_package_a_format_names_the_extra(kind, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("ending", [".ulg", ".bin", ".mcap", ".h5"])
 def test_logs_are_read_and_not_written(ending, tmp_path):
-    with pytest.raises(RecordingError, match="are read and not written"):
+    with pytest.raises(RecordingError, match="can be read but not written"):
         encoded(tmp_path / f"log{ending}", {"a": np.zeros(2)})

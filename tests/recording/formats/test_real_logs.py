@@ -1,4 +1,4 @@
-"""A real log of a flight, beside the tables made of it before and beside pymavlink's reader."""
+"""A real flight log agrees with tables made of it earlier and with pymavlink's reader."""
 
 import contextlib
 import csv
@@ -62,7 +62,7 @@ def test_another_compass_is_its_table_which_was_made_at_the_times_of_the_first(f
 def of_pymavlink(path, name):
     """The columns of a message as pymavlink reads them."""
     reader = pytest.importorskip("pymavlink.DFReader")
-    # it writes what it passes over
+    # pymavlink prints what it skips
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         kind = reader.DFReader_text if path.suffix == ".log" else reader.DFReader_binary
         log = kind(str(path))

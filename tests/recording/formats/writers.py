@@ -45,10 +45,10 @@ def ulog(path: Path, given: Samples, instances: int = 1) -> None:
     layout += "uint8_t[4] _padding0;"
     out.append(_ulog_message("F", layout.encode()))
     out.append(_ulog_message("I", bytes([len(b"char[3] sys_name")]) + b"char[3] sys_name" + b"PX4"))
-    out += [_ulog_message("A", struct.pack("<BH", one, one) + b"sensor_mag") for one in range(instances)]
+    out += [_ulog_message("A", struct.pack("<BH", instance, instance) + b"sensor_mag") for instance in range(instances)]
     for time, mag in zip(given.time.tolist(), given.mag.tolist(), strict=True):
-        for one in range(instances):
-            row = struct.pack("<HQQ3f4s", one, time, time - 100, *(value + one for value in mag), b"abc\0")
+        for instance in range(instances):
+            row = struct.pack("<HQQ3f4s", instance, time, time - 100, *(value + instance for value in mag), b"abc\0")
             out.append(_ulog_message("D", row))
     path.write_bytes(b"".join(out))
 
@@ -81,14 +81,14 @@ def dataflash(path: Path, given: Samples, instances: int = 1, units: bool = True
         out.append(b"\xa3\x95\x86" + struct.pack("<QB16s16s", 1, 130, b"s#GGG", b"F-CCC"))
         out.append(b"\xa3\x95\x86" + struct.pack("<QB16s16s", 1, 131, b"sO", b"F0"))
     for time, mag in zip(given.time.tolist(), given.mag.tolist(), strict=True):
-        for one in range(instances):
-            out.append(b"\xa3\x95\x82" + struct.pack("<QB3f", time, one, *(value + one for value in mag)))
+        for instance in range(instances):
+            out.append(b"\xa3\x95\x82" + struct.pack("<QB3f", time, instance, *(value + instance for value in mag)))
         out.append(b"\xa3\x95\x83" + struct.pack("<Qh", time, 2531))
     path.write_bytes(b"".join(out))
 
 
 def dataflash_text(path: Path, given: Samples) -> None:
-    """As ArduPilot's ground stations write it out, a line a message."""
+    """The text form that ArduPilot's ground stations write, a message per line."""
     out = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
     out += [
         f"FMT, {kind}, 23, {name}, {letters}, {names}" for name, (kind, letters, names) in DATAFLASH_LETTERS.items()
@@ -251,7 +251,7 @@ def mat(path: Path, given: Samples, version: str = "5") -> None:
 
 
 def mat73(path: Path, given: Samples) -> None:
-    """As MATLAB's save -v7.3: HDF5 behind 512 bytes of text, structs as groups, arrays with their axes turned."""
+    """The format of MATLAB's save -v7.3: HDF5 after 512 bytes of text, structs as groups, arrays transposed."""
     import h5py
 
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -304,4 +304,4 @@ WRITERS: dict[str, Callable[[Path, Samples], None]] = {
     ".h5": hdf5,
     ".mf4": mdf,
 }
-"""By ending."""
+"""Writers by ending."""

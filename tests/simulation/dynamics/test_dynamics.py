@@ -542,7 +542,7 @@ def dragged(pull):
 
 @pytest.mark.e2e
 def test_a_sticking_simulation_is_solved_over_a_horizon_of_small_strides(monkeypatch):
-    """Friction is nearly a jump: no trajectory is found from the guess, but a corrected simulation needs one."""
+    """Friction is nearly a jump: no trajectory is found from the guess, but the correction needs a trajectory."""
     time = np.arange(80) * 0.02
     pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
     truth = dragged(pull)

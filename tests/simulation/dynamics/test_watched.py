@@ -76,7 +76,7 @@ class TestInputHold:
         back = other.with_input_hold({"force": "linear"})
         torch.testing.assert_close(back.simulated(theta, {}), before)
 
-    def test_an_input_hold_equals_the_declared_one(self):
+    def test_a_copy_s_input_hold_equals_a_declared_input_hold(self):
         prepared, theta = forced_oscillator()
         declared, _ = forced_oscillator(input_hold="smooth")
         torch.testing.assert_close(

@@ -1,1 +1,1 @@
-"""FMUs that the tests compile themselves, and what is asked of them."""
+"""Tests of FMUs, which they compile themselves."""

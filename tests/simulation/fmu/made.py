@@ -1,6 +1,6 @@
-"""FMUs of a few equations: C by the system's compiler, zipped with a modelDescription.xml as FMI 2.0 and 3.0 ask for.
+"""FMUs of a few equations: C by the system's compiler, zipped with a modelDescription.xml of FMI 2.0 or 3.0.
 
-Derivatives with respect to states, inputs and parameters are SymPy's, an oracle of their own.
+Derivatives with respect to states, inputs and parameters are from SymPy, as an independent reference.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ STATES, RATES, INPUTS, OUTPUTS, PARAMETERS, EVENTS = 100, 200, 300, 400, 500, 90
 
 @dataclass(frozen=True)
 class Model:
-    """Equations as texts that SymPy and C both understand, by the names of states, inputs and parameters.
+    """Equations as text in the common syntax of SymPy and C, in the names of states, inputs and parameters.
 
-    ``parameters`` are (start, lower, greatest, unit), ``events`` expressions that are event indicators. An ``if``
-    in an equation is written ``Piecewise``; one that is frozen input_hold events is a ``relation``, an event indicator's
-    number, in the texts ``r0``, ``r1`` and so on: 1 where the indicator was positive at the last event.
+    ``parameters`` are (start, lower, upper, unit), ``events`` the event indicators. An ``if`` in an equation is written
+    ``Piecewise``; a condition that is frozen between events is a relation, ``r0``, ``r1`` and so on by the number of
+    its event indicator: 1 where the indicator was positive at the last event.
     """
 
     name: str
@@ -64,10 +64,10 @@ def make_fmu(path: Path, model: Model, version: int = 2, **how: object) -> Path:
     """Write an FMU.
 
     Args:
-        path: of the file.
+        path: path of the file.
         model: its equations.
-        version: of FMI, 2 or 3.
-        how: what :func:`description` takes.
+        version: version of FMI, 2 or 3.
+        how: arguments of :func:`description`.
     """
     derivatives = bool(how.get("derivatives", True))
     library = _compiled(source(model, version, derivatives=derivatives))
@@ -96,7 +96,7 @@ def description(
     fmi: str | None = None,
     without: Sequence[str] = (),
 ) -> str:
-    """modelDescription.xml; ``without`` leaves out the variables of those names."""
+    """The modelDescription.xml, without the variables named in ``without``."""
     real = "Real" if version == 2 else "Float64"
     variables = [("time", 0, "independent", "continuous", "", None, ("", "", ""))]
     for k, name in enumerate(model.states):
@@ -107,23 +107,23 @@ def description(
         variables.append((name, INPUTS + k, "input", "continuous", "", 0.0, ("", "", "")))
     for k, name in enumerate(model.outputs):
         variables.append((name, OUTPUTS + k, "output", "continuous", "", None, ("", "", "")))
-    for k, (name, (start, least, most, unit)) in enumerate(model.parameters.items()):
-        variables.append((name, PARAMETERS + k, "parameter", model.variability, "", start, (least, most, unit)))
+    for k, (name, (start, lower, upper, unit)) in enumerate(model.parameters.items()):
+        variables.append((name, PARAMETERS + k, "parameter", model.variability, "", start, (lower, upper, unit)))
     variables += [
         (f"event {k}", EVENTS + k, "local", "continuous", "", None, ("", "", ""))
         for k in range(len(model.events) if version == 3 else 0)
     ]
-    place = {one[0]: number for number, one in enumerate(variables, 1)}
+    place = {variable[0]: number for number, variable in enumerate(variables, 1)}
     lines = []
-    for name, reference, causality, variability, of, start, (least, most, unit) in variables:
+    for name, reference, causality, variability, of, start, (lower, upper, unit) in variables:
         if name in without:
             continue
-        told = {"start": start, "min": least, "max": most, "unit": unit or model.units.get(name, "")}
-        told = {key: value for key, value in told.items() if value not in (None, "")}
+        attributes = {"start": start, "min": lower, "max": upper, "unit": unit or model.units.get(name, "")}
+        attributes = {key: value for key, value in attributes.items() if value not in (None, "")}
         if of:
-            told["derivative"] = place[of] if version == 2 else STATES + model.states.index(of)
+            attributes["derivative"] = place[of] if version == 2 else STATES + model.states.index(of)
         exact = " initial='exact'" if name in model.states else ""
-        own = " ".join(f"{key}={quoteattr(str(value))}" for key, value in told.items())
+        own = " ".join(f"{key}={quoteattr(str(value))}" for key, value in attributes.items())
         head = (
             f"name={quoteattr(name)} valueReference='{reference}' causality='{causality}' variability='{variability}'"
         )
@@ -132,8 +132,8 @@ def description(
             lines.append(f"<ScalarVariable {head}><{real} {own}/></ScalarVariable>")
         else:
             lines.append(f"<{real} {head} {own}/>")
-    units = sorted({*model.units.values(), *(one[3] for one in model.parameters.values())} - {""})
-    unit_lines = "".join(f"<Unit name={quoteattr(one)}/>" for one in units)
+    units = sorted({*model.units.values(), *(parameter[3] for parameter in model.parameters.values())} - {""})
+    unit_lines = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
     unit_lines = f"<UnitDefinitions>{unit_lines}</UnitDefinitions>" if units else ""
     structure = _structure(model, version, place)
     provides = "providesDirectionalDerivative" if version == 2 else "providesDirectionalDerivatives"
@@ -151,7 +151,7 @@ def description(
 
 def _structure(model: Model, version: int, place: Mapping[str, int]) -> str:
     def depends(text: str) -> str:
-        """On which of time, states and inputs, as texts tell."""
+        """The attribute ``dependencies``: the time, states and inputs in an equation."""
         words = set(re.findall(r"[A-Za-z_]\w*", text))
         by = [name for name in ("time", *model.states, *model.inputs) if name in words or model.events]
         kinds = {"time": 0} | {name: STATES + k for k, name in enumerate(model.states)}
@@ -178,7 +178,7 @@ def _structure(model: Model, version: int, place: Mapping[str, int]) -> str:
 
 
 def source(model: Model, version: int, *, derivatives: bool = True) -> str:
-    """The whole C text."""
+    """The C source."""
     import sympy
     from sympy.parsing.sympy_parser import parse_expr
 
@@ -213,7 +213,7 @@ def source(model: Model, version: int, *, derivatives: bool = True) -> str:
                 if slope != 0:
                     slopes.append(f"if (of == {first + k} && by == {reference}) return {c(slope)};")
     starts = [f"m->x[{k}] = {model.start.get(name, 0.0)!r};" for k, name in enumerate(model.states)]
-    starts += [f"m->p[{k}] = {one[0] or 0.0!r};" for k, one in enumerate(model.parameters.values())]
+    starts += [f"m->p[{k}] = {start or 0.0!r};" for k, (start, *_) in enumerate(model.parameters.values())]
     resets = [f"m->x[{model.states.index(name)}] = {c(parsed(text))};" for name, text in model.reset.items()]
     body = _SHARED
     for key, text in {
@@ -222,9 +222,9 @@ def source(model: Model, version: int, *, derivatives: bool = True) -> str:
         "@NP@": str(max(1, len(model.parameters))),
         "@NE@": str(len(model.events)),
         "@START@": "\n".join(starts),
-        "@RATES@": "\n".join(f"f[{k}] = {c(one)};" for k, one in enumerate(rates)),
-        "@OUTPUTS@": "\n".join(f"if (k == {k}) return {c(one)};" for k, one in enumerate(outputs)),
-        "@EVENTS@": "\n".join(f"z[{k}] = {c(one)};" for k, one in enumerate(events)),
+        "@RATES@": "\n".join(f"f[{k}] = {c(rate)};" for k, rate in enumerate(rates)),
+        "@OUTPUTS@": "\n".join(f"if (k == {k}) return {c(output)};" for k, output in enumerate(outputs)),
+        "@EVENTS@": "\n".join(f"z[{k}] = {c(event)};" for k, event in enumerate(events)),
         "@RESET@": "\n".join(resets),
         "@RESETS@": "1" if resets else "0",
         "@MEMORY@": "1" if model.memory else "0",
@@ -236,7 +236,7 @@ def source(model: Model, version: int, *, derivatives: bool = True) -> str:
 
 
 def _stubs(own: str, version: int) -> str:
-    """Every other function of the standard, which refuses."""
+    """Stubs that return an error for all other functions of the standard."""
     from fmpy import fmi2, fmi3
 
     kinds = (fmi2.FMU2Model, fmi2.FMU2Slave) if version == 2 else (fmi3.FMU3Model, fmi3.FMU3Slave)
@@ -246,7 +246,7 @@ def _stubs(own: str, version: int) -> str:
 
 
 def with_memory(model: Model) -> Model:
-    """The same with a state that events remember: its parameters act by how many there were."""
+    """The model with a memory: the number of events changes its first rate."""
     return replace(model, memory=True)
 
 

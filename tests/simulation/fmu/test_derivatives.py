@@ -1,4 +1,4 @@
-"""An FMU as a function of torch: its values and slopes are those of the equations it was made of, by SymPy."""
+"""An FMU as a torch function: its values and derivatives equal those of its equations by SymPy."""
 
 import numpy as np
 import pytest
@@ -43,11 +43,11 @@ HEATER = Model(
 CART = Model(
     "Cart",
     {
-        "place": "speed", "speed": "push - drag*speed", "angle": "turn",
-        "turn": "-((push - drag*speed)*cos(angle) + 9.81*sin(angle))/length",
+        "place": "speed", "speed": "force - drag*speed", "angle": "turn",
+        "turn": "-((force - drag*speed)*cos(angle) + 9.81*sin(angle))/length",
     },
     {"drag": (0.5, 0.0, None, ""), "length": (1.0, 0.1, None, "m")},
-    ("push",),
+    ("force",),
 )  # fmt: skip
 
 MODELS = (PENDULUM, MOTOR, TANKS, HEATER, CART)
@@ -60,25 +60,25 @@ def moments(model, rows=6):
         torch.rand(rows, count, generator=g, dtype=torch.float64) + 0.2
         for count in (1, len(model.states), len(model.inputs))
     )
-    parameters = torch.tensor([one[0] for one in model.parameters.values()], dtype=torch.float64) * 1.1
+    parameters = torch.tensor([start for start, *_ in model.parameters.values()], dtype=torch.float64) * 1.1
     return time[:, 0], states, inputs, parameters
 
 
 def by_sympy(model, texts, at):
-    """Values (S, k), and slopes by states, inputs and parameters, each (S, k, size)."""
+    """Values (S, k), and derivatives by states, inputs and parameters, each (S, k, size)."""
     names = ["time", *model.states, *model.inputs, *model.parameters]
     symbols = {name: sympy.Symbol(name, real=True) for name in names}
     whole = [sympy.sympify(text, locals=symbols) for text in texts]
-    time, states, inputs, parameters = (one.numpy() for one in at)
-    given = [time, *states.T, *inputs.T, *(np.full_like(time, one) for one in parameters)]
+    time, states, inputs, parameters = (part.numpy() for part in at)
+    given = [time, *states.T, *inputs.T, *(np.full_like(time, value) for value in parameters)]
 
     def numbers(expressions):
         function = sympy.lambdify(list(symbols.values()), expressions, "numpy")
-        return torch.tensor(np.stack([np.broadcast_to(one, time.shape) for one in function(*given)], -1)).double()
+        return torch.tensor(np.stack([np.broadcast_to(value, time.shape) for value in function(*given)], -1)).double()
 
     slopes = []
     for group in (model.states, model.inputs, model.parameters):
-        flat = [sympy.diff(one, symbols[name]) for one in whole for name in group]
+        flat = [sympy.diff(expression, symbols[name]) for expression in whole for name in group]
         slopes.append(numbers(flat).unflatten(-1, (len(whole), len(group))))
     return numbers(whole), slopes
 
@@ -93,8 +93,8 @@ def fmus(request, tmp_path_factory):
     }
 
 
-@pytest.mark.parametrize(("model", "outputs"), [*((one, False) for one in MODELS), (MOTOR, True)])
-def test_values_and_slopes_are_those_of_the_equations(fmus, model, outputs):
+@pytest.mark.parametrize(("model", "outputs"), [*((model, False) for model in MODELS), (MOTOR, True)])
+def test_values_and_derivatives_equal_the_equations(fmus, model, outputs):
     texts = list((model.outputs if outputs else model.rates).values())
     evaluation, at = fmus[model.name], moments(model)
     values, slopes = by_sympy(model, texts, at)
@@ -107,27 +107,27 @@ def test_values_and_slopes_are_those_of_the_equations(fmus, model, outputs):
     for transform in (torch.func.jacrev, torch.func.jacfwd):
         states, inputs, parameters = transform(function, argnums=(0, 1, 2))(*at[1:])
         found = [states[rows, :, rows], inputs[rows, :, rows], parameters]
-        for one, expected in zip(found, slopes, strict=True):
-            torch.testing.assert_close(one, expected, rtol=1e-8, atol=1e-8)
+        for derivative, expected in zip(found, slopes, strict=True):
+            torch.testing.assert_close(derivative, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_whole_batches_are_rows_like_others(fmus):
+def test_batches_equal_single_evaluations(fmus):
     evaluation, (time, states, inputs, parameters) = fmus["Pendulum"], moments(PENDULUM)
 
     def function(states, parameters):
         return evaluated(evaluation, False, time, states, inputs, parameters)
 
     many = torch.stack([states, 2.0 * states, -states])
-    expected = torch.stack([function(one, parameters) for one in many])
+    expected = torch.stack([function(rows, parameters) for rows in many])
     assert torch.equal(torch.func.vmap(function, (0, None))(many, parameters), expected)
     other = torch.stack([parameters, 1.5 * parameters, 0.5 * parameters])
-    expected = torch.stack([function(*one) for one in zip(many, other, strict=True)])
+    expected = torch.stack([function(*problem) for problem in zip(many, other, strict=True)])
     assert torch.equal(torch.func.vmap(function)(many, other), expected)
     slopes = torch.func.vmap(torch.func.jacfwd(function), (0, None))(many, parameters)
     torch.testing.assert_close(slopes[1], torch.func.jacrev(function)(many[1], parameters))
 
 
-def test_reverse_mode_of_reverse_mode_is_trusted_and_second_derivatives_are_refused(fmus):
+def test_reverse_mode_applied_twice_is_used_and_second_derivatives_are_refused(fmus):
     evaluation, (time, states, inputs, parameters) = fmus["Cart"], moments(CART)
 
     def function(parameters):
@@ -142,8 +142,8 @@ def test_reverse_mode_of_reverse_mode_is_trusted_and_second_derivatives_are_refu
         torch.autograd.grad(slope.sum(), at)
 
 
-def test_a_wrong_derivative_of_the_fmu_is_not_trusted(tmp_path):
-    """As of tools that leave out what an algebraic loop adds: differences take its place."""
+def test_a_wrong_derivative_of_the_fmu_is_not_used(tmp_path):
+    """As of tools that omit algebraic loops: differences are used instead."""
     wrong = tmp_path / "wrong.fmu"
     make_fmu(wrong, PENDULUM)
     evaluation = load_fmu(wrong).evaluation
@@ -151,20 +151,20 @@ def test_a_wrong_derivative_of_the_fmu_is_not_trusted(tmp_path):
     evaluation.binary.slopes = lambda *how: 1.01 * plain(*how)
     at = moments(PENDULUM)
     _, (expected, _, _) = by_sympy(PENDULUM, list(PENDULUM.rates.values()), at)
-    found = evaluation.slopes(False, EvaluationPoints(*(one.numpy() for one in at)), "states")
+    found = evaluation.slopes(False, EvaluationPoints(*(part.numpy() for part in at)), "states")
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     assert not any(evaluation._trusted.values())
 
 
-def test_a_moment_that_comes_again_is_not_computed_again(fmus, monkeypatch):
+def test_repeated_points_are_computed_once(fmus, monkeypatch):
     evaluation, (time, states, inputs, parameters) = fmus["Motor"], moments(MOTOR)
-    asked = []
+    computed = []
     plain = evaluation.binary.values
-    monkeypatch.setattr(evaluation.binary, "values", lambda *how: asked.append(len(how[1])) or plain(*how))
+    monkeypatch.setattr(evaluation.binary, "values", lambda *how: computed.append(len(how[1])) or plain(*how))
     twice = torch.arange(len(time)).repeat_interleave(2)
     parts = (time[twice], states[twice] + 0.123, inputs[twice])
     first = evaluated(evaluation, False, *parts, parameters)
     assert torch.equal(first[::2], first[1::2])
-    first.zero_()  # what is given away is no longer what is remembered
+    first.zero_()  # the cached values are a copy
     assert float(evaluated(evaluation, False, *parts, parameters).abs().sum()) > 0
-    assert asked == [len(time)]
+    assert computed == [len(time)]

@@ -1,4 +1,4 @@
-"""FMUs as simulations: what is read of them, what is refused, and what their recordings are compared with."""
+"""FMUs as simulations: description, refusals, and comparison with recordings."""
 
 import pickle
 import zipfile
@@ -35,7 +35,7 @@ def swing(count=60, **renamed):
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_it_is_what_it_says_of_itself(tmp_path, version):
+def test_description_is_read(tmp_path, version):
     simulation = load_simulation(str(make_fmu(tmp_path / "p.fmu", PENDULUM, version)))
     assert (simulation.name, simulation.states, simulation.inputs) == ("Pendulum", ("angle", "speed"), ("torque",))
     assert simulation.units == {"angle": "rad", "speed": "rad/s", "torque": "N·m"}
@@ -44,23 +44,23 @@ def test_it_is_what_it_says_of_itself(tmp_path, version):
 
 
 @pytest.mark.parametrize(("version", "derivatives"), [(2, True), (2, False), (3, True)])
-def test_it_simulates_as_the_same_equations_in_torch_do(tmp_path, version, derivatives):
+def test_residual_equals_the_same_equations_in_torch(tmp_path, version, derivatives):
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM, version, derivatives=derivatives))
-    one, other = simulation.prepare(swing()), Pendulum().prepare(swing())
-    theta = other.start()
-    assert one.parameter_names == other.parameter_names
-    assert one.kinematic == {"angle": "speed"}
-    torch.testing.assert_close(one.start(), theta, rtol=1e-6, atol=1e-8)
-    torch.testing.assert_close(one.residual(theta, {}), other.residual(theta, {}), rtol=1e-9, atol=1e-9)
-    slopes = [torch.func.jacfwd(lambda at, which=which: which.residual(at, {}))(theta) for which in (one, other)]
+    fmu, expected = simulation.prepare(swing()), Pendulum().prepare(swing())
+    theta = expected.start()
+    assert fmu.parameter_names == expected.parameter_names
+    assert fmu.kinematic == {"angle": "speed"}
+    torch.testing.assert_close(fmu.start(), theta, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(fmu.residual(theta, {}), expected.residual(theta, {}), rtol=1e-9, atol=1e-9)
+    slopes = [torch.func.jacfwd(lambda at, which=which: which.residual(at, {}))(theta) for which in (fmu, expected)]
     torch.testing.assert_close(*slopes, rtol=1e-7, atol=1e-7)
 
 
-def test_a_state_has_the_name_of_the_output_that_shows_it(tmp_path):
+def test_a_state_has_the_name_of_the_output_that_equals_it(tmp_path):
     model = replace(PENDULUM, outputs={"load.phi": "angle", "height": "1 - cos(angle)"})
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", model))
     assert simulation.states == ("load_phi", "speed")
-    # a column may be called as the FMU calls it
+    # a column may have the name in the FMU
     prepared = simulation.prepare(swing(angle="load.phi"))
     assert prepared.channels == ("load_phi",)
     assert torch.equal(prepared.guess[prepared.rows][:, 0], swing()["angle"])
@@ -76,7 +76,7 @@ def test_a_state_has_the_name_of_the_output_that_shows_it(tmp_path):
     torch.testing.assert_close(shown, 1.0 - torch.cos(states[:, 0]))
 
 
-def test_outputs_that_were_not_recorded_are_listed(tmp_path):
+def test_the_error_lists_outputs_and_columns(tmp_path):
     model = replace(PENDULUM, outputs={"body.height": "1 - cos(angle)"})
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", model))
     with pytest.raises(
@@ -85,7 +85,7 @@ def test_outputs_that_were_not_recorded_are_listed(tmp_path):
         simulation.prepare(swing(angle="phi"))
 
 
-def test_another_process_can_be_given_it(tmp_path):
+def test_an_fmu_can_be_pickled(tmp_path):
     simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM))
     again = pickle.loads(pickle.dumps(simulation))
     assert again.states == simulation.states
@@ -100,15 +100,15 @@ STOP = Model(
     ("inflow",),
     events=("level - rim",),
 )
-"""Above the rim it spills; which side it is on is frozen between events, as tools do."""
+"""Above the rim it spills; the condition is frozen between events, as in usual tools."""
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_what_switches_is_looked_at_in_each_moment(tmp_path, version):
+def test_discrete_equations_are_solved_at_each_moment(tmp_path, version):
     simulation = load_fmu(make_fmu(tmp_path / "s.fmu", STOP, version))
     level = torch.tensor([0.2, 0.9, 0.3, 0.7], dtype=torch.float64)
     x, u = type("X", (), {"level": level})(), type("U", (), {"inflow": torch.zeros_like(level)})()
-    p = type("P", (), {name: torch.tensor(one[0]).double() for name, one in STOP.parameters.items()})()
+    p = type("P", (), {name: torch.tensor(start).double() for name, (start, *_) in STOP.parameters.items()})()
     found = simulation.derivative(torch.zeros_like(level), x, u, p)["level"]
     torch.testing.assert_close(found, -0.3 * level - 2.0 * (level - 0.5).clamp(min=0.0))
 
@@ -118,7 +118,7 @@ def test_jumps_and_memory_are_refused(tmp_path, version):
     bouncing = replace(STOP, reset={"level": "-0.8*level"})
     with pytest.raises(SimulationError, match=r"resets its states at an event.*`--simulator-output SIM.csv`"):
         load_fmu(make_fmu(tmp_path / "b.fmu", bouncing, version))
-    with pytest.raises(FmuError, match=r"depend on events before.*`--simulator-output SIM.csv`"):
+    with pytest.raises(FmuError, match=r"depend on earlier events.*`--simulator-output SIM.csv`"):
         load_fmu(make_fmu(tmp_path / "m.fmu", replace(STOP, memory=True), version))
 
 
@@ -138,33 +138,33 @@ STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force
     ("text", "more", "words"),
     [
         (None, (), "this is no FMU, or a damaged one: it has no modelDescription.xml"),
-        ("<fmiModelDescription fmiVersion='2.0'", (), "its modelDescription.xml cannot be understood"),
+        ("<fmiModelDescription fmiVersion='2.0'", (), "its modelDescription.xml cannot be parsed"),
         (description(PENDULUM, fmi="1.0"), (), "this FMU is of FMI 1.0; FMI 2.0 and 3.0 are read"),
-        ("<model/>", (), "this FMU is of FMI no version that it tells"),
+        ("<model/>", (), "this FMU is of FMI (no version)"),
         (description(PENDULUM, 3, kind="ScheduledExecution"), (), "for scheduled execution only; export it for model"),
         (description(STILL), (), "no continuous states, so there is no differential equation in it"),
-        (TEXT.replace("start=\"9.0\"", ""), (), "its parameter stiffness has no start, which FMI asks for"),
-        (TEXT.replace("start=\"9.0\"", "start=\"nine\""), (), "of its parameter stiffness a value is 'nine'"),
+        (TEXT.replace("start=\"9.0\"", ""), (), "its parameter stiffness has no start, which FMI requires"),
+        (TEXT.replace("start=\"9.0\"", "start=\"nine\""), (), "its parameter stiffness has the value 'nine'"),
         (TEXT.replace("start=\"0.1\"", "start=\"-0.1\""), (), "its parameter damping cannot be fitted"),
         (TEXT, (), "it has no binaries, and none for"),
-        (TEXT, ("binaries/mars64/Pendulum.so",), "it has binaries for mars64 alone, and none for"),
-        (TEXT, ("sources/all.c",), "its sources are in it; `fmpy compile MODEL.fmu` makes one of them"),
+        (TEXT, ("binaries/mars64/Pendulum.so",), "it has binaries for mars64 only, and none for"),
+        (TEXT, ("sources/all.c",), "it contains sources; compile them with `fmpy compile MODEL.fmu`"),
         (TEXT, ("binaries/PLATFORM/Pendulum.so",), "its binary cannot be used"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, text, more, words):
+def test_unusable_fmus_are_refused_with_a_sentence(tmp_path, text, more, words):
     path = tmp_path / "model.fmu"
     zipped(path, text, *(name.replace("PLATFORM", binary._platform(2)) for name in more))
     with pytest.raises(FmuError) as caught:
         load_fmu(path)
-    told = str(caught.value)
-    assert told.startswith(f"{path}: ")
-    assert words in told
-    assert told.endswith(".")
-    assert "\n" not in told
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert words in message
+    assert message.endswith(".")
+    assert "\n" not in message
 
 
-def test_neither_is_what_is_no_archive(tmp_path):
+def test_other_files_are_refused(tmp_path):
     (tmp_path / "model.fmu").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(FmuError, match=r"damaged one: it is no zip archive"):
         load_fmu(tmp_path / "model.fmu")
@@ -172,7 +172,7 @@ def test_neither_is_what_is_no_archive(tmp_path):
         load_fmu(tmp_path / "other.fmu")
 
 
-def test_without_fmpy_it_says_what_to_install(tmp_path, monkeypatch):
+def test_without_fmpy_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "fmpy", None)
     (tmp_path / "model.fmu").write_bytes(b"")
     with pytest.raises(ImportError, match=r'install it with `pip install "mkc-torch\[fmu\]"`'):
@@ -186,27 +186,27 @@ from pythonfmu import Fmi2Causality, Fmi2Slave, Real
 class Lag(Fmi2Slave):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.push, self.level = 0.0, 0.0
-        self.register_variable(Real("push", causality=Fmi2Causality.input))
+        self.drive, self.level = 0.0, 0.0
+        self.register_variable(Real("drive", causality=Fmi2Causality.input))
         self.register_variable(Real("level", causality=Fmi2Causality.output))
 
     def do_step(self, current_time, step_size):
-        self.level += step_size * (self.push - self.level)
+        self.level += step_size * (self.drive - self.level)
         return True
 """
 
 
-def test_one_with_its_own_solver_is_compared_as_what_a_simulator_wrote(tmp_path):
+def test_co_simulation_is_compared_like_a_simulators_output(tmp_path):
     builder = pytest.importorskip("pythonfmu.builder")
     (tmp_path / "lag.py").write_text(COSIMULATION, encoding="utf-8")
     path = builder.FmuBuilder.build_FMU(str(tmp_path / "lag.py"), dest=str(tmp_path))
     simulation = load_fmu(path)
     time = 0.05 * torch.arange(80, dtype=torch.float64)
-    push = torch.ones_like(time)
-    level = 1.0 - torch.exp(-time)  # of the same equation without steps
-    prepared = simulation.prepare(Recording({"time": time, "push": push, "level": level}))
+    drive = torch.ones_like(time)
+    level = 1.0 - torch.exp(-time)  # the exact solution
+    prepared = simulation.prepare(Recording({"time": time, "drive": drive, "level": level}))
     assert (simulation.name, prepared.channels) == ("simulated", ("level",))
     left = prepared.residual(prepared.start(), {})
     assert float(left.abs().max()) < 0.02
-    with pytest.raises(SimulationError, match=r"It has level; the recording has time, push, height"):
-        simulation.prepare(Recording({"time": time, "push": push, "height": level}))
+    with pytest.raises(SimulationError, match=r"It has level; the recording has time, drive, height"):
+        simulation.prepare(Recording({"time": time, "drive": drive, "height": level}))

@@ -1,4 +1,4 @@
-"""The challenge's naive simulations as FMUs: the same equations, and the same diagnoses."""
+"""The challenge's nominal models as FMUs: the same equations, and the same diagnoses."""
 
 import pytest
 import torch
@@ -15,24 +15,29 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler o
 
 
 @pytest.mark.parametrize("system", fmu.RATES)
-def test_the_texts_are_the_naive_equations(tmp_path, system):
-    one, other = fmu.NAIVE[system](), load_fmu(fmu.as_fmu(system, tmp_path))
-    assert (one.states, one.inputs, list(one.parameters)) == (other.states, other.inputs, list(other.parameters))
+def test_the_fmus_have_the_nominal_equations(tmp_path, system):
+    model, loaded = fmu.NAIVE[system](), load_fmu(fmu.as_fmu(system, tmp_path))
+    assert (model.states, model.inputs, list(model.parameters)) == (
+        loaded.states,
+        loaded.inputs,
+        list(loaded.parameters),
+    )
     generator = torch.Generator().manual_seed(0)
     states, inputs = (
-        torch.rand(9, len(names), generator=generator, dtype=torch.float64) - 0.1 for names in (one.states, one.inputs)
+        torch.rand(9, len(names), generator=generator, dtype=torch.float64) - 0.1
+        for names in (model.states, model.inputs)
     )
-    values = {k: p.value if isinstance(p, Parameter) else p for k, p in one.parameters.items()}
+    values = {k: p.value if isinstance(p, Parameter) else p for k, p in model.parameters.items()}
     p = Names(**{name: torch.tensor(1.3 * value, dtype=torch.float64) for name, value in values.items()})
-    given = torch.zeros(9), namespace(one.states, states), namespace(one.inputs, inputs), p
-    expected, found = one.derivative(*given), other.derivative(*given)
-    for state in one.states:
+    given = torch.zeros(9), namespace(model.states, states), namespace(model.inputs, inputs), p
+    expected, found = model.derivative(*given), loaded.derivative(*given)
+    for state in model.states:
         torch.testing.assert_close(found[state], expected[state], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.slow
-def test_what_is_found_is_the_same(monkeypatch):
-    """A throw, the quickest of the systems; `python -m tests.benchmarks.fmu` does all of them."""
+def test_findings_are_the_same(monkeypatch):
+    """A throw, the fastest of the systems; `python -m tests.benchmarks.fmu` runs all systems."""
     monkeypatch.setattr(fmu, "FIRST", 18)
     (pair,) = fmu.pairs(1)
     assert pair.name.startswith("projectile")

@@ -1,4 +1,4 @@
-"""Which view is compared: one whose turns are wrong leaves far more of the field than its length does."""
+"""Selection of the view: wrong turns have a far larger residual than the length."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.simulation.tumbling import RATE, body_rate, changed, full_truth, tumb
 N = 3000
 TIME = np.arange(N) / RATE
 SLOW = 0.1 * TIME
-"""Moments of a motion so slow that the length determines the sensor, but no longer together with a step."""
+"""Moments of a motion so slow that the length determines the sensor without a step but not with a step."""
 
 STEP = np.outer(TIME > 30.0, [8.0, -5.0, 3.0])
 
@@ -32,8 +32,8 @@ def prepared(attitude, **further):
     return Magnetometer().prepare(changed(tumbling(N, noise=0.5, **further), **attitude))
 
 
-def wandering(degrees, tau=10.0):
-    """An attitude's error, as a filter has it."""
+def drifting(degrees, tau=10.0):
+    """A rotation error with the correlation time of a filter."""
     random, decay = np.random.default_rng(0), np.exp(-1.0 / (RATE * tau))
     error = np.zeros((N, 3))
     for k in range(1, N):
@@ -45,20 +45,20 @@ def wandering(degrees, tau=10.0):
     "attitude",
     [
         quaternions(turns(TIME)),
-        quaternions(wandering(2.0) * turns(TIME)),
-        quaternions(wandering(4.0) * turns(TIME)),
+        quaternions(drifting(2.0) * turns(TIME)),
+        quaternions(drifting(4.0) * turns(TIME)),
         quaternions(turns(TIME - 0.01)),
         quaternions(turns(TIME) * Rotation.from_euler("Z", 40, degrees=True)),
     ],
     ids=["exact", "2 degrees", "4 degrees", "10 ms late", "other axes"],
 )
-def test_an_attitude_may_be_off_by_its_own_noise(attitude):
+def test_a_noisy_attitude_is_used(attitude):
     assert prepared(attitude).view == "attitude"
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("size", [10.0, 40.0])
-def test_a_change_of_the_sensor_is_no_fault_of_the_attitude(size):
+def test_a_change_of_the_sensor_does_not_exclude_the_attitude(size):
     right = quaternions(turns(TIME))
     assert prepared(right, sensor=np.outer(TIME > 30.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
     assert prepared(right, sensor=np.outer(TIME / 60.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
@@ -72,13 +72,13 @@ def test_a_change_of_the_sensor_is_no_fault_of_the_attitude(size):
         (quaternions(turns(TIME - 0.1)), "seems to be late by 0.1 s"),
         (quaternions(turns(TIME + 0.5)), "seems to be early by 0.5 s"),
         (dict(zip(("q_w", "q_x", "q_y", "q_z"), turns(TIME).as_quat().T, strict=True)), "in the order x, y, z, w"),
-        (quaternions(turns(0.77 * TIME + 31.0)), "see that it is of this recording and of this sensor"),
-        (quaternions(wandering(20.0) * turns(TIME)), "see that it is of this recording and of this sensor"),
+        (quaternions(turns(0.77 * TIME + 31.0)), "check that it belongs to this recording and this sensor"),
+        (quaternions(drifting(20.0) * turns(TIME)), "check that it belongs to this recording and this sensor"),
         (quaternions(turns(0.0 * TIME)), "does not turn as the field does"),
     ],
     ids=["late", "early", "order", "another's", "poor", "still"],
 )
-def test_a_wrong_attitude_is_left_out_for_the_length_with_the_reason(attitude, words):
+def test_a_wrong_attitude_is_excluded_with_the_reason(attitude, words):
     view = prepared(attitude)
     assert view.view == "norm"
     (sentence,) = (warning for warning in view.warnings if "attitude is left out" in warning)
@@ -86,10 +86,10 @@ def test_a_wrong_attitude_is_left_out_for_the_length_with_the_reason(attitude, w
     assert float(1.4826 * view.residual(view.start(), {}).abs().median()) < 0.6
 
 
-def test_what_is_left_is_told_in_the_measurements_unit():
+def test_the_warning_has_residuals_in_the_measurements_unit():
     (sentence,) = prepared(quaternions(turns(TIME - 0.1))).warnings
-    assert "of the field of 47 µT are left in each axis, of the length 0.5 µT" in sentence
-    assert "Without that 0.5" in sentence
+    assert "of the field of 47 µT, with the length 0.5 µT" in sentence
+    assert "Without this fault the residual would be 0.5" in sentence
 
 
 @pytest.mark.e2e
@@ -102,7 +102,7 @@ def test_what_is_left_is_told_in_the_measurements_unit():
     ],
     ids=["degrees", "degrees and sign", "exchanged"],
 )
-def test_a_wrong_gyroscope_is_left_out_where_the_length_holds_together_with_a_step(rate, words):
+def test_a_wrong_gyroscope_is_excluded_where_length_and_step_determine_the_sensor(rate, words):
     recording = tumbling(N, noise=0.5, moments=SLOW, sensor=STEP)
     right = 0.1 * body_rate(SLOW)
     assert Magnetometer().prepare(changed(recording, **rates(right))).view == "gyro"
@@ -115,7 +115,7 @@ def test_a_wrong_gyroscope_is_left_out_where_the_length_holds_together_with_a_st
 
 
 @pytest.mark.e2e
-def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
+def test_wrong_turns_have_a_warning_where_the_length_is_insufficient():
     little = tumbling(N, noise=0.5, size=(1.0, 0.1, 0.1), moments=0.3 * TIME)
     rate = 0.3 * body_rate(0.3 * TIME, (1.0, 0.1, 0.1))
     right = Magnetometer().prepare(changed(little, **rates(rate)))
@@ -127,25 +127,25 @@ def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
 
 
 @pytest.mark.e2e
-def test_a_view_that_is_asked_for_is_taken_and_knows_what_is_wrong_with_its_turns():
+def test_a_requested_view_is_used_and_has_the_fault_of_its_turns():
     table = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
     views = [Magnetometer(use=use).prepare(table) for use in ("attitude", "gyro", "norm")]
     assert [view.view for view in views] == ["attitude", "gyro", "norm"]
     late, turned_round, none = (view.wrong_turns for view in views)
     assert late.startswith("With the attitude")
     assert "seems to be late by 0.5 s" in late
-    assert "of the length 0.5 µT" in turned_round
+    assert "with the length 0.5 µT" in turned_round
     assert "The rates seem to have the other sign" in turned_round
     assert none == ""
 
 
-def test_right_turns_have_nothing_wrong():
+def test_correct_turns_have_no_fault():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **quaternions(turns(TIME)), **rates(body_rate(TIME)))
     assert [Magnetometer(use=use).prepare(table).wrong_turns for use in ("attitude", "gyro")] == ["", ""]
 
 
 @pytest.mark.e2e
-def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
+def test_a_simulation_with_wrong_turns_is_unfit_with_the_reason():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **rates(-body_rate(TIME)))
     found = diagnose(Magnetometer(use="gyro"), table, surrogates=19)
     assert (found.verdict, found.findings) == ("unfit", ())
@@ -153,7 +153,7 @@ def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
 
 
 @pytest.mark.e2e
-def test_a_part_starts_the_length_where_all_samples_do_not():
+def test_a_part_determines_the_ellipsoid_where_all_samples_do_not():
     half = tumbling(N, noise=0.3, moments=np.where(TIME < 30.0, TIME, 30.0 + 0.02 * (TIME - 30.0)))
     points = half.magnetometer() + torch.as_tensor(np.outer(TIME > 30.0, [300.0, 0.0, 0.0]))
     surface = ellipsoid_of_a_part(points, torch.arange(N))
@@ -164,7 +164,7 @@ def test_a_part_starts_the_length_where_all_samples_do_not():
     )
 
 
-def test_samples_that_cover_too_little_start_nothing():
+def test_samples_with_little_coverage_are_refused():
     little = tumbling(N, noise=0.5, size=(1.0, 0.05, 0.05))
     with pytest.raises(NotIdentifiableError):
         Magnetometer().prepare(little)
@@ -172,7 +172,7 @@ def test_samples_that_cover_too_little_start_nothing():
 
 
 @pytest.mark.e2e
-def test_a_step_is_named_by_the_length_where_the_gyroscope_is_in_degrees():
+def test_a_step_is_found_by_the_length_with_a_gyroscope_in_degrees():
     recording = changed(
         tumbling(N, noise=0.5, seed=1, moments=SLOW, sensor=STEP), **rates(np.rad2deg(0.1 * body_rate(SLOW)))
     )

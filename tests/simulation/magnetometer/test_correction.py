@@ -1,4 +1,4 @@
-"""The magnetometer's measuring side on another recording."""
+"""The correction of another recording by a fitted magnetometer."""
 
 import json
 
@@ -20,7 +20,7 @@ def stacked(columns):
 
 
 @pytest.mark.parametrize("view", ["norm", "gyro", "attitude"])
-def test_the_corrected_field_is_the_ambient_one(view):
+def test_the_corrected_field_is_the_ambient_field(view):
     theta = full_truth(STRENGTH, 0.0, 0.0) if view == "attitude" else symmetric_truth(STRENGTH)
     if view == "gyro":
         theta = torch.cat([theta[:3], torch.from_numpy(true_matrix(STRENGTH)).flatten(), theta.new_zeros(3)])
@@ -36,15 +36,15 @@ def test_parameters_of_another_view_are_refused():
         MagnetometerCorrection({"view": "gyro"}, tumbling(50)).corrected(symmetric_truth(STRENGTH), {})
 
 
-def test_changes_are_taken_off_the_measurement():
+def test_changes_are_removed_from_the_measurement():
     change = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     theta = symmetric_truth(STRENGTH)
     clean = MagnetometerCorrection({"view": "norm"}, tumbling(50)).corrected(theta, {})
-    spoilt = MagnetometerCorrection({"view": "norm"}, tumbling(50, sensor=change))
-    torch.testing.assert_close(stacked(spoilt.corrected(theta, {"sensor": lambda _: change})), stacked(clean))
+    contaminated = MagnetometerCorrection({"view": "norm"}, tumbling(50, sensor=change))
+    torch.testing.assert_close(stacked(contaminated.corrected(theta, {"sensor": lambda _: change})), stacked(clean))
 
 
-def test_what_follows_the_signal_sees_the_measurement_less_its_offset():
+def test_changes_depend_on_the_measurement_without_offset():
     theta, seen = symmetric_truth(STRENGTH), []
     correction = MagnetometerCorrection({"view": "norm"}, tumbling(50))
     correction.corrected(theta, {"sensor": lambda signal: seen.append(signal) or torch.zeros_like(signal)})
@@ -58,7 +58,7 @@ def test_only_the_sensor_is_corrected():
     assert correction.ports["sensor"].unit == "µT"
 
 
-def test_rows_stay_as_they_are():
+def test_missing_samples_stay_missing():
     recording = tumbling(50)
     mag_x = recording["mag_x"].clone()
     mag_x[3] = torch.nan
@@ -69,7 +69,7 @@ def test_rows_stay_as_they_are():
     assert int(stacked(columns).isnan().any(-1).sum()) == 1
 
 
-def test_without_times_there_are_none_in_the_correction():
+def test_without_times_the_correction_has_no_times():
     correction = MagnetometerCorrection({"view": "norm"}, changed(tumbling(50), time=None))
     assert list(correction.corrected(symmetric_truth(STRENGTH), {})) == ["field_x", "field_y", "field_z"]
     assert torch.equal(correction.time, torch.arange(50, dtype=torch.float64))
@@ -89,7 +89,7 @@ def test_corrections_are_looked_up_by_name():
 
 
 @pytest.mark.parametrize("use", ["norm", "gyro", "attitude"])
-def test_what_a_view_keeps_is_enough_to_correct(use):
+def test_state_of_a_view_suffices_for_the_correction(use):
     recording = tumbling(600, gyro=True, attitude=True)
     view = Magnetometer(use=use).prepare(recording)
     state = json.loads(json.dumps(view.state))

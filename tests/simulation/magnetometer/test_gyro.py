@@ -1,4 +1,4 @@
-"""The vector, turned along by the gyroscope."""
+"""The field vector, rotated by the gyroscope."""
 
 import numpy as np
 import pytest
@@ -31,11 +31,11 @@ def truth(view):
     return torch.cat([torch.from_numpy(OFFSET), matrix, matrix.new_zeros(3)])
 
 
-def test_next_to_nothing_is_left_at_the_truth(view):
+def test_residual_is_small_at_the_truth(view):
     residual = view.residual(truth(view), {})
     assert view.channels == ("along", "across_1", "across_2")
     assert residual.shape == (500, 3)
-    # of the length nothing is lost; across it the trapezoid rule of the turns at 50 Hz
+    # along the field there is no error; across it that of the trapezoidal rule at 50 Hz
     assert float(residual[:, 0].abs().max()) < 1e-4
     assert 1e-4 < float(residual[:, 1:].abs().max()) < 0.03
 
@@ -56,7 +56,7 @@ def test_the_start_is_the_truth_without_noise(view):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_channels_are_orthonormal_and_the_first_is_along_the_field(view, axis):
-    """One sample that is off by a vector moves its own residual by as much, turned; its window hardly notices."""
+    """A change of a sample changes its residual by as much, rotated, and hardly affects its window."""
     theta, k = truth(view), 230
     ambient = turns(view.time.numpy()[k]).inv().apply(FIELD)
     axes = np.linalg.qr(np.stack([ambient, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], -1))[0].T
@@ -81,14 +81,14 @@ def test_axes_across_are_orthogonal(view):
     torch.testing.assert_close(moved.norm(dim=-1), expected, rtol=0.02, atol=0.02)
 
 
-def test_a_change_at_the_sensor_is_one_of_the_measurement():
+def test_a_change_at_the_sensor_changes_the_measurement():
     change = torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     view = prepared(sensor=change)
     assert float(view.residual(truth(view), {}).abs().max()) > 1.0
     assert float(view.residual(truth(view), {"sensor": lambda _: change}).abs().max()) < 0.03
 
 
-def test_a_change_of_the_field_is_one_of_its_strength(view):
+def test_a_change_of_the_field_changes_its_strength(view):
     stronger = torch.linspace(-1.0, 1.0, 500, dtype=torch.float64).unsqueeze(-1)
     moved = view.residual(truth(view), {"field": lambda _: stronger}) - view.residual(truth(view), {})
     torch.testing.assert_close(moved[:, :1], -stronger)
@@ -129,15 +129,15 @@ def test_signals_are_the_simulated_measurement(view):
 def test_a_bias_of_the_gyroscope_is_a_parameter():
     bias = np.array([0.02, -0.01, 0.015])
     recording = tumbling(500, gyro=True)
-    spoilt = changed(recording, **{f"gyro_{a}": recording[f"gyro_{a}"] + bias[k] for k, a in enumerate("xyz")})
-    view = Magnetometer(use="gyro").prepare(spoilt)
+    biased = changed(recording, **{f"gyro_{a}": recording[f"gyro_{a}"] + bias[k] for k, a in enumerate("xyz")})
+    view = Magnetometer(use="gyro").prepare(biased)
     theta = truth(view)
     without = float(view.residual(theta, {}).square().mean().sqrt())
     theta[12:] = torch.from_numpy(bias)
     assert float(view.residual(theta, {}).square().mean().sqrt()) < 0.1 * without
 
 
-def test_what_is_known_of_the_bias_beforehand(view):
+def test_prior_of_the_bias(view):
     assert bool((view.prior.precision[12:] > 0).all())
     assert view.prior.mean[12:].tolist() == [0.0] * 3
 
@@ -149,7 +149,7 @@ def test_ports(view):
 
 
 @pytest.mark.e2e
-def test_a_hand_that_turns_too_little_for_the_length_is_followed_by_the_gyroscope():
+def test_the_gyroscope_is_used_where_turns_are_insufficient_for_the_length():
     recording = tumbling(500, noise=0.2, size=(1.0, 0.3, 0.3), gyro=True)
     with pytest.raises(NotIdentifiableError, match="Directions not covered"):
         Magnetometer(use="norm").prepare(recording)
@@ -158,7 +158,7 @@ def test_a_hand_that_turns_too_little_for_the_length_is_followed_by_the_gyroscop
     np.testing.assert_allclose(view.start()[:3], OFFSET, atol=5.0)
 
 
-def test_a_turn_about_one_axis_determines_no_offset_along_it():
+def test_a_turn_about_a_single_axis_is_refused():
     with pytest.raises(NotIdentifiableError, match="Directions not covered"):
         Magnetometer().prepare(tumbling(500, noise=0.2, size=(1.0, 0.0, 0.0), gyro=True))
 
@@ -168,8 +168,8 @@ SMALL_TILTS = (1.0, 0.12, 0.12)
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", range(3))
-def test_a_matrix_that_shrinks_what_hardly_turns_gains_nothing(seed):
-    """The noise is that of the sensor: a smaller field of it would be the likelier one, and its offset far away."""
+def test_noise_of_small_tilts_does_not_shrink_the_matrix(seed):
+    """The noise is in the units of the sensor; with noise of the field, a small matrix and a far offset would win."""
     recording = tumbling(1500, noise=0.3, size=SMALL_TILTS, gyro=True, seed=seed)
     found = diagnose(Magnetometer(use="gyro"), recording, surrogates=19, effects=())
     offset, matrix = found.model.theta[:3], found.model.theta[3:12].unflatten(0, (3, 3))
@@ -179,7 +179,7 @@ def test_a_matrix_that_shrinks_what_hardly_turns_gains_nothing(seed):
 
 
 @pytest.mark.e2e
-def test_axes_that_are_turned_against_the_gyroscope_are_no_effect():
+def test_misaligned_axes_are_fitted_by_the_matrix():
     angle = np.radians(4.0)
     turned = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     recording = tumbling(1500, noise=0.3, gyro=True)

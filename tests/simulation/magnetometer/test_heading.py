@@ -18,7 +18,7 @@ RATE = 50.0
 
 
 def recorded(N, jumps, **kwargs):
-    """A recording whose attitude is turned about the vertical, by so many degrees from each sample on."""
+    """A recording whose attitude is rotated about the vertical: first sample to size of each jump in degrees."""
     recording = tumbling(N, attitude=True, gyro=True, **kwargs)
     off = sum(((np.arange(N) >= first) * size for first, size in jumps.items()), np.zeros(N))
     turned = Rotation.from_rotvec(off[:, None] * [0.0, 0.0, 1.0], degrees=True) * turns(recording["time"].numpy())
@@ -27,7 +27,7 @@ def recorded(N, jumps, **kwargs):
 
 
 def field_at(time):
-    """What a magnetometer measures without noise."""
+    """The measurement of a magnetometer without noise."""
     return torch.from_numpy(turns(time).inv().apply(FIELD))
 
 
@@ -46,29 +46,29 @@ def jumps_of(N, jumps, rate=None):
     between=st.integers(60, 140),
     sizes=st.tuples(*[st.floats(5.0, 170.0) | st.floats(-170.0, -5.0)] * 2),
 )
-def test_every_jump_is_found_with_its_size_whatever_the_motion(first, between, sizes):
+def test_every_jump_is_found_with_its_size_for_any_motion(first, between, sizes):
     found = jumps_of(300, {first: sizes[0], first + between: sizes[1]})
     assert [jump.after for jump in found] == [first - 1, first + between - 1]
     np.testing.assert_allclose([jump.size for jump in found], sizes, atol=0.3)
 
 
-def test_an_attitude_that_turns_with_the_gyroscope_has_none():
+def test_an_attitude_that_agrees_with_the_gyroscope_has_no_jumps():
     assert jumps_of(300, {}) == ()
 
 
-def test_gyroscopes_axes_that_are_others_show_none():
+def test_other_axes_of_the_gyroscope_show_no_jumps():
     time = np.arange(300) / RATE
     assert jumps_of(300, {100: 40.0}, body_rate(time) * [-1.0, 1.0, -1.0]) == ()
 
 
-def test_where_the_gyroscope_does_not_know_there_is_none():
+def test_missing_rates_show_no_jumps():
     rate = body_rate(np.arange(300) / RATE)
     rate[99:101] = np.nan
     assert [jump.after for jump in jumps_of(300, {100: 40.0, 200: 30.0}, rate)] == [199]
     assert jumps_of(300, {100: 40.0}, np.full((300, 3), np.nan)) == ()
 
 
-def test_in_a_gap_in_which_the_sensor_turns_more_there_is_none():
+def test_a_gap_in_which_the_sensor_turns_has_no_jump():
     time = np.concatenate([np.arange(100), np.arange(170, 350)]) / RATE
     attitude = torch.from_numpy(turns(time).as_matrix())
     rate = torch.from_numpy(body_rate(time))
@@ -82,24 +82,24 @@ def test_in_a_gap_in_which_the_sensor_turns_more_there_is_none():
 
 
 @pytest.mark.parametrize("length", [1, 10, 40])
-def test_an_attitude_that_comes_back_was_not_set_anew(length):
+def test_a_reversed_jump_is_a_glitch(length):
     assert jumps_of(300, {100: 50.0, 100 + length: -50.0}) == ()
     found = jumps_of(300, {100: 50.0, 100 + length: -50.0, 220: 30.0})
     assert [jump.after for jump in found] == [219]
 
 
-def test_of_many_jumps_the_largest_are_told_in_their_order():
+def test_the_largest_of_many_jumps_are_returned_in_order():
     sizes = {60 * k: 10.0 + 7.0 * ((5 * k) % 12) for k in range(1, 12)}
     largest = sorted(sorted(sizes, key=sizes.get, reverse=True)[:8])
     assert [jump.after + 1 for jump in jumps_of(780, sizes)] == largest
 
 
-def test_too_few_samples_have_none():
+def test_a_single_sample_has_no_jumps():
     assert heading_jumps(torch.zeros(1), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, 3)) == ()
 
 
 @pytest.mark.e2e
-def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():
+def test_the_heading_port_corrects_the_jumps():
     assert "heading" not in Magnetometer().prepare(tumbling(400, attitude=True, gyro=True)).ports
     assert "heading" not in Magnetometer().prepare(changed(recorded(400, {200: 20.0}), gyro_x=None)).ports
     view = Magnetometer().prepare(recorded(400, {150: 20.0, 250: -35.0}))
@@ -107,7 +107,7 @@ def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():
     since = view.signals(view.start(), {})["heading"]
     assert since.sum(0).tolist() == [250.0, 150.0]
     sizes = since.new_tensor([20.0, -35.0])
-    # the field's direction at the truth, against the one that the jumps have spoilt
+    # the true direction of the field, relative to the start, which the jumps affect
     ahead = torch.from_numpy(FIELD / np.linalg.norm(FIELD))
     tilt = view._across @ ahead / (view._ahead @ ahead)
     truth = full_truth(view.strength, *tilt.tolist())
@@ -117,7 +117,7 @@ def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():
 
 
 @pytest.mark.e2e
-def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
+def test_a_reset_and_a_current_are_found_together():
     N = 1500
     time = np.arange(N) / RATE
     current = 5.0 + 4.0 * np.sin(0.4 * time) + 3.0 * (time > 16.0)
@@ -141,17 +141,17 @@ def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", ["quadrotor_compass1", "quadrotor_compass3"])
-def test_the_autopilot_of_a_quadrotor_set_its_heading_anew_at_take_off(name):
+def test_a_quadrotors_heading_reset_at_take_off_is_reported(name):
     recording = Recording.read(shared_data(f"magnetometer/{name}.csv")).sorted_by_time()
     view = Magnetometer().prepare(recording)
-    told = view.warnings[-1]
-    assert "by 15.6° at 61.1 s (gyroscope: 0.2°)" in told
-    assert "at 77.8 s" in told
-    assert "at 103.2 s" in told
+    warning = view.warnings[-1]
+    assert "by 15.6° at 61.1 s (gyroscope: 0.2°)" in warning
+    assert "at 77.8 s" in warning
+    assert "at 103.2 s" in warning
 
 
 @pytest.mark.e2e
-def test_what_was_said_of_the_compass_that_steers_the_heading_is_the_heading_s():
+def test_the_first_finding_of_the_steering_compass_is_the_heading_reset():
     result = diagnose(Magnetometer(), Recording.read(shared_data("magnetometer/quadrotor_compass1.csv")))
     first = result.findings[0]
     assert first.effect == "heading_reset"
@@ -160,7 +160,7 @@ def test_what_was_said_of_the_compass_that_steers_the_heading_is_the_heading_s()
 
 
 @pytest.mark.e2e
-def test_a_quadrotor_s_current_is_found_beside_its_heading_s_jumps():
+def test_a_quadrotors_current_is_found_next_to_its_heading_jumps():
     recording = Recording.read(shared_data("magnetometer/quadrotor_compass3.csv"))
     result = diagnose(Magnetometer(), recording)
     assert [finding.effect for finding in result.findings] == ["current_field", "heading_reset"]
@@ -177,6 +177,6 @@ def test_a_quadrotor_s_current_is_found_beside_its_heading_s_jumps():
     assert result.corrected.rmse < 0.9 * worse.corrected.rmse
 
 
-def test_an_optical_tracker_sets_nothing_anew():
+def test_an_optical_tracker_has_no_heading_jumps():
     recording = Recording.read(shared_data("magnetometer/broad_36_attached_magnet_5cm.csv")).sorted_by_time()
     assert "heading" not in Magnetometer(use="attitude").prepare(recording).ports

@@ -1,4 +1,4 @@
-"""The length of the field."""
+"""The field strength."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def view():
 
 
 def orthogonal_distance(point, semi_axes):
-    """Signed distance to an ellipsoid about the origin along the axes, by the root of its one equation."""
+    """Signed distance to an ellipsoid about the origin along the axes, by the root of its equation."""
     p, a = np.abs(point), np.asarray(semi_axes)
 
     def equation(t):
@@ -29,7 +29,7 @@ def orthogonal_distance(point, semi_axes):
     return np.sign(t) * np.linalg.norm(p - nearest)
 
 
-def test_nothing_is_left_at_the_truth(view):
+def test_residual_is_zero_at_the_truth(view):
     theta = symmetric_truth(view.strength)
     assert view.channels == ("norm",)
     assert view.unit == "µT"
@@ -55,18 +55,18 @@ def test_the_start_withstands_outliers():
 @pytest.mark.parametrize("size", [0.01, 0.1, 1.0])
 def test_the_residual_is_the_orthogonal_distance_to_first_order(size):
     error = size * np.random.default_rng(0).standard_normal((600, 3))
-    spoilt = Magnetometer().prepare(tumbling(600, sensor=error))
-    theta = symmetric_truth(spoilt.strength)
-    found = spoilt.residual(theta, {}).squeeze(-1).numpy()
+    contaminated = Magnetometer().prepare(tumbling(600, sensor=error))
+    theta = symmetric_truth(contaminated.strength)
+    found = contaminated.residual(theta, {}).squeeze(-1).numpy()
     values, vectors = np.linalg.eigh(true_matrix(1.0) @ true_matrix(1.0))
-    points = (spoilt.measured.numpy() - OFFSET) @ vectors
+    points = (contaminated.measured.numpy() - OFFSET) @ vectors
     expected = np.array([orthogonal_distance(p, values**-0.5) for p in points])
     assert np.abs(expected).max() > size
-    # what is missing is of second order in the error over the radius
+    # the remainder is of second order in the error over the radius
     assert np.abs(found - expected).max() < 3.0 * size**2 / np.linalg.norm(FIELD)
 
 
-def test_a_change_at_the_sensor_is_one_of_the_measurement():
+def test_a_change_at_the_sensor_changes_the_measurement():
     change = torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     view = Magnetometer().prepare(tumbling(600, sensor=change))
     theta = symmetric_truth(view.strength)
@@ -74,7 +74,7 @@ def test_a_change_at_the_sensor_is_one_of_the_measurement():
     assert float(view.residual(theta, {"sensor": lambda _: change}).abs().max()) < 1e-10
 
 
-def test_a_change_of_the_field_is_one_of_its_strength():
+def test_a_change_of_the_field_changes_its_strength():
     course = 1.0 + 0.005 * np.sin(np.arange(600) / 30.0)
     still = tumbling(600)
     measured = (still.magnetometer().numpy() - OFFSET) * course[:, None] + OFFSET
@@ -91,7 +91,7 @@ def test_the_signal_is_the_simulated_measurement(view):
     true = view.measured - torch.from_numpy(OFFSET)
     normal = (true @ torch.from_numpy(true_matrix(1.0) @ true_matrix(1.0))).numpy()
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # noise along the surface stays, for the length knows nothing of it; that across it is gone
+    # noise along the surface stays, because the length does not contain it; noise across it is removed
     assert np.abs(((signal - true).numpy() * normal).sum(-1)).max() < 0.05
     across = ((noisy.measured - view.measured).numpy() * normal).sum(-1)
     assert np.abs(across).max() > 0.5
@@ -112,7 +112,7 @@ def test_without_times_the_samples_are_numbered():
     assert torch.equal(view.time, torch.arange(600, dtype=torch.float64))
 
 
-def test_samples_are_sorted_and_those_that_are_not_finite_left_out():
+def test_samples_are_sorted_and_finite():
     recording = tumbling(600)
     mag_x = recording["mag_x"].clone()
     mag_x[7] = torch.nan
@@ -126,7 +126,7 @@ def test_samples_are_sorted_and_those_that_are_not_finite_left_out():
     assert "Dropped 1 of 600 samples" in " ".join(view.recording.warnings)
 
 
-def test_a_turn_about_one_axis_is_refused_by_the_directions_it_lacks():
+def test_a_turn_about_a_single_axis_is_refused_with_the_missing_directions():
     with pytest.raises(NotIdentifiableError, match=r"Directions not covered: \+z .*; -z"):
         Magnetometer().prepare(tumbling(500, noise=0.3, size=(1.0, 0.0, 0.0)))
 
@@ -147,7 +147,7 @@ def test_columns_that_are_missing_are_named():
         Magnetometer(use="gyro").prepare(changed(tumbling(100, gyro=True), time=None))
 
 
-def test_the_view_can_be_asked_for():
+def test_the_view_can_be_requested():
     recording = tumbling(600, gyro=True, attitude=True)
     views = {use: Magnetometer(use=use).prepare(recording).view for use in (None, "norm", "gyro", "attitude")}
     assert views == {None: "attitude", "norm": "norm", "gyro": "gyro", "attitude": "attitude"}
@@ -156,17 +156,17 @@ def test_the_view_can_be_asked_for():
         Magnetometer(use="compass").prepare(recording)
 
 
-def test_columns_of_its_own_drive_nothing():
+def test_own_columns_do_not_drive_effects():
     assert Magnetometer().columns == {
         "time", "mag_x", "mag_y", "mag_z", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z",
         "q_w", "q_x", "q_y", "q_z",
     }  # fmt: skip
 
 
-def test_samples_that_draw_no_surface_are_a_start_too():
-    """An effect that is sought may move them as widely as the noise does here."""
+def test_samples_without_a_surface_give_a_start():
+    """An effect may scatter the samples as widely as the noise here."""
     recording = tumbling(3000, noise=14.0)
-    with pytest.raises(NotIdentifiableError, match="draw no surface"):
+    with pytest.raises(NotIdentifiableError, match="Not identifiable"):
         EllipsoidFit(LeastTrimmedSquares()).fit(recording.magnetometer())
     start = Magnetometer("norm").prepare(recording).start()
     assert np.abs(start[:3].numpy() - OFFSET).max() < 5.0

@@ -20,14 +20,14 @@ def _pointwise(build: Callable[..., int], values: Sequence[Any], dtype: torch.dt
     trace = next(value.tracing for value in values if isinstance(value, Symbol))
     parts = [as_nodes(value, trace) for value in values]
     shape = torch.broadcast_shapes(*(part.shape for part in parts))
-    moments = {len(shape) - len(part.shape) + part.moments for part in parts if part.moments is not None}
-    if len(moments) > 1:
-        raise UntraceableError("moments against moments")
+    time_axes = {len(shape) - len(part.shape) + part.time_axis for part in parts if part.time_axis is not None}
+    if len(time_axes) > 1:
+        raise UntraceableError("two different time axes")
     built = np.frompyfunc(lambda *arguments: build(trace.expressions, *arguments), len(parts), 1)(
         *(part.nodes for part in parts)
     )
     nodes: Nodes = np.asarray(built).astype(np.int64)
-    return Symbol(trace, nodes, shape, moments.pop() if moments else None, dtype or torch.float64)
+    return Symbol(trace, nodes, shape, time_axes.pop() if time_axes else None, dtype or torch.float64)
 
 
 def _operation(name: str, dtype: torch.dtype | None = None) -> Callable[..., Symbol]:

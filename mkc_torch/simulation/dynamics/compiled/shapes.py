@@ -21,17 +21,17 @@ def _axis(dim: int, count: int) -> int:
     return dim + count if dim < 0 else dim
 
 
-def _not_moments(symbol: Symbol, dim: int) -> int:
-    """The index of an axis; raise where it is the axis of moments."""
+def _other_axis(symbol: Symbol, dim: int) -> int:
+    """The index of an axis; raise where it is the time axis."""
     axis = _axis(dim, symbol.dim())
-    if axis == symbol.moments or symbol.packed is not None:
-        raise UntraceableError("an operation along the moments")
+    if axis == symbol.time_axis or symbol.packed is not None:
+        raise UntraceableError("an operation along the time axis")
     return axis
 
 
 def _unchanged(symbol: Symbol, *_: Any, **__: Any) -> Symbol:
     """A new symbol with the same values."""
-    return Symbol(symbol.tracing, symbol.nodes, symbol.shape, symbol.moments, symbol.dtype, symbol.packed)
+    return Symbol(symbol.tracing, symbol.nodes, symbol.shape, symbol.time_axis, symbol.dtype, symbol.packed)
 
 
 def _filled(value: float) -> Callable[..., Any]:
@@ -39,7 +39,7 @@ def _filled(value: float) -> Callable[..., Any]:
         if symbol.packed is not None:
             raise UntraceableError("flattened channels")
         nodes = np.full(symbol.nodes.shape, symbol.expressions.number(value), dtype=np.int64)
-        return Symbol(symbol.tracing, nodes, tuple(symbol.shape), symbol.moments)
+        return Symbol(symbol.tracing, nodes, tuple(symbol.shape), symbol.time_axis)
 
     return like
 
@@ -69,12 +69,12 @@ def _view(symbol: Symbol, size: Sequence[int]) -> Symbol:
         matrix, nodes = symbol.packed
         product = _product(symbol, matrix.unflatten(0, shape), nodes)
         return symbol.like(product, shape, 0)
-    if symbol.moments is None:
+    if symbol.time_axis is None:
         return symbol.like(symbol.nodes.reshape(shape), shape, None)
-    before, length = math.prod(symbol.shape[: symbol.moments]), symbol.shape[symbol.moments]
+    before, length = math.prod(symbol.shape[: symbol.time_axis]), symbol.shape[symbol.time_axis]
     places = [k for k, size in enumerate(shape) if size == length and math.prod(shape[:k]) == before]
     if not places:
-        raise UntraceableError("a view that mixes the moments")
+        raise UntraceableError("a view that mixes the time axis with others")
     nodes = symbol.nodes.reshape([1 if k == places[0] else size for k, size in enumerate(shape)])
     return symbol.like(nodes, shape, places[0])
 
@@ -83,9 +83,9 @@ def _unsqueeze(symbol: Symbol, dim: int) -> Symbol:
     if symbol.packed is not None:
         raise UntraceableError("flattened channels")
     axis = _axis(dim, symbol.dim() + 1)
-    moments = None if symbol.moments is None else symbol.moments + (symbol.moments >= axis)
+    time_axis = None if symbol.time_axis is None else symbol.time_axis + (symbol.time_axis >= axis)
     shape = [*symbol.shape[:axis], 1, *symbol.shape[axis:]]
-    return symbol.like(np.expand_dims(symbol.nodes, axis), shape, moments)
+    return symbol.like(np.expand_dims(symbol.nodes, axis), shape, time_axis)
 
 
 def _squeeze(symbol: Symbol, dim: int | Sequence[int] | None = None) -> Symbol:
@@ -93,16 +93,16 @@ def _squeeze(symbol: Symbol, dim: int | Sequence[int] | None = None) -> Symbol:
         dims = list(range(symbol.dim()))
     else:
         dims = [_axis(k, symbol.dim()) for k in ((dim,) if isinstance(dim, int) else dim)]
-    gone = tuple(k for k in dims if symbol.shape[k] == 1 and k != symbol.moments)
-    moments = None if symbol.moments is None else symbol.moments - sum(k < symbol.moments for k in gone)
-    return symbol.like(symbol.nodes.squeeze(gone), [n for k, n in enumerate(symbol.shape) if k not in gone], moments)
+    gone = tuple(k for k in dims if symbol.shape[k] == 1 and k != symbol.time_axis)
+    time_axis = None if symbol.time_axis is None else symbol.time_axis - sum(k < symbol.time_axis for k in gone)
+    return symbol.like(symbol.nodes.squeeze(gone), [n for k, n in enumerate(symbol.shape) if k not in gone], time_axis)
 
 
 def _select(symbol: Symbol, dim: int, index: int) -> Symbol:
-    axis = _not_moments(symbol, dim)
-    moments = None if symbol.moments is None else symbol.moments - (symbol.moments > axis)
+    axis = _other_axis(symbol, dim)
+    time_axis = None if symbol.time_axis is None else symbol.time_axis - (symbol.time_axis > axis)
     shape = [*symbol.shape[:axis], *symbol.shape[axis + 1 :]]
-    return symbol.like(np.asarray(symbol.nodes.take(index, axis)), shape, moments)
+    return symbol.like(np.asarray(symbol.nodes.take(index, axis)), shape, time_axis)
 
 
 def _slice(symbol: Symbol, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1) -> Symbol:
@@ -110,19 +110,19 @@ def _slice(symbol: Symbol, dim: int = 0, start: int | None = None, end: int | No
     kept = range(symbol.shape[axis])[slice(start, end, step)]
     if len(kept) == symbol.shape[axis] and step == 1:
         return _unchanged(symbol)
-    axis = _not_moments(symbol, axis)
+    axis = _other_axis(symbol, axis)
     nodes = symbol.nodes[(slice(None),) * axis + (slice(start, end, step),)]
     shape = [*symbol.shape[:axis], len(kept), *symbol.shape[axis + 1 :]]
-    return symbol.like(nodes, shape, symbol.moments)
+    return symbol.like(nodes, shape, symbol.time_axis)
 
 
 def _unbind(symbol: Symbol, dim: int = 0) -> list[Symbol]:
-    axis = _not_moments(symbol, dim)
+    axis = _other_axis(symbol, dim)
     return [_select(symbol, axis, k) for k in range(symbol.shape[axis])]
 
 
 def _split(symbol: Symbol, sizes: int | Sequence[int], dim: int = 0) -> list[Symbol]:
-    axis = _not_moments(symbol, dim)
+    axis = _other_axis(symbol, dim)
     whole = symbol.shape[axis]
     if isinstance(sizes, int):
         sizes = [min(sizes, whole - k) for k in range(0, whole, sizes)]
@@ -136,25 +136,27 @@ def _expand(symbol: Symbol, size: Sequence[int], **_: Any) -> Symbol:
     more = len(size) - symbol.dim()
     old = (*(1,) * more, *symbol.shape)
     shape = [had if new == -1 else new for had, new in zip(old, size, strict=True)]
-    moments = None if symbol.moments is None else symbol.moments + more
-    if moments is None:
-        # a constant is repeated for each moment: the axis of moments is new
+    time_axis = None if symbol.time_axis is None else symbol.time_axis + more
+    if time_axis is None:
+        # a constant is repeated for each time: the time axis is new
         grown = [
             k
             for k, (had, new) in enumerate(zip(old, shape, strict=True))
             if had != new and new in symbol.tracing.lengths
         ]
-        moments = grown[0] if grown else None
-    full = [1 if k == moments else new for k, new in enumerate(shape)]
-    return symbol.like(np.broadcast_to(symbol.nodes.reshape([*(1,) * more, *symbol.nodes.shape]), full), shape, moments)
+        time_axis = grown[0] if grown else None
+    full = [1 if k == time_axis else new for k, new in enumerate(shape)]
+    return symbol.like(
+        np.broadcast_to(symbol.nodes.reshape([*(1,) * more, *symbol.nodes.shape]), full), shape, time_axis
+    )
 
 
 def _permute(symbol: Symbol, dims: Sequence[int]) -> Symbol:
     if symbol.packed is not None:
         raise UntraceableError("flattened channels")
     order = [_axis(k, symbol.dim()) for k in dims]
-    moments = None if symbol.moments is None else order.index(symbol.moments)
-    return symbol.like(symbol.nodes.transpose(order), [symbol.shape[k] for k in order], moments)
+    time_axis = None if symbol.time_axis is None else order.index(symbol.time_axis)
+    return symbol.like(symbol.nodes.transpose(order), [symbol.shape[k] for k in order], time_axis)
 
 
 def _transpose(symbol: Symbol, first: int = 0, second: int = 1) -> Symbol:
@@ -172,10 +174,10 @@ def _index(symbol: Symbol, indices: Sequence[Tensor | None]) -> Symbol:
     chosen = [(k, index) for k, index in enumerate(indices) if index is not None]
     if len(chosen) != 1 or isinstance(chosen[0][1], Symbol) or chosen[0][1].dim() != 1:
         raise UntraceableError("an index of several axes")
-    axis = _not_moments(symbol, chosen[0][0])
+    axis = _other_axis(symbol, chosen[0][0])
     index = chosen[0][1].numpy()
     nodes = symbol.nodes[(slice(None),) * axis + (index,)]
-    return symbol.like(nodes, [*symbol.shape[:axis], nodes.shape[axis], *symbol.shape[axis + 1 :]], symbol.moments)
+    return symbol.like(nodes, [*symbol.shape[:axis], nodes.shape[axis], *symbol.shape[axis + 1 :]], symbol.time_axis)
 
 
 def _joined(values: Sequence[Any], dim: int, join: Callable[[Sequence[Nodes], int], Nodes], new_axis: bool) -> Symbol:
@@ -183,18 +185,18 @@ def _joined(values: Sequence[Any], dim: int, join: Callable[[Sequence[Nodes], in
     parts = [as_nodes(value, like.tracing) for value in values]
     parts = [part for part in parts if new_axis or part.shape != (0,)]
     axis = _axis(dim, len(parts[0].shape) + new_axis)
-    moments = next((part.moments for part in parts if part.moments is not None), None)
-    if not new_axis and axis == moments:
-        raise UntraceableError("moments after moments")
-    if any(part.moments != moments for part in parts):
-        raise UntraceableError("moments combined with other numbers")
+    time_axis = next((part.time_axis for part in parts if part.time_axis is not None), None)
+    if not new_axis and axis == time_axis:
+        raise UntraceableError("concatenation along the time axis")
+    if any(part.time_axis != time_axis for part in parts):
+        raise UntraceableError("arguments with and without a time axis")
     nodes = join([part.nodes for part in parts], axis)
     total = len(parts) if new_axis else sum(part.shape[axis] for part in parts)
     shape = list(parts[0].shape)
     shape[axis : axis + (not new_axis)] = [total]
-    if moments is not None and new_axis:
-        moments += moments >= axis
-    return like.like(nodes, shape, moments)
+    if time_axis is not None and new_axis:
+        time_axis += time_axis >= axis
+    return like.like(nodes, shape, time_axis)
 
 
 def _stack(values: Sequence[Any], dim: int = 0) -> Symbol:
@@ -217,16 +219,16 @@ def _added(e: Expressions, nodes: Nodes, axis: int) -> Nodes:
 
 def _sum(symbol: Symbol, dim: Sequence[int] | None = None, keepdim: bool = False, **_: Any) -> Symbol:
     dims = dim if dim else range(symbol.dim())
-    axes = sorted((_not_moments(symbol, k) for k in dims), reverse=True)
-    nodes, shape, moments = symbol.nodes, list(symbol.shape), symbol.moments
+    axes = sorted((_other_axis(symbol, k) for k in dims), reverse=True)
+    nodes, shape, time_axis = symbol.nodes, list(symbol.shape), symbol.time_axis
     for axis in axes:
         nodes = _added(symbol.expressions, nodes, axis)
         if keepdim:
             nodes, shape[axis] = np.expand_dims(nodes, axis), 1
         else:
             del shape[axis]
-            moments = None if moments is None else moments - (moments > axis)
-    return symbol.like(nodes, shape, moments)
+            time_axis = None if time_axis is None else time_axis - (time_axis > axis)
+    return symbol.like(nodes, shape, time_axis)
 
 
 def _product(like: Symbol, rows: Any, vector: Nodes) -> Nodes:
@@ -238,20 +240,20 @@ def _product(like: Symbol, rows: Any, vector: Nodes) -> Nodes:
 
 
 def _mv(matrix: Any, vector: Any) -> Symbol:
-    """Multiply a matrix, which may have a row for each moment, by a vector."""
+    """Multiply a matrix, which may have a row for each time, by a vector."""
     like = matrix if isinstance(matrix, Symbol) else vector
-    nodes, _, moments = as_nodes(vector, like.tracing)
-    if moments is not None:
-        raise UntraceableError("a sum over the moments")
+    nodes, _, time_axis = as_nodes(vector, like.tracing)
+    if time_axis is not None:
+        raise UntraceableError("a sum over the time axis")
     if not isinstance(matrix, Symbol) and any(
         len(matrix) % size == 0 and len(matrix) > size for size in like.tracing.lengths
     ):
-        # the channels of each moment, in sequence
+        # the channels of each time, in sequence
         return Symbol(like.tracing, np.zeros(0, np.int64), (len(matrix),), None, packed=(matrix, nodes))
     own = as_nodes(matrix, like.tracing)
-    if own.moments == 1:
-        raise UntraceableError("a sum over the moments")
-    return like.like(_product(like, matrix, nodes), own.shape[:1], own.moments)
+    if own.time_axis == 1:
+        raise UntraceableError("a sum over the time axis")
+    return like.like(_product(like, matrix, nodes), own.shape[:1], own.time_axis)
 
 
 def _mm(left: Any, right: Any) -> Symbol:

@@ -1,4 +1,4 @@
-"""A tensor without values that records operations as scalar expressions for each moment (station or sample)."""
+"""A tensor without values that records operations as scalar expressions for each time (station or sample)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 __all__ = ["Nodes", "Part", "Symbol", "Trace", "UntraceableError", "as_nodes", "parameter_symbol", "state_symbol"]
 
 Nodes = NDArray[np.int64]
-"""Nodes in the shape of a tensor, with length 1 along its axis of moments."""
+"""Nodes in the shape of a tensor, with length 1 along its time axis."""
 
 
 class UntraceableError(RuntimeError):
-    """A function that uses values, mixes moments, or has an operation without a rule."""
+    """A function that uses values, mixes times, or has an operation without a rule."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Trace:
 
     Attributes:
         expressions: the expressions that hold their nodes.
-        lengths: lengths of an axis that mark it as the axis of moments.
+        lengths: lengths of an axis that mark it as the time axis.
         operations: torch's operations on symbols, by name.
     """
 
@@ -39,18 +39,18 @@ class Trace:
 
 
 class Symbol(Tensor):
-    """A tensor of expressions, an expression for each element; elements along the axis of moments share it.
+    """A tensor of expressions, an expression for each element; elements along the time axis share it.
 
     Attributes:
         tracing: the trace of the function.
         nodes: nodes of the elements.
-        moments: the axis of moments; None without such an axis.
-        packed: a matrix and nodes whose product is this tensor, if channels and moments share an axis; else None.
+        time_axis: the time axis; None without such an axis.
+        packed: a matrix and nodes whose product is this tensor, if channels and times share an axis; else None.
     """
 
     tracing: Trace
     nodes: Nodes
-    moments: int | None
+    time_axis: int | None
     packed: tuple[Tensor, Nodes] | None
 
     @staticmethod
@@ -59,20 +59,20 @@ class Symbol(Tensor):
         trace: Trace,
         nodes: Nodes,
         shape: Sequence[int],
-        moments: int | None,
+        time_axis: int | None,
         dtype: torch.dtype = torch.float64,
         packed: tuple[Tensor, Nodes] | None = None,
     ) -> Symbol:
         symbol = Tensor._make_wrapper_subclass(cls, torch.Size(shape), dtype=dtype)
-        symbol.tracing, symbol.nodes, symbol.moments, symbol.packed = trace, nodes, moments, packed
+        symbol.tracing, symbol.nodes, symbol.time_axis, symbol.packed = trace, nodes, time_axis, packed
         return symbol
 
     def __repr__(self) -> str:  # type: ignore[override]
         return f"Symbol{tuple(self.shape)}"
 
-    def like(self, nodes: Nodes, shape: Sequence[int], moments: int | None) -> Symbol:
+    def like(self, nodes: Nodes, shape: Sequence[int], time_axis: int | None) -> Symbol:
         """Another tensor of the same function."""
-        return Symbol(self.tracing, nodes, shape, moments, self.dtype)
+        return Symbol(self.tracing, nodes, shape, time_axis, self.dtype)
 
     @property
     def expressions(self) -> Expressions:
@@ -114,24 +114,24 @@ def state_symbol(trace: Trace, length: int, count: int) -> Symbol:
 
 
 class Part(NamedTuple):
-    """An argument of an operation: its nodes, its shape, and its axis of moments."""
+    """An argument of an operation: its nodes, its shape, and its time axis."""
 
     nodes: Nodes
     shape: tuple[int, ...]
-    moments: int | None
+    time_axis: int | None
 
 
 def as_nodes(value: object, trace: Trace) -> Part:
     """Convert an argument of an operation, a symbol, a number or a tensor of constants, to nodes.
 
     Raises:
-        UntraceableError: a matrix over the moments, a large constant, a constant in single precision, or another type.
+        UntraceableError: a matrix with two time axes, a large or single-precision constant, or another type.
     """
     expressions, lengths = trace.expressions, trace.lengths
     if isinstance(value, Symbol):
         if value.packed is not None:
             raise UntraceableError("flattened channels")
-        return Part(value.nodes, tuple(value.shape), value.moments)
+        return Part(value.nodes, tuple(value.shape), value.time_axis)
     if isinstance(value, bool | int | float):
         return Part(np.array(expressions.number(value)), (), None)
     if not isinstance(value, Tensor):
@@ -144,7 +144,7 @@ def as_nodes(value: object, trace: Trace) -> Part:
         array = array.astype(np.float64)
     axes = [axis for axis, size in enumerate(shape) if size in lengths]
     if len(axes) > 1:
-        raise UntraceableError("a matrix over the moments")
+        raise UntraceableError("a matrix with two time axes")
     if not axes:
         if array.size > _LARGEST_CONSTANT:
             raise UntraceableError("a large constant")
@@ -159,7 +159,7 @@ def as_nodes(value: object, trace: Trace) -> Part:
 
 
 _LARGEST_CONSTANT = 4096
-"""Elements of a constant at each moment, at most."""
+"""Elements of a constant at each time, at most."""
 
 
 def _constant(expressions: Expressions, values: NDArray[Any]) -> int:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Traceable", "Traced", "traced"]
 
 _FEWEST = 16
-"""Smallest number of samples, plus the number of parameters, that distinguishes the axis of moments from others."""
+"""Smallest number of samples, plus the number of parameters, that distinguishes the time axis from other axes."""
 
 
 class Traceable(Protocol):
@@ -116,8 +116,8 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     leaves = [e.leaf("state", k) for k in range(width)], [e.leaf("parameter", k) for k in range(size)]
 
     def block(value: Tensor, length: int, arranged: Callable[[Array], Array]) -> CompiledBlock:
-        nodes, shape, moments = as_nodes(value, trace)
-        if len(shape) != 2 or shape[0] != length or moments != 0:
+        nodes, shape, time_axis = as_nodes(value, trace)
+        if len(shape) != 2 or shape[0] != length or time_axis != 0:
             raise UntraceableError(f"a result of shape {shape}")
         return CompiledBlock(e, nodes[0].tolist(), *leaves, arranged)
 

@@ -44,7 +44,7 @@ def filter_samples(
         place: (B, D), index of the rate, or p plus index of the output, that a lasting disturbance acts on.
         variance: (B, m), of each output's white noise.
         clip: standard deviations at which innovations are clipped.
-        hard_clip: whether innovations within the clip are left as they are, instead of shrunk by a hyperbolic tangent.
+        hard_clip: whether innovations below the limit pass unchanged, instead of clipping by a hyperbolic tangent.
         state, P: (G, B, k) and (G, B, k, k), at the first sample; on return, after the last sample.
         left: (G, B, k, k), derivative of the error by an error of the first state; empty if not wanted.
         standard, spread: (L, G, B, m), the standardised innovations and their standard deviations.

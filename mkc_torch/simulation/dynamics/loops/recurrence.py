@@ -15,10 +15,10 @@ def pass_on(carries: Any, values: Any) -> None:
         values: v, (w, K, G); δ on return.
     """
     w, K, G = values.shape
-    for moment in range(1, G):
+    for k in range(1, G):
         for i in range(w):
             for j in range(w):
-                a = carries[i, j, moment]
+                a = carries[i, j, k]
                 if a != 0.0:
                     for s in range(K):
-                        values[i, s, moment] += a * values[j, s, moment - 1]
+                        values[i, s, k] += a * values[j, s, k - 1]

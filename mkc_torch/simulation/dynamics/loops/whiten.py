@@ -25,7 +25,7 @@ def whiten_samples(
     """Whiten K series of N samples under B noise models; writes into ``start`` and ``out``.
 
     Args:
-        transition, noise_input: (M, n, n) and (M, n, p), of the flow; M is N where more samples follow, and N-1 otherwise.
+        transition, noise_input: (M, n, n) and (M, n, p), of the flow; M is N where more samples follow, else N-1.
         phi: (M, B, D), share of a lasting disturbance that remains at the next sample.
         place: (B, D), index of the rate, or p plus index of the output, that a lasting disturbance acts on.
         seen: (N, m, n), derivative of the outputs by the states.

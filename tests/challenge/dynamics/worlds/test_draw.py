@@ -62,7 +62,7 @@ def test_nothing_is_hidden_in_an_empty_case(name):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", ["white", "gusts", "held"])
-def test_a_push_acts_in_every_second_case_with_something_hidden(name):
+def test_a_disturbance_acts_in_every_second_case_with_hidden_physics(name):
     keys = [SCENARIOS[name].draw(3, index, True, index).key for index in range(2)]
     assert [key.disturbance is not None for key in keys] == [True, False]
     assert all(len(key.key.effects) == 1 for key in keys)
@@ -70,7 +70,7 @@ def test_a_push_acts_in_every_second_case_with_something_hidden(name):
 
 
 @pytest.mark.e2e
-def test_a_push_makes_a_hidden_effect_harder_to_see():
+def test_a_disturbance_makes_a_hidden_effect_harder_to_detect():
     """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
     from mkc_torch.challenge.dynamics.errors import draw_errors
     from mkc_torch.challenge.dynamics.oracle import power
@@ -126,7 +126,7 @@ def recorded_runs(recording):
 @pytest.mark.e2e
 @pytest.mark.parametrize(("name", "runs"), [("lasting_push", 1), ("lasting_push_runs", 4)])
 @pytest.mark.parametrize("hidden", [False, True])
-def test_a_push_that_lasts_acts_in_every_recording_for_about_a_run(name, runs, hidden):
+def test_a_lasting_disturbance_acts_in_every_recording_for_about_a_run(name, runs, hidden):
     for index in range(3):
         case = SCENARIOS[name].draw(3, index, hidden, index)
         assert recorded_runs(case.recording) == runs
@@ -140,7 +140,7 @@ def test_a_push_that_lasts_acts_in_every_recording_for_about_a_run(name, runs, h
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("hidden", [False, True])
-def test_a_sensor_errs_slowly_for_one_to_ten_per_cent_of_a_run_and_nothing_pushes(hidden):
+def test_a_sensor_drifts_for_one_to_ten_per_cent_of_a_run_without_disturbance(hidden):
     for index in range(4):
         case = SCENARIOS["slow_sensor"].draw(3, index, hidden, index)
         key, time = case.key, case.recording["time"]
@@ -163,7 +163,7 @@ def test_runs_are_several_and_throws_have_nothing_to_hold():
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_far_starts_are_ten_times_off_and_the_true_ones_are_not(index, tmp_path):
+def test_far_starts_are_ten_times_off(index, tmp_path):
     case = SCENARIOS["far_starts"].draw(3, index, False, 0)
     system = case.key.key.mode
     name = "".join(word.capitalize() for word in system.split("_"))

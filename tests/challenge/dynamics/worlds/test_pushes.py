@@ -41,7 +41,7 @@ def test_white_force_noise_is_independent_and_its_integral_does_not_depend_on_th
         assert steps.var() / STEP == pytest.approx(1.0, rel=0.03)
 
 
-def test_a_slow_push_forgets_exponentially():
+def test_a_slow_disturbance_decorrelates_exponentially():
     many = slow(generator(2), trial(200, 4000), 2)  # the correlation over an ensemble
     constant = many.words["correlation time"]
     assert SLOW[0] <= constant / (199 * STEP) <= SLOW[1]
@@ -53,7 +53,7 @@ def test_a_slow_push_forgets_exponentially():
         assert many.covariance[0, 0, lag] == pytest.approx(np.exp(-lag * STEP / constant))
 
 
-def test_a_lasting_push_is_one_that_forgets_within_a_run_or_so():
+def test_a_lasting_disturbance_decorrelates_within_about_a_run():
     many = KINDS["lasting_push_runs"](generator(2), trial(100, 4000), 1)
     constant = many.words["correlation time"]
     assert LASTING[0] <= constant / (99 * STEP) <= LASTING[1]
@@ -74,7 +74,7 @@ def test_gusts_are_level_in_some_stretches_and_absent_in_others():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("system", ["pendulum", "cart_pole", "thermal"])
-def test_a_push_is_in_the_rate_of_its_state_and_of_size_nought_is_not_there(system, kind):
+def test_a_disturbance_is_in_the_rate_of_its_state_and_vanishes_at_size_0(system, kind):
     scene, errors = scene_of(system)
     plant = scene.plant
     disturbance = draw_disturbance(generator(4, kind), kind, scene, errors)
@@ -87,11 +87,13 @@ def test_a_push_is_in_the_rate_of_its_state_and_of_size_nought_is_not_there(syst
     # in the first fine step nothing but that state has moved to first order
     first = simulate(plant, scene.trial, disturbance=disturbance.rates).states[:, 1] - scene.course.states[:, 1]
     step = scene.trial.step / plant.fine
-    np.testing.assert_allclose(first[plant.row(disturbance.state)], step * disturbance.rates[plant.row(disturbance.state), 0], rtol=0.2)
+    np.testing.assert_allclose(
+        first[plant.row(disturbance.state)], step * disturbance.rates[plant.row(disturbance.state), 0], rtol=0.2
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_a_push_leaves_in_the_fitted_run_is_what_the_key_says(kind):
+def test_the_residual_of_a_disturbance_in_the_fitted_run_is_that_of_the_key(kind):
     scene, errors = scene_of("tanks")
     disturbance = draw_disturbance(generator(5, kind), kind, scene, errors)
     moved = simulate(scene.plant, scene.trial, disturbance=disturbance.rates).outputs - scene.course.outputs
@@ -121,7 +123,7 @@ def test_responses_are_those_of_the_true_system(system):
 
 
 @pytest.mark.e2e
-def test_under_a_push_traces_that_look_like_it_weigh_less():
+def test_traces_similar_to_the_disturbance_have_less_weight():
     """Draws of noise and push together are white of variance one in that metric, in the mean over many."""
     scene, errors = scene_of("tanks")
     errors = dataclasses.replace(errors, correlation=0.0, family="gaussian")

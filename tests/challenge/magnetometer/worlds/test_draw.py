@@ -48,14 +48,14 @@ def test_nothing_is_hidden_in_an_empty_case(name):
 
 
 @pytest.mark.parametrize("name", ["white", "bursts"])
-def test_the_offset_wanders_in_every_second_case_with_something_hidden(name):
+def test_the_offset_drifts_in_every_second_case_with_hidden_physics(name):
     keys = [SCENARIOS[name].draw(3, index, True, index).key for index in range(4)]
     assert [key.key.noise["walks"] is not None for key in keys] == [True, False, True, False]
     assert all(len(key.key.effects) == 1 for key in keys)
     assert all(key.key.effects[0].z > 0.0 for key in keys)
 
 
-def test_a_wander_goes_as_far_as_it_says():
+def test_a_drift_has_its_declared_size():
     noise = draw_noise(generator(1), 2000, 50.0)
     reach = []
     for seed in range(60):
@@ -104,7 +104,7 @@ def test_a_sensor_rests_in_many_orientations_and_is_turned_between():
     assert float(motion.rotation[..., 2].abs().max(0).values.min()) > 0.8
 
 
-def test_useless_views_are_asked_for_and_differ_from_the_truth(tmp_path):
+def test_unusable_views_are_requested_and_differ_from_the_truth(tmp_path):
     views = []
     for index in range(4):
         case = SCENARIOS["useless"].draw(3, index, False, index)
@@ -133,7 +133,7 @@ def turned_along(recording, sign):
     return float(torch.nn.functional.cosine_similarity(change, told, dim=-1).median())
 
 
-def test_the_wrong_sign_is_wrong_and_another_gyroscope_tells_nothing():
+def test_a_wrong_or_foreign_gyroscope_does_not_fit():
     wrong, other = (SCENARIOS["useless"].draw(3, index, False, index).recording for index in (1, 2))
     assert turned_along(wrong, -1.0) > 0.8
     assert turned_along(wrong, 1.0) < -0.8

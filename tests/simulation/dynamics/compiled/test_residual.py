@@ -134,7 +134,7 @@ def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
         nearby = theirs.nearby.bare
     neighbour = compiled.answer(0.999 * parameters, nearby).nearby
     assert neighbour is not None
-    for near in (neighbour, beside.bare, nearby, None):
+    for near in (neighbour, neighbour.bare, nearby, None):
         ours = compiled.answer(parameters, near)
         torch.testing.assert_close(
             ours.residual, theirs.residual, rtol=0, atol=rtol * float(theirs.residual.abs().max())

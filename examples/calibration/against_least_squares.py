@@ -1,6 +1,6 @@
-"""MKC-EM beside least squares on any recordings: what robustness costs where nothing disturbs.
+"""Compare MKC-EM with least squares on any recordings: the cost of robustness without disturbances.
 
-python examples/calibration/least_squares_beside.py RECORDING.csv ...
+python examples/calibration/against_least_squares.py RECORDING.csv ...
 """
 
 from __future__ import annotations
