@@ -53,7 +53,7 @@ class WrongAnswerError(Exception):
 def mkc(folder: Path, *arguments: str, exit_codes: tuple[int, ...] = (1, 2)) -> str:
     """What a command says of its arguments, of which those that begin with @ are files of the folder."""
     there = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    given = [str(folder / one[1:]) if one.startswith("@") else one for one in arguments]
+    given = [str(folder / item[1:]) if item.startswith("@") else item for item in arguments]
     done = CliRunner().invoke(app, given)
     if done.exit_code not in exit_codes or not isinstance(done.exception, (SystemExit, type(None))):
         raise WrongAnswerError(f"{arguments}: exit code {done.exit_code}, {done.exception!r}\n{done.output}")

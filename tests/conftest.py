@@ -21,7 +21,7 @@ if not torch.cuda.is_available():
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file():
     """Tests hold no doctests: with --doctest-modules every one of their files would be collected twice."""
-    return [one for one in (yield) if not isinstance(one, DoctestModule)]
+    return [item for item in (yield) if not isinstance(item, DoctestModule)]
 
 
 @pytest.fixture(scope="session", autouse=True)

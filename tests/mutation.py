@@ -101,7 +101,8 @@ def mutant_of(path: Path, number: int) -> Mutant:
 
 def _lines_of_statement(tree: ast.AST, node: ast.AST) -> range:
     """Lines of the innermost statement around a node, without the statements within it."""
-    inner = [one for one in ast.walk(tree) if isinstance(one, ast.stmt) and any(each is node for each in ast.walk(one))]
+    statements = [entry for entry in ast.walk(tree) if isinstance(entry, ast.stmt)]
+    inner = [entry for entry in statements if any(each is node for each in ast.walk(entry))]
     statement = inner[-1]  # ast.walk goes from the outside inwards
     body = getattr(statement, "body", [])
     return range(statement.lineno, body[0].lineno if body else statement.end_lineno + 1)
@@ -258,20 +259,20 @@ def main() -> None:
     parser.add_argument("tests", nargs="+", help="paths of the tests that should see a change")
     parser.add_argument("-n", type=int, default=0, help="how many are drawn; 0 tries all")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     left = 0
     with tempfile.TemporaryDirectory() as folder:
         go_to_a_copy(Path(folder).resolve())
-        room = Path("mkc_torch", asked.room)
+        room = Path("mkc_torch", options.room)
         files = sorted(room.rglob("*.py")) if room.is_dir() else [room]
         found = [place for file in files for place in places(file)]
-        if asked.n:
-            found = random.Random(asked.seed).sample(found, min(asked.n, len(found)))
-        reached = reach(asked.tests)
+        if options.n:
+            found = random.Random(options.seed).sample(found, min(options.n, len(found)))
+        reached = reach(options.tests)
         for number, (path, node) in enumerate(found, start=1):
             mutant = mutant_of(path, node)
             tests = reached.tests_of(mutant)
-            if survives(mutant, tests or asked.tests, reached.seconds):
+            if survives(mutant, tests or options.tests, reached.seconds):
                 left += 1
                 print(f"survives {len(tests)} tests: {mutant.change}", flush=True)
             if number % 10 == 0:

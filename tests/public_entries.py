@@ -1,4 +1,4 @@
-"""Every public entry with arguments that fit, and ways to spoil one of them."""
+"""Every public entry with arguments that fit, and ways to contaminate each of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Entry:
     Attributes:
         names: what is public of it, by module.
         call: what is asked of it.
-        arguments: that fit; those of ``fixed`` are not spoilt.
+        arguments: that fit; those of ``fixed`` stay as they are.
         passes: arguments of which NaN goes through, as the docstring says, or that the user's own function is given.
     """
 
@@ -106,11 +106,11 @@ def entries() -> Iterator[Entry]:
     yield Entry(
         ("density.MKCDistribution",),
         lambda sigma, d, bound, loc, value: (
-            (one := density.MKCDistribution(sigma, d, bound, loc)).log_prob(value),
-            one.cdf(value),
-            one.mean,
-            one.variance,
-            one.entropy(),
+            (item := density.MKCDistribution(sigma, d, bound, loc)).log_prob(value),
+            item.cdf(value),
+            item.mean,
+            item.variance,
+            item.entropy(),
         ),
         {**bounded, "loc": 0.1, "value": Y},
     )
@@ -173,10 +173,10 @@ def entries() -> Iterator[Entry]:
     yield Entry(
         ("losses.HeteroscedasticMKCLoss", "losses.MKCHead", "losses.MKCHeadOutput"),
         lambda bound, d_min, features, target: losses.HeteroscedasticMKCLoss(bound)(
-            (one := losses.MKCHead(3, 2, bound=bound, d_min=d_min).double()(features)).location,
+            (item := losses.MKCHead(3, 2, bound=bound, d_min=d_min).double()(features)).location,
             target,
-            one.sigma,
-            one.d,
+            item.sigma,
+            item.d,
         ),
         {"bound": 50.0, "d_min": 0.01, "features": X, "target": Y},
         passes=("features",),
@@ -201,7 +201,7 @@ def entries() -> Iterator[Entry]:
     )
     yield Entry(
         ("metrics.MKCNegativeLogLikelihood",),
-        lambda input, target: (one := MKCNegativeLogLikelihood(given())).update(input, target) or one.compute(),
+        lambda input, target: (item := MKCNegativeLogLikelihood(given())).update(input, target) or item.compute(),
         pair,
     )
     for name, options in LINEAR.items():
@@ -281,9 +281,9 @@ def entries() -> Iterator[Entry]:
     )
 
 
-def spoilt(value: Any) -> Iterator[tuple[str, Any]]:
+def contaminated(value: Any) -> Iterator[tuple[str, Any]]:
     """Ways in which a value does not fit: its name, and the value."""
-    yield "text", "spoilt"
+    yield "text", "contaminated"
     yield "object", object()
     if isinstance(value, Tensor):
         yield from _spoilt_tensors(value)
@@ -309,9 +309,9 @@ def _spoilt_tensors(value: Tensor) -> Iterator[tuple[str, Any]]:
         ("-1", -1.0),
         ("0", 0.0),
     ):
-        one = value.clone()
-        one.view(-1)[min(3, one.numel() - 1)] = number
-        yield f"one {name}", one
+        item = value.clone()
+        item.view(-1)[min(3, item.numel() - 1)] = number
+        yield f"one {name}", item
         yield f"all {name}", torch.full_like(value, number)
     yield "times 1e200", value * 1e200
     yield "times 1e-200", value * 1e-200

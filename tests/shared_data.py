@@ -1,4 +1,4 @@
-"""Real recordings, published tables and kept cases, which lie beside the project and are not part of it."""
+"""Real recordings, published tables and kept cases, in a folder next to the project, and not part of it."""
 
 from pathlib import Path
 

@@ -36,14 +36,14 @@ def test_they_are_many_and_differ():
 
 @pytest.mark.manual
 def test_each_message_is_a_sentence(found):
-    for bad, said in found:
-        assert re.search(r"[.:][)\"`]*$|\.$", said), (bad.given, said)
-        assert len(said) > 20, (bad.given, said)
-        assert "Traceback" not in said
-        assert not re.search(r"(?<!write )(?<!got )(?<!is )\bnan\b|\bNaN\b(?!: lower)", said), (bad.given, said)
-        assert not re.search(r"/tmp|\.py\"?, line|0x7f", said), said
+    for bad, message in found:
+        assert re.search(r"[.:][)\"`]*$|\.$", message), (bad.given, message)
+        assert len(message) > 20, (bad.given, message)
+        assert "Traceback" not in message
+        assert not re.search(r"(?<!write )(?<!got )(?<!is )\bnan\b|\bNaN\b(?!: lower)", message), (bad.given, message)
+        assert not re.search(r"/tmp|\.py\"?, line|0x7f", message), message
 
 
 @pytest.mark.manual
 def test_most_messages_differ(found):
-    assert len({said for _, said in found}) > 0.8 * len(found)
+    assert len({message for _, message in found}) > 0.8 * len(found)

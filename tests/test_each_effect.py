@@ -6,7 +6,7 @@ import pytest
 
 from mkc_torch.challenge.key import canonical
 from tests.gate import each_effect
-from tests.gate.each_effect import said_of, strong_cases
+from tests.gate.each_effect import score_case, strong_cases
 
 
 @pytest.fixture(scope="module")
@@ -17,8 +17,8 @@ def case():
 def says(folder, key, *effects):
     (folder / key.name).mkdir(exist_ok=True)
     findings = [{"effect": effect, "grade": "left_out", "channels": ["angle"]} for effect in effects]
-    told = {"verdict": "explained", "p_value": 0.01, "findings": findings}
-    (folder / key.name / "diagnosis.json").write_text(json.dumps(told), encoding="utf-8")
+    reported = {"verdict": "explained", "p_value": 0.01, "findings": findings}
+    (folder / key.name / "diagnosis.json").write_text(json.dumps(reported), encoding="utf-8")
 
 
 def test_the_requested_effect_is_hidden_and_detectable(case):
@@ -40,9 +40,9 @@ def test_an_effect_that_no_system_hides_has_no_recordings():
 def test_its_name_is_right_and_another_is_not(case, tmp_path):
     for effect, right in (("gravity_sag", True), ("backlash", False)):
         says(tmp_path, case.key, effect)
-        assert said_of(case.key, tmp_path) == (right, f"explained: {effect} at angle")
+        assert score_case(case.key, tmp_path) == (right, f"explained: {effect} at angle")
     says(tmp_path, case.key)
-    assert said_of(case.key, tmp_path) == (False, "explained: no name")
+    assert score_case(case.key, tmp_path) == (False, "explained: no name")
 
 
 def test_the_table_counts_names_and_an_earlier_diagnosis_is_kept(case, tmp_path, monkeypatch, capsys):

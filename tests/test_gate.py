@@ -17,8 +17,8 @@ from tests.gate.compare import differences
 from tests.gate.tables import compared_lines, count_lines, wrong_lines
 from tests.gate.work import Job, diagnosed
 
-REAL = {one.name: one.expected for one in known.real()}
-CASES = {one.name: one.expected for one in known.cases()}
+REAL = {case.name: case.expected for case in known.real()}
+CASES = {case.name: case.expected for case in known.cases()}
 ROCKET, PENDULUM = "real rocket juno Rocket", "real pendulum_encoder run Pendulum"
 
 
@@ -77,8 +77,8 @@ def test_stribeck_friction_may_be_an_alternative_and_no_claim():
     assert judged(row(finding("coulomb_friction", alternatives=["stribeck_friction"]), after=after), REAL[PENDULUM])[
         "right"
     ]
-    told = judged(row(finding("stribeck_friction", alternatives=["coulomb_friction"]), after=after), REAL[PENDULUM])
-    assert told["wrong"] == ["stribeck_friction is claimed"]
+    result = judged(row(finding("stribeck_friction", alternatives=["coulomb_friction"]), after=after), REAL[PENDULUM])
+    assert result["wrong"] == ["stribeck_friction is claimed"]
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if "coloured_sensor" in name])
@@ -95,8 +95,8 @@ def test_other_effects_that_are_needed_too():
         "real so101 recording",
     )
     assert judged(row(*found, after=after), REAL[servo])["right"]
-    told = judged(row(*found[:2], after=after), REAL[servo])["wrong"]
-    assert told == ["offset or gravity_sag is not claimed but backlash, delay"]
+    result = judged(row(*found[:2], after=after), REAL[servo])["wrong"]
+    assert result == ["offset or gravity_sag is not claimed but backlash, delay"]
 
 
 def test_a_claim_in_the_wrong_place_is_wrong():
@@ -109,14 +109,14 @@ def test_a_claim_in_the_wrong_place_is_wrong():
 
 
 def test_another_effect_claimed_first_is_wrong():
-    told = judged(row(finding("constant_force"), drag(), after={"altitude": 2.0}), REAL[ROCKET])["wrong"]
-    assert told == ["constant_force is claimed first"]
+    result = judged(row(finding("constant_force"), drag(), after={"altitude": 2.0}), REAL[ROCKET])["wrong"]
+    assert result == ["constant_force is claimed first"]
 
 
 def test_air_drag_that_would_explain_is_right_and_silence_is_wrong():
     coast = CASES["cases coastdown runs Coast"]
-    said = "quadratic_drag would explain what is left best, but noise and pushes make as much of it by chance."
-    assert judged(row(verdict="adequate", sentences=[said]), coast)["right"]
+    stated = "quadratic_drag would explain what is left best, but noise and pushes make as much of it by chance."
+    assert judged(row(verdict="adequate", sentences=[stated]), coast)["right"]
     assert not judged(row(verdict="adequate", sentences=["Use the simulation as it is."]), coast)["right"]
     assert judged(row(drag(0.0006, 1e-4)), coast)["right"]
     assert not judged(row(drag(0.0008, 1e-4)), coast)["right"]
@@ -133,19 +133,19 @@ def test_air_drag_that_would_explain_is_right_and_silence_is_wrong():
     ],
 )
 def test_where_nothing_is_to_be_named_the_verdict_decides(name, verdict):
-    for said in ("adequate", "unexplained", "unfit", "explained"):
-        assert judged(row(verdict=said), CASES[name])["right"] == (said == verdict)
+    for stated in ("adequate", "unexplained", "unfit", "explained"):
+        assert judged(row(verdict=stated), CASES[name])["right"] == (stated == verdict)
     assert not judged(row(finding("input_delay"), verdict=verdict), CASES[name])["right"]
 
 
 def test_recordings_have_unique_names_and_existing_files():
     everything = [*known.real(), *known.cases()]
-    assert len({one.name for one in everything}) == len(everything) == 29
-    arm = next(one for one in everything if "propeller_arm" in one.name)
+    assert len({case.name for case in everything}) == len(everything) == 29
+    arm = next(case for case in everything if "propeller_arm" in case.name)
     assert arm.request.input_hold == {"voltage": "held"}
     assert arm.request.simulation.endswith("propeller_arm/naive.py:Arm")
-    commanded = next(one for one in everything if one.name == "real so101 recording")
-    assert (commanded.request.simulation, commanded.request.simulated) == ("", commanded.file)
+    commanded = next(case for case in everything if case.name == "real so101 recording")
+    assert (commanded.request.simulation, commanded.request.simulator_output) == ("", commanded.file)
 
 
 def test_pairs_differ_in_verdict_names_sizes_and_residuals():
@@ -169,7 +169,7 @@ def test_pairs_differ_in_verdict_names_sizes_and_residuals():
     }
     assert differences(stored, found) == {
         "verdict": ["verdict explained -> unfit", "right True -> False"],
-        "grade": ["findings quadratic_drag (left out; rate of speed) -> quadratic_drag (not confirmed; rate of speed)"],
+        "grade": ["findings quadratic_drag (left_out; rate of speed) -> quadratic_drag (unconfirmed; rate of speed)"],
         "size": ["drag of quadratic_drag 9e-05 -> 9.1e-05"],
         "residual": ["residual of altitude 2 -> 17"],
     }
@@ -213,16 +213,16 @@ def test_the_command_counts_writes_and_compares(tmp_path, monkeypatch, capsys):
     recording = tmp_path / "juno.csv"
     recording.write_text("time,altitude\n", encoding="utf-8")
     (tmp_path / "naive.py").write_text("", encoding="utf-8")
-    one = known.Known(ROCKET, recording, f"{tmp_path / 'naive.py'}:Rocket", REAL[ROCKET])
+    present = known.Known(ROCKET, recording, f"{tmp_path / 'naive.py'}:Rocket", REAL[ROCKET])
     absent = known.Known("real away", tmp_path / "away.csv", f"{tmp_path / 'naive.py'}:Rocket", REAL[ROCKET])
-    said = row(drag(), after={"altitude": 2.0})
-    monkeypatch.setattr(known, "real", lambda: iter([one, absent]))
-    monkeypatch.setattr(gate, "diagnosed", lambda jobs, *_, **__: iter([(job.name, said) for job in jobs]))
+    stated = row(drag(), after={"altitude": 2.0})
+    monkeypatch.setattr(known, "real", lambda: iter([present, absent]))
+    monkeypatch.setattr(gate, "diagnosed", lambda jobs, *_, **__: iter([(job.name, stated) for job in jobs]))
     assert gate.main(["--output", str(tmp_path / "before"), "--only", "real"]) == 0
     printed = capsys.readouterr().out
     assert "real: right 1/1" in printed
     assert f"left out: {tmp_path / 'away.csv'} is absent" in printed
-    said = row(verdict="unexplained")
+    stated = row(verdict="unexplained")
     stored = str(tmp_path / "before" / gate.RESULT)
     assert gate.main(["--output", str(tmp_path / "after"), "--only", "real", "--compare", stored]) == 1
     assert "real: right 1/1 -> 0/1" in capsys.readouterr().out
@@ -258,6 +258,6 @@ def test_undecidable_single_runs_are_counted_apart(tmp_path):
     (family, _) = drawn.all_scenarios(tmp_path, match="scenario dynamics lasting_push empty", empty=2, hidden=0)
     assert len(family.jobs) == 2
     rival = finding("backlash", alternatives=("dead_zone",))
-    rows = {job.name: row(one) for job, one in zip(family.jobs, (finding("backlash"), rival), strict=True)}
+    rows = {job.name: row(item) for job, item in zip(family.jobs, (finding("backlash"), rival), strict=True)}
     counts = family.counts(rows)
-    assert (counts["false alarms"], counts["a name alone where one run cannot tell"]) == ("0/0", "1/2")
+    assert (counts["false alarms"], counts["a wrong single name in one run"]) == ("0/0", "1/2")

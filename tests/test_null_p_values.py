@@ -24,9 +24,9 @@ def alike(values, lag):
 
 
 def test_the_same_seed_gives_the_same_recording_and_each_kind_has_its_own():
-    one, again, other = recording("white", 3), recording("white", 3), recording("white", 4)
-    torch.testing.assert_close(one["place"], again["place"], rtol=0, atol=0)
-    assert not torch.equal(one["place"], other["place"])
+    item, again, other = recording("white", 3), recording("white", 3), recording("white", 4)
+    torch.testing.assert_close(item["place"], again["place"], rtol=0, atol=0)
+    assert not torch.equal(item["place"], other["place"])
     assert len({float(recording(kind, 3)["place"][5]) for kind in KINDS}) == len(KINDS)
 
 
@@ -99,15 +99,15 @@ def test_the_command_writes_table_picture_and_p_values_and_goes_on(tmp_path, mon
     assert asked == [("white", 39), ("held inputs", 39)] * 3  # the first pair is not searched again
     stored = json.loads((tmp_path / "p_values.json").read_text(encoding="utf-8"))
     assert stored["p_values"] == {"white": [0.01] * 3, "held inputs": [0.5] * 3}
-    told = capsys.readouterr().out
-    assert "| white | 3 | 100.0 % | 29.2 to 100.0 % | 0.99 |" in told
-    assert "| held inputs | 3 | 0.0 % | 0.0 to 70.8 % | 0.50 |" in told
-    assert (tmp_path / "summary.md").read_text(encoding="utf-8") in told
+    printed = capsys.readouterr().out
+    assert "| white | 3 | 100.0 % | 29.2 to 100.0 % | 0.99 |" in printed
+    assert "| held inputs | 3 | 0.0 % | 0.0 to 70.8 % | 0.50 |" in printed
+    assert (tmp_path / "summary.md").read_text(encoding="utf-8") in printed
     page = (tmp_path / "null_p_values.svg").read_text(encoding="utf-8")
     assert "white (3)" in page
     assert "held inputs (3)" in page
     assert null_p_values.main(["--seed", "2", *command, "1"]) == 0
-    assert len(asked) == 8  # another seed begins anew
+    assert len(asked) == 8  # another seed begins again
 
 
 @pytest.mark.e2e

@@ -1,4 +1,4 @@
-"""Every public entry with each of its arguments spoilt in each way: a clear refusal, or an answer without NaN."""
+"""Every public entry with each of its arguments contaminated in each way: a clear refusal, or an answer without NaN."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from mkc_torch.nonlinear import NoFitError
-from tests.public_entries import Entry, entries, spoilt
+from tests.public_entries import Entry, contaminated, entries
 
 ENTRIES = {entry.names[0]: entry for entry in entries()}
 ROOMS = ("covariance", "density", "functional", "linear", "losses", "metrics", "nonlinear")
@@ -52,11 +52,11 @@ def tensors(value: Any) -> Iterator[Tensor]:
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, (list, tuple)):
-        for one in value:
-            yield from tensors(one)
+        for item in value:
+            yield from tensors(item)
     elif is_dataclass(value):
-        for one in vars(value).values():
-            yield from tensors(one)
+        for item in vars(value).values():
+            yield from tensors(item)
 
 
 def outcome(entry: Entry, argument: str, value: Any) -> str:
@@ -74,8 +74,8 @@ def outcome(entry: Entry, argument: str, value: Any) -> str:
 
 def wrong(name: str, argument: str) -> dict[str, str]:
     entry = ENTRIES[name]
-    outcomes = {way: outcome(entry, argument, value) for way, value in spoilt(entry.arguments[argument])}
-    return {way: told for way, told in outcomes.items() if told}
+    outcomes = {way: outcome(entry, argument, value) for way, value in contaminated(entry.arguments[argument])}
+    return {way: fault for way, fault in outcomes.items() if fault}
 
 
 @pytest.mark.parametrize(("name", "argument"), [case for case in CASES if not case[0].startswith(SLOW)])
@@ -89,7 +89,7 @@ def test_a_contaminated_argument_is_refused_or_gives_numbers(name, argument):
 def test_so_of_those_that_take_long(data):
     name, argument = data.draw(st.sampled_from([case for case in CASES if case[0].startswith(SLOW)]))
     entry = ENTRIES[name]
-    assert outcome(entry, argument, data.draw(st.sampled_from(list(spoilt(entry.arguments[argument]))))[1]) == ""
+    assert outcome(entry, argument, data.draw(st.sampled_from(list(contaminated(entry.arguments[argument]))))[1]) == ""
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def imported(path):
 
 @cache
 def imports():
-    return {name: {one for one in imported(path) if one in MODULES} - {name} for name, path in MODULES.items()}
+    return {name: {module for module in imported(path) if module in MODULES} - {name} for name, path in MODULES.items()}
 
 
 def circle(graph):
@@ -127,7 +127,7 @@ def test_every_package_has_a_docstring():
 def test_every_public_name_of_a_room_is_there():
     for name in PACKAGES:
         module = __import__(name, fromlist=["__all__"])
-        assert [one for one in getattr(module, "__all__", ()) if not hasattr(sys.modules[name], one)] == []
+        assert [item for item in getattr(module, "__all__", ()) if not hasattr(sys.modules[name], item)] == []
 
 
 def test_the_page_on_architecture_names_what_is_there():

@@ -27,12 +27,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--torch", default="2.6.0", help="version of torch")
     parser.add_argument("tests", nargs="*", default=["tests"], help="paths of the sdist")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         venv.create(place / "env", with_pip=True)
         python = place / "env" / "bin" / "python"
-        if run(python, "-m", "pip", "install", "-q", "build", "hatchling", f"torch=={asked.torch}"):
+        if run(python, "-m", "pip", "install", "-q", "build", "hatchling", f"torch=={options.torch}"):
             sys.exit(1)
         if run(python, "-m", "build", "--no-isolation", "--outdir", place / "dist", ROOT):
             sys.exit(1)
@@ -43,7 +43,8 @@ def main() -> None:
             file.extractall(place, filter="data")
         (tree,) = place.glob("mkc_torch-*")
         shutil.rmtree(tree / "mkc_torch")  # the wheel is what is tested
-        sys.exit(run(python, "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *asked.tests, cwd=tree))
+        pytest = ("-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider")
+        sys.exit(run(python, *pytest, *options.tests, cwd=tree))
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ class Known:
     @property
     def request(self) -> Request:
         if self.simulation.endswith(".csv"):
-            return Request(simulation="", simulated=self.file, force=True, report=False)
+            return Request(simulation="", simulator_output=self.file, force=True, report=False)
         return Request(simulation=self.simulation, input_hold=self.input_hold, force=True, report=False)
 
 

@@ -145,9 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=SHARED, help="folder with real, cases and data")
     parser.add_argument("--only", default="", help="only recordings with this text in their name")
-    parser.add_argument(
-        "--output", type=Path, default=Path("known"), help="folder; existing rows are kept"
-    )
+    parser.add_argument("--output", type=Path, default=Path("known"), help="folder; existing rows are kept")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds after which each search is stopped")
     options = parser.parse_args(arguments)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that begin below

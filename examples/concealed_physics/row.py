@@ -58,7 +58,7 @@ def finding(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _parameters(model: Path, request: Request) -> dict[str, float]:
     """Return the simulation's own parameters, fitted with the findings, by name."""
-    if not model.is_file() or request.simulated is not None or request.simulation == MAGNETOMETER:
+    if not model.is_file() or request.simulator_output is not None or request.simulation == MAGNETOMETER:
         return {}
     values = json.loads(model.read_text(encoding="utf-8"))["parameters"]
     names = getattr(simulation_of(request), "parameters", {})
@@ -70,7 +70,7 @@ def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, floa
 
     Empty for a magnetometer, whose corrected field has no recorded counterpart, and without a model.
     """
-    if not model.is_file() or (request.simulated is None and request.simulation == MAGNETOMETER):
+    if not model.is_file() or (request.simulator_output is None and request.simulation == MAGNETOMETER):
         return {}
     table = Recording.read(recording, recognise=False)
     try:

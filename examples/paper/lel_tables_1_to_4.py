@@ -184,12 +184,12 @@ def speed(console: Console, G: Tensor, y: Tensor) -> None:
     newton: list[float] = []
     simplex: dict[float, list[float]] = {1e-4: [], 1e-8: []}
     worse = 0
-    for one in y:
+    for item in y:
         estimator = LeastEntropyLike(starts=starts)
-        newton.append(min(seconds(lambda e=estimator, one=one: e.fit(G, one)) for _ in range(3)))  # type: ignore[misc]
+        newton.append(min(seconds(lambda e=estimator, item=item: e.fit(G, item)) for _ in range(3)))  # type: ignore[misc]
         for tol, times in simplex.items():
             start = time.process_time()
-            least = nelder_mead(G.numpy(), one.numpy(), starts.numpy(), tol)
+            least = nelder_mead(G.numpy(), item.numpy(), starts.numpy(), tol)
             times.append(time.process_time() - start)
             worse += int(least > float(estimator.entropy_) + 1e-6)
     ours = float(np.median(newton))

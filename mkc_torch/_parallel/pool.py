@@ -40,7 +40,7 @@ _CHECK_INTERVAL_S = 0.1
 """Seconds between two checks of the deadline while waiting for a copy."""
 
 _copies = 0
-_ahead: list[Future[dict[int, bytes]]] = []
+_speculative_copies: list[Future[dict[int, bytes]]] = []
 
 
 def allow_copies(most: int | None = None) -> None:
@@ -71,7 +71,7 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
     check_deadline()
     if len(works) < 2:
         return [work() for work in works]
-    with _begun(works, min(_copies, len(works) - 1), known, thing=thing) as results:
+    with _running_works(works, min(_copies, len(works) - 1), known, thing=thing) as results:
         return results()
 
 
@@ -82,8 +82,8 @@ def speculative(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) 
     Yields a function that returns all results: it does the works that no copy has started, and waits for the others.
     Without a free core it does all of them. :func:`shared` has priority: these copies run at a lower priority.
     """
-    busy = sum(not copy.done() for copy in _ahead)
-    with _begun(works, min(_copies - busy, len(works)), known, ahead=True) as results:
+    busy = sum(not copy.done() for copy in _speculative_copies)
+    with _running_works(works, min(_copies - busy, len(works)), known, ahead=True) as results:
         yield results
 
 
@@ -134,13 +134,13 @@ class _Unpacker(pickle.Unpickler):
 
 
 @contextmanager
-def _begun(
+def _running_works(
     works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False, thing: str = ""
 ) -> Iterator[Callable[[], list[T]]]:
     """Start works in copies; yields a function that returns all results. All copies are ended on exit."""
     parcels = Serializer(known)
     if copies < 1:
-        yield lambda: [_done(work, parcels, thing) for work in counted(works, len(works), thing)]
+        yield lambda: [_do(work, parcels, thing) for work in counted(works, len(works), thing)]
         return
     # the process that reads a number does that work
     todo, entry = os.pipe()
@@ -149,28 +149,28 @@ def _begun(
     os.close(entry)
     before = set(multiprocessing.active_children())
     task = works, todo, parcels, _SPECULATIVE_NICENESS if ahead else 0
-    pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _begin, task)
+    pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _initialise_copy, task)
     begun: list[Future[dict[int, bytes]]] = []
     try:
-        begun += _forked(pool, copies)
-        _ahead.extend(begun if ahead else ())
+        begun += _fork_copies(pool, copies)
+        _speculative_copies.extend(begun if ahead else ())
         yield lambda: _results(works, parcels, todo, begun, thing)
     finally:
         with _uninterrupted():
-            _ahead[:] = [copy for copy in _ahead if copy not in begun]
+            _speculative_copies[:] = [copy for copy in _speculative_copies if copy not in begun]
             for child in set(multiprocessing.active_children()) - before:
                 child.kill()
             pool.shutdown()
             os.close(todo)
 
 
-def _forked(pool: ProcessPoolExecutor, copies: int) -> list[Future[dict[int, bytes]]]:
+def _fork_copies(pool: ProcessPoolExecutor, copies: int) -> list[Future[dict[int, bytes]]]:
     """The future results of each copy; empty where there is not enough memory for another process."""
     # copies inherit the blocked SIGINT: this process receives it, and ends them
     with suppress(OSError), _uninterrupted(), warnings.catch_warnings():
         # a fork with threads is deprecated; the threads of pools and progress bars hold no lock that a copy needs
         warnings.simplefilter("ignore", DeprecationWarning)
-        return [pool.submit(_take_part) for _ in range(copies)]
+        return [pool.submit(_do_works) for _ in range(copies)]
     return []
 
 
@@ -192,31 +192,31 @@ def _results(
     thing: str,
 ) -> list[T]:
     done = {}
-    for number in _taken(todo):
+    for number in _take_numbers(todo):
         # all processes take the works in reverse order
         count(thing, len(works) - 1 - number, len(works))
-        done[number] = _done(works[number], parcels, thing)
+        done[number] = _do(works[number], parcels, thing)
     for copy in copies:
-        _waited_for(copy)
+        _wait_for(copy)
         with suppress(BrokenProcessPool):
             done |= {number: parcels.unpacked(parcel) for number, parcel in copy.result().items()}
     # a work that failed in a copy raises its error here
-    return [done[number] if number in done else _done(work, parcels) for number, work in enumerate(works)]
+    return [done[number] if number in done else _do(work, parcels) for number, work in enumerate(works)]
 
 
-def _waited_for(copy: Future[dict[int, bytes]]) -> None:
+def _wait_for(copy: Future[dict[int, bytes]]) -> None:
     """Wait until a copy is done, or until the deadline."""
     while is_limited() and not wait([copy], _CHECK_INTERVAL_S).done:
         check_deadline()
 
 
-def _taken(todo: int) -> Iterator[int]:
+def _take_numbers(todo: int) -> Iterator[int]:
     """Numbers of works that no other process has taken, until all are taken."""
     while number := os.read(todo, _BYTES):
         yield int.from_bytes(number, "big")
 
 
-def _done(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
+def _do(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
     """The result of a work as if sent by a copy; a counted work does not count its own steps."""
     check_deadline()
     with silently() if thing else nullcontext():
@@ -231,22 +231,22 @@ _task: tuple[Sequence[Callable[[], object]], int, Serializer] = ((), 0, Serializ
 """In a copy: the works, the pipe of their numbers, and the serializer of results."""
 
 
-def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer, niceness: int) -> None:
+def _initialise_copy(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer, niceness: int) -> None:
     global _task
     _task = works, todo, parcels
     allow_copies(0)
-    _ahead.clear()
+    _speculative_copies.clear()
     ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
     warnings.simplefilter("ignore")  # another thread may have held the lock of their stream
     gc.disable()
     os.nice(niceness)
 
 
-def _take_part() -> dict[int, bytes]:
+def _do_works() -> dict[int, bytes]:
     works, todo, parcels = _task
     done = {}
     with silently():
-        for number in _taken(todo):
+        for number in _take_numbers(todo):
             with suppress(Exception):
                 done[number] = parcels.packed(works[number]())
     return done

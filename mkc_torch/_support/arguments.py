@@ -167,7 +167,7 @@ def refuse_out_of_range(
             (value <= high) if ends[1] == "]" else (value < high)
         )
         got = first_of(value.detach(), ~right)
-    raise ValueError(f"Expected argument `{name}` to be {_range(low, high, ends)} but got {got}{_then(advice)}.")
+    raise ValueError(f"Expected argument `{name}` to be {_range(low, high, ends)} but got {got}{_remedy_text(advice)}.")
 
 
 def checked_number(
@@ -182,7 +182,7 @@ def checked_number(
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(
             f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {format_value(value)}"
-            f"{_then(advice)}."
+            f"{_remedy_text(advice)}."
         )
     try:
         number = float(value)
@@ -202,7 +202,8 @@ def checked_whole(name: str, value: object, least: int | None = None, advice: st
     if number is None or (least is not None and number < least):
         limit = "" if least is None else f" of at least {least}"
         raise ValueError(
-            f"Expected argument `{name}` to be a whole number{limit} but got {format_value(value)}{_then(advice)}."
+            f"Expected argument `{name}` to be a whole number{limit} but got {format_value(value)}"
+            f"{_remedy_text(advice)}."
         )
     return number
 
@@ -345,5 +346,5 @@ def _range(low: float, high: float, ends: str) -> str:
     return f"in {ends[0]}{low:.4g}, {high:.4g}{ends[1]}"
 
 
-def _then(advice: str) -> str:
+def _remedy_text(advice: str) -> str:
     return f"; {advice}" if advice else ""

@@ -275,7 +275,7 @@ TERMS: dict[str, str] = {
     "label.how_large": "how large",
     "label.where": "where",
     "label.mostly": "mostly",
-    "label.in": "in runs",
+    "label.in": "in",
     "label.driven_by": "driven by",
     "label.how_sure": "how sure",
     "label.how_much_better": "how much better",

@@ -1,8 +1,7 @@
 """The catalogue of effects: one piece of physics a file, with its drivers, units, size and source.
 
-A user's own effect is a class derived from :class:`Effect`; :class:`GainEffect` makes it a dozen lines. Each class states
-what the physics is, how it changes the simulation, what drives it, its units, the size that is plausible, and where
-that is from.
+A user's own effect is a class derived from :class:`Effect`; :class:`GainEffect` makes it a dozen lines. The docstring
+of each class states the physics, its change of the simulation, its drivers, units and plausible size, and the source.
 
 To add an effect to the catalogue, write it into a file of its own and enter it in the list of that folder's
 ``__init__``: ``sensor/`` and ``SENSOR`` for a vector sensor and the field around it (``ATTITUDE`` for a recorded

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import gained, per
+from mkc_torch.effects.courses import outer_product, per
 from mkc_torch.effects.kinds import kind_at
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ class GainEffect(Effect):
         return (Quantity(self.gain, len(context.channels), self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return gained(self.waveform(shape, context), gamma)
+        return outer_product(self.waveform(shape, context), gamma)
 
 
 def in_words(effect_id: str) -> str:

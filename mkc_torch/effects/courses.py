@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.runs import first_of_runs, passed_on, passed_on_within, run_numbers
+from mkc_torch.effects.runs import clamped_recurrence, first_of_runs, linear_recurrence, run_numbers
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["after", "combined", "gained", "in_contact", "lagged", "per", "played"]
+__all__ = ["apply_basis", "in_contact", "lagged", "outer_product", "per", "played", "unit_step"]
 
 _MIN_RATIO = 1e-12
 """Lower limit of a sampling interval over the lag, a divisor."""
 
 
-def gained(waveform: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
+def outer_product(waveform: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
     """A waveform times a gain for each channel, (N, c)."""
     return waveform.unsqueeze(-1) @ gain.unsqueeze(0)
 
@@ -33,12 +33,12 @@ def per(unit: str, other: str) -> str:
     return f"{unit}/{'K' if other == '°C' else other}" if other else unit
 
 
-def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
+def unit_step(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
     """A unit step: 0 before the onset, 1 from the onset on."""
     return (time >= onset).to(time.dtype)
 
 
-def combined(basis: Float[Tensor, "N c q"], gamma: Float[Tensor, " q"]) -> Float[Tensor, "N c"]:
+def apply_basis(basis: Float[Tensor, "N c q"], gamma: Float[Tensor, " q"]) -> Float[Tensor, "N c"]:
     """The change ``basis @ γ``, (N, c)."""
     # as one matrix: a batch of γ would otherwise copy the basis of each sample for each γ
     return (basis.flatten(0, 1) @ gamma).unflatten(0, basis.shape[:2])
@@ -71,7 +71,7 @@ def lagged(
     late = torch.where(first, 0.0, -torch.expm1(-ratio) / ratio)
     away = values - values[0]
     before = torch.cat([away[:1], away[:-1]])
-    return values[0] + passed_on(keep, (late - keep) * before + (1.0 - late) * away)
+    return values[0] + linear_recurrence(keep, (late - keep) * before + (1.0 - late) * away)
 
 
 def played(
@@ -113,7 +113,7 @@ def in_contact(values: Float[Tensor, " N"], gap: Float[Tensor, " N"]) -> tuple[I
         (tensor([0, 1, 2, 2]), tensor([ 0., -1., -1., -1.]))
     """
     low, high = values - gap, values + gap
-    load = passed_on_within(low, high)
+    load = clamped_recurrence(low, high)
     below, above = load == low, load == high
     number = torch.arange(len(values), device=values.device)
     touched = torch.where(below | above, number, torch.zeros_like(number)).cummax(0).values

@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["first_of_runs", "passed_on", "passed_on_within", "run_numbers"]
+__all__ = ["clamped_recurrence", "first_of_runs", "linear_recurrence", "run_numbers"]
 
 
 def run_numbers(time: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
@@ -28,17 +28,17 @@ def first_of_runs(run: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
     return torch.cat([torch.ones(1, dtype=torch.bool), run.diff() != 0])
 
 
-def passed_on(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+def linear_recurrence(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """The recurrence ``y[k] = factor[k] y[k-1] + level[k]`` from ``y[-1] = 0``, by a parallel scan of affine maps.
 
     A factor of 0 restarts it. Its derivatives are recurrences with the same factors, so the scan itself is never
     differentiated. Blelloch, "Prefix sums and their applications" (1990).
 
     Example:
-        >>> passed_on(torch.tensor([0.0, 0.5, 0.5]), torch.tensor([4.0, 0.0, 1.0]))
+        >>> linear_recurrence(torch.tensor([0.0, 0.5, 0.5]), torch.tensor([4.0, 0.0, 1.0]))
         tensor([4., 2., 2.])
     """
-    found: Tensor = _PassedOn.apply(factor, level)  # type: ignore[no-untyped-call]
+    found: Tensor = _LinearRecurrence.apply(factor, level)  # type: ignore[no-untyped-call]
     return found
 
 
@@ -60,8 +60,8 @@ def _before(values: Float[Tensor, "*b N"]) -> Float[Tensor, "*b N"]:
     return torch.cat([torch.zeros_like(values[..., :1]), values[..., :-1]], -1)
 
 
-class _PassedOn(torch.autograd.Function):
-    """:func:`passed_on` along the last dimension, with its derivatives in forward and reverse mode and over a batch."""
+class _LinearRecurrence(torch.autograd.Function):
+    """:func:`linear_recurrence` along the last dimension, with derivatives in both modes and a rule for ``vmap``."""
 
     @staticmethod
     def forward(factor: Tensor, level: Tensor) -> Tensor:
@@ -80,7 +80,7 @@ class _PassedOn(torch.autograd.Function):
         moved = torch.zeros_like(found) if level_tangent is None else level_tangent
         if factor_tangent is not None:
             moved = moved + factor_tangent * _before(found)
-        return passed_on(factor, moved)
+        return linear_recurrence(factor, moved)
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
@@ -89,7 +89,7 @@ class _PassedOn(torch.autograd.Function):
         factor, found = ctx.saved_tensors
         # the transposed recurrence runs from the last sample to the first
         back = torch.cat([torch.zeros_like(factor[..., :1]), factor[..., 1:].flip(-1)], -1).conj()
-        to_level = passed_on(back, slope.flip(-1)).flip(-1)
+        to_level = linear_recurrence(back, slope.flip(-1)).flip(-1)
         to_factor = to_level * _before(found).conj()
         if not factor.is_complex():
             to_factor = torch.real(to_factor)
@@ -101,16 +101,16 @@ class _PassedOn(torch.autograd.Function):
             factor = factor.movedim(places[0], 0)
         if places[1] is not None:
             level = level.movedim(places[1], 0)
-        return passed_on(factor, level), 0
+        return linear_recurrence(factor, level), 0
 
 
-def passed_on_within(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+def clamped_recurrence(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """The recurrence ``y[k] = max(low[k], min(high[k], y[k-1]))``, by a parallel scan: a clamp of a clamp is a clamp.
 
     It restarts where ``low`` equals ``high``, as must be the case at the first sample.
 
     Example:
-        >>> passed_on_within(torch.tensor([0.0, 1.0, 0.5, -2.0]), torch.tensor([0.0, 3.0, 2.5, 0.0]))
+        >>> clamped_recurrence(torch.tensor([0.0, 1.0, 0.5, -2.0]), torch.tensor([0.0, 3.0, 2.5, 0.0]))
         tensor([0., 1., 1., 0.])
     """
     shift = 1

@@ -112,7 +112,7 @@ class Paired:
         refuse_no_recording("recording", recording)
         shared = self._shared(recording)
         table = recording.finite("time", *shared).sorted_by_time()
-        table, curve = _met(self.simulated.finite(*shared), table, shared)
+        table, curve = _common_samples(self.simulated.finite(*shared), table, shared)
         return PreparedPaired(self, table, shared, curve)
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
@@ -128,7 +128,7 @@ class Paired:
         shared = tuple(name for name in recording.names if name in self.simulated and name not in _NOT_KEYS)
         if not shared:
             raise SimulationError(
-                f"{_called(recording, 'the recording')} and {_called(self.simulated, 'the simulated table')} have no "
+                f"{_name_of(recording, 'the recording')} and {_name_of(self.simulated, 'the simulated table')} have no "
                 f"column in common to compare: {_listed(recording)} there, {_listed(self.simulated)} here. Rename with "
                 "`--columns`."
             )
@@ -158,7 +158,7 @@ class PreparedPaired(ClosedForm):
         self.measured, self.curve = measured[:, kept], curve.columns(kept)
         # without the compared columns, so that they do not drive effects on themselves
         others = {name: values for name, values in recording.columns.items() if name not in self.channels}
-        self.recording = _copied(recording, others)
+        self.recording = _with_columns(recording, others)
         self._units = {name: recording.units[name] for name in self.channels}
         units = set(self._units.values())
         self.unit = units.pop() if len(units) == 1 else ""
@@ -171,8 +171,8 @@ class PreparedPaired(ClosedForm):
         self.parameter_names = (*offsets, "clock rate")
         self._spread = sizes = self.time.new_tensor(spread)
         self.prior: GaussianPrior | None = GaussianPrior(torch.zeros_like(sizes), sizes.square().reciprocal())
-        self._most = _FREE * sizes
-        self.state: Mapping[str, object] = {"channels": list(self.channels), "clocks": self._most.tolist()}
+        self._clock_limits = _FREE * sizes
+        self.state: Mapping[str, object] = {"channels": list(self.channels), "clocks": self._clock_limits.tolist()}
         self.bounds = torch.full_like(sizes, -torch.inf), torch.full_like(sizes, torch.inf)
         run = successive_runs(curve.run, self.time)
         self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels, run)
@@ -207,7 +207,7 @@ class PreparedPaired(ClosedForm):
         return output_signals(self._outputs(theta), self.channels, changes)
 
     def _outputs(self, theta: Tensor) -> Float[Tensor, "N m"]:
-        clock = _clocks(theta, self._most)
+        clock = _clocks(theta, self._clock_limits)
         return self.curve.at(self.time + clock[:-1][self.curve.run] + clock[-1] * self._since)
 
 
@@ -227,9 +227,9 @@ class PairedCorrection:
 
     def __init__(self, system: Paired, state: Mapping[str, Any], recording: Recording) -> None:
         self.channels = tuple(state["channels"])
-        self._most = torch.tensor(state.get("clocks", ()), dtype=torch.float64)
+        self._clock_limits = torch.tensor(state.get("clocks", ()), dtype=torch.float64)
         self.time = recording["time"]
-        inside, self._curve = _found(system.simulated.finite(*self.channels), recording, self.channels)
+        inside, self._curve = _match_runs(system.simulated.finite(*self.channels), recording, self.channels)
         if not bool(inside.all()):
             raise SimulationError(
                 f"{int((~inside).sum())} of {len(inside)} samples lie outside the times that were simulated; simulate "
@@ -242,8 +242,8 @@ class PairedCorrection:
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The simulated columns with the effects; the clock offset is the mean over the fitted runs."""
         at = self.time
-        if len(self._most):
-            clock = _clocks(theta, self._most)
+        if len(self._clock_limits):
+            clock = _clocks(theta, self._clock_limits)
             at = at + clock[:-1].mean() + clock[-1] * _since_begin(self.time, self._curve)
         outputs = changed_outputs(self._curve.at(at), self.channels, changes)
         return {"time": self.time} | dict(zip(self.channels, outputs.unbind(-1), strict=True))
@@ -305,9 +305,9 @@ def _since_begin(time: Float[Tensor, " N"], curve: _Curve) -> Float[Tensor, " N"
     return time - first[curve.run]
 
 
-def _met(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Recording, _Curve]:
+def _common_samples(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Recording, _Curve]:
     """The samples at simulated times, and the curve."""
-    inside, curve = _found(simulated, recording, names)
+    inside, curve = _match_runs(simulated, recording, names)
     if bool(inside.all()):
         return recording, curve
     warning = (
@@ -315,10 +315,12 @@ def _met(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> 
         f"{_range(simulated)}, and are left out."
     )
     columns = {name: values[inside] for name, values in recording.columns.items()}
-    return _copied(recording, columns, warning), curve.kept(inside)
+    return _with_columns(recording, columns, warning), curve.kept(inside)
 
 
-def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Bool[Tensor, " N"], _Curve]:
+def _match_runs(
+    simulated: Recording, recording: Recording, names: tuple[str, ...]
+) -> tuple[Bool[Tensor, " N"], _Curve]:
     """The mask of the samples within the simulated times of their run, and the curve.
 
     Raises:
@@ -330,12 +332,12 @@ def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -
     missing = [label for label in own_labels if label not in labels]
     if missing and (labels != [""] or own_labels != [""]):
         raise SimulationError(
-            f"{_called(simulated, 'The simulated table')} has no run {_experiments(missing)}; its column `experiment` "
+            f"{_name_of(simulated, 'The simulated table')} has no run {_experiments(missing)}; its column `experiment` "
             f"has {_experiments(labels)}. Runs of both tables are matched by that column."
         )
     count = torch.bincount(number, minlength=len(labels))
     if int(count.min()) < _FEWEST:
-        raise SimulationError(f"{_called(simulated, 'The simulated table')} has a run of one moment; it needs two.")
+        raise SimulationError(f"{_name_of(simulated, 'The simulated table')} has a run of one moment; it needs two.")
     last = count.cumsum(0) - 1
     run = torch.tensor([labels.index(label) for label in own_labels])[own]
     low, high = (last - count + 1)[run], last[run]
@@ -344,8 +346,8 @@ def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -
         if not bool(inside[own == k].any()):
             where = f" of run {label}" if label else ""
             raise SimulationError(
-                f"{_called(recording, 'The recording')} and {_called(simulated, 'the simulated table')} do not meet in "
-                f"time{where}: {_range(recording, own == k)} was recorded, "
+                f"{_name_of(recording, 'The recording')} and {_name_of(simulated, 'the simulated table')} do not meet "
+                f"in time{where}: {_range(recording, own == k)} was recorded, "
                 f"{_range(simulated, number == labels.index(label))} simulated. Give both the same zero of time."
             )
     values = simulated.stack(*names)
@@ -382,7 +384,7 @@ def _interval(time: Float[Tensor, " N"], run: Int[Tensor, " N"]) -> float:
     return float(inside.median()) if len(inside) else 1.0
 
 
-def _copied(recording: Recording, columns: Mapping[str, Tensor], *warnings: str) -> Recording:
+def _with_columns(recording: Recording, columns: Mapping[str, Tensor], *warnings: str) -> Recording:
     return Recording(
         columns,
         name=recording.name,
@@ -392,7 +394,7 @@ def _copied(recording: Recording, columns: Mapping[str, Tensor], *warnings: str)
     )
 
 
-def _called(recording: Recording, otherwise: str) -> str:
+def _name_of(recording: Recording, otherwise: str) -> str:
     return recording.name or otherwise
 
 

@@ -228,7 +228,7 @@ class PreparedStatic(ClosedForm):
         load_forward_mode()
         tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
         self.warnings = undetermined(tangents.flatten(0, 1), self.start(), self.parameter_names)
-        fixed = tuple(name for k, name in enumerate(self.channels) if not _moves(tangents, k))
+        fixed = tuple(name for k, name in enumerate(self.channels) if not _can_shift(tangents, k))
         self.state: Mapping[str, object] = {"class": system.name, "fixed": list(fixed)}
         self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed)
 
@@ -348,7 +348,7 @@ def _ports(
     return ports | output_ports(system.outputs, units, unit, measured, fixed)
 
 
-def _moves(tangents: Float[Tensor, "N m p"], channel: int) -> bool:
+def _can_shift(tangents: Float[Tensor, "N m p"], channel: int) -> bool:
     """Whether a change of the parameters can shift one output by a constant and leave the others unchanged."""
     constant = torch.zeros_like(tangents[..., :1])
     constant[:, channel] = 1.0

@@ -29,7 +29,7 @@ def _copies():
     yield
     allow_copies(0)
     assert multiprocessing.active_children() == []
-    assert _pool._ahead == []
+    assert _pool._speculative_copies == []
 
 
 def elsewhere(value):
@@ -179,7 +179,7 @@ def test_without_a_free_core_speculative_work_is_done_on_request():
         assert answer() == [HERE]
     with speculative([os.getpid]) as first:
         first()  # its core is free from now on
-        while not all(copy.done() for copy in _pool._ahead):
+        while not all(copy.done() for copy in _pool._speculative_copies):
             time.sleep(0.01)
         with begun(os.getpid) as (work, wait), speculative([work]) as answer:
             wait()

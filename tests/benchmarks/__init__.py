@@ -1,1 +1,1 @@
-"""What is measured and not tested: times differ from machine to machine."""
+"""Benchmarks: times are measured and not tested, for they differ from machine to machine."""

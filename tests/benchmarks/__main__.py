@@ -1,4 +1,4 @@
-"""All benchmarks, one after the other: `python -m tests.benchmarks`; one alone: `python -m tests.benchmarks.start`."""
+"""Run all benchmarks in turn: `python -m tests.benchmarks`; a single benchmark: `python -m tests.benchmarks.start`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ NAMES = ("start", "small_fits", "large_fits", "streaming", "diagnosis")
 
 
 def main() -> None:
-    """Run them in processes of their own."""
+    """Run each benchmark in its own process."""
     for name in NAMES:
         print(f"\n{name}\n", flush=True)
         subprocess.run([sys.executable, "-m", f"tests.benchmarks.{name}"], check=True)

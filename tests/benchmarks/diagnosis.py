@@ -1,8 +1,8 @@
 """Wall and CPU seconds and memory of `mkc diagnose` from the shell: `python -m tests.benchmarks.diagnosis`.
 
-Each row is one command, with its start and its reports. Rows whose recordings lie outside of this repository are left
-out, with the file's name, where that is absent; `--only` takes rows whose name begins so. `--samples PICTURE` draws CPU
-seconds over the samples of a recording instead.
+Each row is one command, with its start and its reports. A row is left out if its recording, outside of this repository,
+is absent; the file name is printed. `--only` takes rows whose name begins with the given text. `--samples PICTURE`
+draws CPU seconds over the samples of a recording instead.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Cart(Dynamics):
 
 @dataclass(frozen=True)
 class Row:
-    """A command, and the seconds and the GiB that it may take at most."""
+    """A command, with its limits in seconds and GiB."""
 
     name: str
     files: tuple[Path, ...]
@@ -65,13 +65,13 @@ class Row:
 
 
 def sensor(path: Path, rate: float, seconds: float, seed: int, *, attitude: bool = False) -> Path:
-    """A magnetometer turned by hand while a loudspeaker passes, at this rate in Hz; with quaternions on demand."""
+    """A magnetometer turned by hand while a loudspeaker passes, at ``rate`` Hz; optionally with quaternions."""
     with patch.object(demonstration, "SECONDS", seconds), patch.object(demonstration, "RATE", rate):
         recording, _ = demonstration.simulated_recording(seed)
     columns = dict(recording.columns)
     if attitude:
-        to_world = demonstration._hand_rotation(columns["time"]).mT
-        columns |= dict(zip(("q_w", "q_x", "q_y", "q_z"), quaternions(to_world).unbind(-1), strict=True))
+        body_to_earth = demonstration._hand_rotation(columns["time"]).mT
+        columns |= dict(zip(("q_w", "q_x", "q_y", "q_z"), quaternions(body_to_earth).unbind(-1), strict=True))
     write_table(path, columns)
     return path
 
@@ -104,8 +104,8 @@ def cart(path: Path, count: int) -> Path:
             speed += 0.25 * h * (motor - 0.5 * speed - 0.4 * speed * abs(speed))
             motor += 0.25 * h * (u - motor) / 0.2
     noise = torch.randn(count, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    seen = torch.tensor(found, dtype=torch.float64) + 0.005 * noise
-    write_table(path, {"time": time_, "voltage": voltage, "place": seen[:, 0], "speed": seen[:, 1]})
+    noisy = torch.tensor(found, dtype=torch.float64) + 0.005 * noise
+    write_table(path, {"time": time_, "voltage": voltage, "place": noisy[:, 0], "speed": noisy[:, 1]})
     return path
 
 
@@ -114,7 +114,7 @@ def of_cases(name: str) -> Callable[[Path], tuple[Path, ...]]:
 
 
 def rows(folder: Path, only: str) -> Iterator[Row]:
-    """The rows whose name begins with ``only``, whose recordings are written first."""
+    """Yield the rows whose name begins with ``only``, after their recordings are written."""
     written = folder / "cart.py"
     written.write_text(CART)
     magnetometer = "magnetometer"
@@ -135,7 +135,8 @@ def rows(folder: Path, only: str) -> Iterator[Row]:
         "three states, 1,000 samples": (lambda f: (cart(f / "cart_short.csv", 1_000),), f"{written}:Cart", 20),
     }
     known |= {
-        f"case {name}": (of_cases(name), f"{CASES / name / 'naive.py'}:{one}", 10) for name, (_, one) in SYSTEMS.items()
+        f"case {name}": (of_cases(name), f"{CASES / name / 'naive.py'}:{kind}", 10)
+        for name, (_, kind) in SYSTEMS.items()
     }
     for name, (make, simulation, seconds) in known.items():
         if name.startswith(only):
@@ -148,7 +149,7 @@ def rows(folder: Path, only: str) -> Iterator[Row]:
 
 
 def measured(row: Row, output: Path) -> tuple[float, float, float]:
-    """Wall seconds, CPU seconds and GiB of the greatest process of a command."""
+    """Wall seconds, CPU seconds and peak memory in GiB of the largest process of a command."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-m", "mkc_torch.cli", "diagnose", *map(str, row.files)]
     command += ["--simulation", row.simulation, "--output", str(output), "--force"]
@@ -162,7 +163,7 @@ def measured(row: Row, output: Path) -> tuple[float, float, float]:
 
 
 def over_samples(picture: Path, most: float) -> None:
-    """Print CPU seconds over samples with their exponent, and draw them."""
+    """Print and draw CPU seconds over samples, and print the exponent."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "reports"
 
@@ -177,15 +178,17 @@ def over_samples(picture: Path, most: float) -> None:
 def main() -> None:
     """Print the table, or draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="", help="rows whose name begins so")
-    parser.add_argument("--samples", type=Path, metavar="PICTURE", help="CPU seconds over samples, as a PNG, instead")
-    parser.add_argument("--seconds", type=float, default=600.0, help="CPU seconds of a point of --samples at most")
-    asked = parser.parse_args()
-    if asked.samples is not None:
-        over_samples(asked.samples, asked.seconds)
+    parser.add_argument("--only", default="", help="only rows whose name begins with this text")
+    parser.add_argument(
+        "--samples", type=Path, metavar="PICTURE", help="draw CPU seconds over samples as a PNG instead"
+    )
+    parser.add_argument("--seconds", type=float, default=600.0, help="largest CPU seconds of a point of --samples")
+    options = parser.parse_args()
+    if options.samples is not None:
+        over_samples(options.samples, options.seconds)
         return
-    only = asked.only
-    print(f"{'':<32}{'wall':>9}{'asked':>8}{'CPU':>9}{'GiB so far':>12}")
+    only = options.only
+    print(f"{'':<32}{'wall':>9}{'limit':>8}{'CPU':>9}{'GiB so far':>12}")
     with tempfile.TemporaryDirectory() as folder:
         for row in rows(Path(folder), only):
             wall, cpu, memory = measured(row, Path(folder) / "reports")

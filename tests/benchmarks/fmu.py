@@ -1,8 +1,8 @@
-"""The challenge's naive simulations diagnosed twice: as they are, and as FMUs that are compiled here.
+"""Diagnose with the nominal models of the challenge twice: in PyTorch, and as FMUs that are compiled here.
 
     python -m tests.benchmarks.fmu --recordings 60
 
-For each recording: what is found first, by how much parameters differ, and the time on one core.
+Prints for each recording the first findings, the difference of the parameters, and the time on one core.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from mkc_torch.simulation import Dynamics, Parameter, Simulation, load_fmu
 from tests.simulation.fmu.made import Model, make_fmu
 
 SEED = 350
-"""Of the recordings, which nothing in the adapter was set by."""
+"""Seed of the recordings; no setting of the adapter was chosen with them."""
 
 FIRST = 0
-"""Number of the first of them."""
+"""Index of the first recording."""
 
 _OUTLET = "sqrt(Piecewise(({0}, {0} > 1e-4), (1e-4, True)))"
 RATES: Mapping[str, Mapping[str, str]] = {
@@ -53,7 +53,7 @@ RATES: Mapping[str, Mapping[str, str]] = {
 }
 """The equations of ``mkc_torch.challenge.dynamics.nominal_models``, as texts."""
 
-NAIVE: Mapping[str, type[Dynamics]] = {
+NOMINAL: Mapping[str, type[Dynamics]] = {
     "pendulum": nominal_models.Pendulum,
     "cart_pole": nominal_models.CartPole,
     "tanks": nominal_models.Tanks,
@@ -65,7 +65,7 @@ NAIVE: Mapping[str, type[Dynamics]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """One recording, diagnosed twice: first findings, the largest difference of a parameter, and seconds."""
+    """A recording diagnosed twice: first findings, largest relative difference of a parameter, and seconds."""
 
     name: str
     effects: tuple[str, str]
@@ -78,31 +78,31 @@ class Pair:
 
 
 def as_fmu(system: str, folder: Path, version: int = 2, *, derivatives: bool = True) -> Path:
-    """The naive simulation of a system as an FMU."""
-    kind = NAIVE[system]
-    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in kind.parameters.items()}
+    """The nominal simulation of a system as an FMU."""
+    kind = NOMINAL[system]
+    known = {name: p if isinstance(p, Parameter) else Parameter(p) for name, p in kind.parameters.items()}
     bounds = {
-        name: (one.value, *(None if abs(end) == float("inf") else end for end in (one.lower, one.upper)), one.unit)
-        for name, one in known.items()
+        name: (p.value, *(None if abs(end) == float("inf") else end for end in (p.lower, p.upper)), p.unit)
+        for name, p in known.items()
     }
     model = Model(kind.__name__, RATES[system], bounds, kind.inputs, units=dict(kind.units))
     return make_fmu(folder / f"{system}_{version}.fmu", model, version, derivatives=derivatives)
 
 
 def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates: int = 19) -> Iterator[Pair]:
-    """The first recordings of the seed, one after the other; those of a system without states are left out."""
+    """Yield the first ``count`` recordings of the seed; recordings of a system without states are left out."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as place:
         fmus: dict[str, Simulation] = {}
         for index in range(FIRST, FIRST + count):
             case = generator.draw(SEED, index)
             system = case.key.mode
-            if system not in RATES:  # it has no differential equations
+            if system not in RATES:  # a system without differential equations
                 continue
             if system not in fmus:
                 fmus[system] = load_fmu(as_fmu(system, Path(place), version, derivatives=derivatives))
             results, seconds = [], []
-            for simulation in (NAIVE[system](), fmus[system]):
+            for simulation in (NOMINAL[system](), fmus[system]):
                 began = time.process_time()
                 results.append(diagnose(simulation, case.recording, surrogates=surrogates, max_findings=1))
                 seconds.append(time.process_time() - began)
@@ -110,23 +110,23 @@ def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates:
 
 
 def _firsts(results: list[Diagnosis]) -> tuple[str, str]:
-    one, other = (result.findings[0].effect if result.findings else "nothing" for result in results)
-    return one, other
+    first, second = (result.findings[0].effect if result.findings else "nothing" for result in results)
+    return first, second
 
 
 def _off(results: list[Diagnosis]) -> float:
-    """By what share of themselves the parameters of the simulation differ at most; 0 where there are none."""
-    one, other = (result.model.theta for result in results)
-    if len(one) != len(other) or not len(one):
-        return 0.0 if len(one) == len(other) else float("inf")
-    return float(((one - other).abs() / one.abs().clamp(min=1e-12)).max())
+    """Largest relative difference of the simulation's parameters; 0 without parameters."""
+    first, second = (result.model.theta for result in results)
+    if len(first) != len(second) or not len(first):
+        return 0.0 if len(first) == len(second) else float("inf")
+    return float(((first - second).abs() / first.abs().clamp(min=1e-12)).max())
 
 
 def main() -> None:
     """Print a line for each recording, and the sums."""
     parser = argparse.ArgumentParser(description="Diagnoses of the same equations as torch and as FMU")
     parser.add_argument("--recordings", type=int, default=60)
-    parser.add_argument("--version", type=int, choices=(2, 3), default=2, help="of FMI")
+    parser.add_argument("--version", type=int, choices=(2, 3), default=2, help="version of FMI")
     parser.add_argument("--differences", action="store_true", help="without directional derivatives")
     given = parser.parse_args()
     known: list[Pair] = []

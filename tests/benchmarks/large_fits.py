@@ -1,10 +1,10 @@
-"""CPU time and memory of one large robust fit beside least squares, scikit-learn and statsmodels, in one run:
+"""CPU time and memory of one large robust fit compared with least squares, scikit-learn and statsmodels, in one run:
 
     python -m tests.benchmarks.large_fits
 
-Data of 9 columns with 10 % outliers, in one thread; times are CPU milliseconds, the least of several. It prints how
-many times the data are read, how long that takes at the rate at which the machine reads and sums memory, and the peak
-of memory of a process that holds the data and fits them. What is not installed is left out.
+Data of 9 columns with 10 % outliers, in one thread; times are CPU milliseconds, the least of several. Prints how many
+times the data are read, how long that takes at the rate at which the machine reads and sums memory, and the peak memory
+of a process that holds the data and fits them. Packages that are not installed are left out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.benchmarks.small_fits import milliseconds, peers
 COLUMNS = 9
 
 REPEATS = 7
-"""Timings of which the least is told."""
+"""Number of timings; the least is printed."""
 
 
 def sample(N: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -40,7 +40,7 @@ def sample(N: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def least(works: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """The least CPU time of each, taken in turn so that what else the machine does meets them alike."""
+    """The least CPU time of each work in ms, timed in turn: other load of the machine affects all alike."""
     times = {name: milliseconds(work, 1) for name, work in works.items()}
     for _ in range(REPEATS):
         for name, work in works.items():
@@ -49,7 +49,7 @@ def least(works: dict[str, Callable[[], object]]) -> dict[str, float]:
 
 
 def bytes_read(X: Tensor, y: Tensor) -> int:
-    """Bytes of X and y that a fit takes up in blocks."""
+    """Bytes of X and y that a fit reads."""
     read = 0
     blocks = _passes.blocks
 
@@ -64,18 +64,18 @@ def bytes_read(X: Tensor, y: Tensor) -> int:
         MKCRegression().fit(X, y)
     finally:
         _passes.blocks = blocks
-    # the look at every value beside
+    # the check of every value in addition
     return read + X.nbytes + y.nbytes
 
 
 def apart(fit: MKCRegression, X: Tensor, y: Tensor) -> float:
-    """How far the coefficients are from fully converged ones at the same domain, in standard errors."""
-    rest = MKCRegression(bound=fit.bound_, start=fit.coef_).fit(X.clone().requires_grad_(), y)
-    return float(((fit.coef_ - rest.coef_.detach()) / fit.standard_error_).abs().max())
+    """Largest distance of the coefficients from the converged coefficients on the same domain, in standard errors."""
+    converged = MKCRegression(bound=fit.bound_, start=fit.coef_).fit(X.clone().requires_grad_(), y)
+    return float(((fit.coef_ - converged.coef_.detach()) / fit.standard_error_).abs().max())
 
 
 def peak(N: int) -> float:
-    """Peak of memory of a process that fits data of N rows, its code not counted, over the data."""
+    """Peak memory, without the code, of a process that fits N rows, as a multiple of the data."""
     with tempfile.TemporaryDirectory() as folder:
         X, y = sample(N)
         np.save(Path(folder) / "X.npy", X.numpy())
@@ -88,7 +88,7 @@ def peak(N: int) -> float:
 
 
 def print_own_peak(folder: str) -> None:
-    """Of this process, once it has loaded and fitted the data in ``folder``."""
+    """Load and fit the data in ``folder``, and print the peak memory of this process as a multiple of the data."""
     MKCRegression().fit(*sample(25_000))
     before = memory("VmRSS")
     X, y = (torch.from_numpy(np.load(Path(folder) / f"{name}.npy")) for name in "Xy")
@@ -97,7 +97,7 @@ def print_own_peak(folder: str) -> None:
 
 
 def memory(name: str) -> int:
-    """Bytes of this process that Linux tells by this name; its own highest, as rusage's may be that of its parent."""
+    """Bytes of this process by the name in Linux' status file; the peak of rusage may be that of the parent."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
@@ -127,7 +127,7 @@ def main() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         others = peers(X.numpy(), y.numpy())
-        others.pop("statsmodels RLMDetSMM", None)  # of small fits only
+        others.pop("statsmodels RLMDetSMM", None)  # for small fits only
         times = least({"MKCRegression": lambda: MKCRegression().fit(X, y), **others})
     for name, taken in times.items():
         print(f"  {name:<36}{taken:>9.1f}{taken / times['MKCRegression']:>8.2f}", flush=True)

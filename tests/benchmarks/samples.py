@@ -1,6 +1,6 @@
 """CPU seconds of `mkc diagnose` over the samples of a recording, as a picture.
 
-A rotor with one state, driven by a recorded torque, whose quadratic drag the simulation leaves out. Each point is one
+A rotor with one state is driven by a recorded torque; the simulation leaves out its quadratic drag. Each point is one
 command with its start and its reports; `python -m tests.benchmarks.diagnosis --samples samples.png` draws it.
 """
 
@@ -47,27 +47,27 @@ def rotor(path: Path, samples: int) -> Path:
     time = STEP * torch.arange(samples, dtype=torch.float64)
     torque = torch.sin(1.3 * time) + torch.sin(0.31 * time) + 0.5 * torch.sign(torch.sin(0.17 * time))
     values, h, speed = torque.tolist(), STEP / 4.0, 0.0
-    seen = []
+    speeds = []
     for here, following in zip(values, [*values[1:], values[-1]], strict=True):
-        seen.append(speed)
+        speeds.append(speed)
         for part in range(4):
             first, second = (here + (following - here) * (part + k) / 4.0 for k in (0, 1))
             slope = first - 0.5 * speed - 0.4 * speed * abs(speed)
             ahead = speed + h * slope
             speed += 0.5 * h * (slope + second - 0.5 * ahead - 0.4 * ahead * abs(ahead))
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    write_table(path, {"time": time, "torque": torque, "speed": torch.tensor(seen).double() + NOISE * noise})
+    write_table(path, {"time": time, "torque": torque, "speed": torch.tensor(speeds).double() + NOISE * noise})
     return path
 
 
 def measure(
     folder: Path, most: float, cpu_seconds: Callable[[Path, str], float], sizes: Sequence[int] = SAMPLES
 ) -> tuple[list[int], list[float]]:
-    """Samples and CPU seconds, up to the first point expected to take more than ``most`` seconds in proportion.
+    """Samples and CPU seconds, up to the first point that would in proportion take more than ``most`` seconds.
 
     Args:
-        folder: for the recordings.
-        most: CPU seconds of a point.
+        folder: folder of the recordings.
+        most: largest CPU seconds of a point.
         cpu_seconds: runs the command on a recording with a simulation.
         sizes: samples, ascending.
     """
@@ -85,7 +85,7 @@ def measure(
 
 
 def slope(samples: Sequence[int], seconds: Sequence[float]) -> float:
-    """The exponent of the samples: of a straight line through the logarithms; nan of fewer than two points.
+    """The exponent: slope of a straight line through the logarithms; nan for fewer than two points.
 
     Example:
         >>> round(slope([1000, 10_000, 100_000], [2.0, 20.0, 200.0]), 6)

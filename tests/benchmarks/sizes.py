@@ -1,8 +1,8 @@
-"""What a fit and a diagnosis cost over their size, as a picture: `python -m tests.benchmarks.sizes --output sizes.png`.
+"""Cost of a fit and of a diagnosis over size, as a picture: `python -m tests.benchmarks.sizes --output sizes.png`.
 
 CPU seconds of one thread over rows (in memory, and streamed from a file), over columns, over problems in one call, over
 ranks, over candidates and over the samples of a diagnosis. A curve ends before the first point that is expected to take
-longer than `--seconds`, or its file longer than `--bytes`. The points are printed as they come.
+longer than `--seconds`, or whose file exceeds `--bytes`. The points are printed at once.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Limits:
-    """What a point may take."""
+    """Limits of a point: CPU seconds, and bytes of memory or of a file."""
 
     seconds: float
     bytes: float
@@ -51,7 +51,7 @@ class Curve:
     seconds: list[float] = field(default_factory=list)
 
     def measure(self, sizes: Iterable[int], work_of: Callable[[int], Work | None], limit: float) -> Curve:
-        """Add a point for each size; what ``work_of`` prepares is not timed, and None of it ends the curve."""
+        """Add a point for each size. ``work_of`` prepares the work, untimed; None from it ends the curve."""
         for size in sizes:
             if self._expected(size) > limit:
                 break
@@ -66,7 +66,7 @@ class Curve:
         return self
 
     def _expected(self, size: int) -> float:
-        """By the last two points, at least in proportion."""
+        """Expected seconds, extrapolated from the last two points with an exponent of at least 1."""
         if len(self.sizes) < 2:
             return 0.0
         (a, b), (s, t) = self.sizes[-2:], self.seconds[-2:]
@@ -75,7 +75,7 @@ class Curve:
 
 
 def powers(least: float, most: float, each: int = 2) -> list[int]:
-    """So many numbers a decade, powers of ten among them."""
+    """``each`` numbers a decade, the powers of ten among them."""
     low, high = round(each * math.log10(least)), round(each * math.log10(most))
     return [round(10 ** (k / each)) for k in range(low, high + 1)]
 
@@ -141,7 +141,7 @@ def of_ranks(limits: Limits, folder: Path) -> list[Curve]:
 
 
 def of_candidates(limits: Limits, folder: Path) -> list[Curve]:
-    """Of a recording with more and more columns that could be a cause."""
+    """A diagnosis of a recording with an increasing number of candidate columns."""
     recording = Recording.read(diagnosis.sensor(folder / "candidates.csv", 20, 60, 0))
     random = np.random.default_rng(0)
     curve = Curve("60 s at 20 Hz", "candidates of a diagnosis")
@@ -212,9 +212,9 @@ def picture(curves: list[Curve], path: Path) -> None:
 def main() -> None:
     """Measure, print and draw."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, required=True, help="the picture")
-    parser.add_argument("--seconds", type=float, default=60.0, help="that a point may take")
-    parser.add_argument("--bytes", type=float, default=4e9, help="of memory, or of a file, that a point may take")
+    parser.add_argument("--output", type=Path, required=True, help="file of the picture")
+    parser.add_argument("--seconds", type=float, default=60.0, help="largest CPU seconds of a point")
+    parser.add_argument("--bytes", type=float, default=4e9, help="largest bytes of memory, or of a file, of a point")
     options = parser.parse_args()
     limits = Limits(options.seconds, options.bytes)
     torch.set_num_threads(1)

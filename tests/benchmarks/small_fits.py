@@ -1,9 +1,9 @@
-"""CPU time of small robust fits beside that of scikit-learn and statsmodels, in one run:
+"""CPU time of small robust fits compared with that of scikit-learn and statsmodels, in one run:
 
     python -m tests.benchmarks.small_fits
 
-Prints milliseconds of CPU of one thread for one fit, the least of several: of one fit of 300 × 6 with 10 % outliers,
-and of each of many fits of 100 × 2 in one call. What is not installed is left out.
+Prints CPU milliseconds of one thread for one fit, the least of several: for one fit of 300 × 6 with 10 % outliers, and
+for each of many fits of 100 × 2 in one call. Packages that are not installed are left out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MANY = 5000
 """Fits in one call."""
 
 REPEATS = 7
-"""Timings of which the least is told."""
+"""Number of timings; the least is printed."""
 
 
 def sample(seed: int, *shape: int) -> tuple[Tensor, Tensor]:
@@ -36,7 +36,7 @@ def sample(seed: int, *shape: int) -> tuple[Tensor, Tensor]:
 
 
 def milliseconds(work: Callable[[], object], repeats: int = REPEATS) -> float:
-    """CPU time of the process, the first run left out where there are several."""
+    """Least CPU milliseconds of the process; the first of several runs is left out."""
     taken = []
     for _ in range(repeats + (repeats > 1)):
         begin = time.process_time()
@@ -46,7 +46,7 @@ def milliseconds(work: Callable[[], object], repeats: int = REPEATS) -> float:
 
 
 def peers(X: np.ndarray, y: np.ndarray) -> dict[str, Callable[[], object]]:
-    """What others fit, where it is installed; X holds its intercept."""
+    """Fits of other packages, where installed; X holds its intercept."""
     found: dict[str, Callable[[], object]] = {}
     try:
         from sklearn.linear_model import HuberRegressor

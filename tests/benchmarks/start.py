@@ -1,4 +1,4 @@
-"""CPU seconds of starting and of a calibration, beside those of Python and torch: `python -m tests.benchmarks.start`.
+"""CPU seconds of starting and of a calibration, and those of Python and torch: `python -m tests.benchmarks.start`.
 
 User and system time of a whole process in one thread, the least of several runs after one that fills the caches.
 """

@@ -1,12 +1,14 @@
-"""A streamed fit of a table on disk beside reading the table, with one rank and with two:
+"""A streamed fit of a table on disk compared with reading the table, with one rank and with two:
 
     python -m tests.benchmarks.streaming --rows 10000000 --folder /tmp
 
 Writes rows of nine float32, eight columns and a target of which a fifth is wrong, to a file of 36 bytes a row, and
-removes it at the end. Prints nanoseconds a row of each pass and of reading and summing the same file, both warm and of
-one thread, the least of several in turn; seconds of a whole fit; the memory that it takes, anonymous (its own) and of
-the file's pages (the cache's, which gives them back); and the time of passes and of a fit of one rank and of two, of
-the slower one, by the clock and of the CPU, which is the fairer where the processors have other work.
+removes it at the end. Prints:
+
+- nanoseconds a row of each pass, and of reading and summing the same file, warm, of one thread, the least of several;
+- seconds of a whole fit, and its resident memory: anonymous memory, and pages of the file in the cache;
+- wall and CPU seconds of passes and of a fit with one rank and with two, of the slower rank. CPU time is the fairer
+  measure if the processors have other work.
 """
 
 from __future__ import annotations
@@ -37,10 +39,10 @@ from mkc_torch.linear.streaming._survey import survey_rows
 
 COLUMNS = 8
 WRITTEN = 1_000_000
-"""Rows that are drawn and written at a time."""
+"""Rows that are drawn and written at once."""
 
 READ = 65_536
-"""Rows that are summed at a time: of the powers of two the one that is fastest."""
+"""Rows that are summed at once: the fastest power of two."""
 
 POINT = StreamPoint(np.ones(COLUMNS), np.array([0.25]), np.array([0.5]))
 
@@ -89,11 +91,11 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def in_turn(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """The least seconds of each, all of them timed one after the other again and again."""
+    """The least seconds of each work; the works are timed in turn, ``repeats`` times."""
     best = dict.fromkeys(work, math.inf)
     for _ in range(repeats):
-        for name, one in work.items():
-            best[name] = min(best[name], seconds(one))
+        for name, run in work.items():
+            best[name] = min(best[name], seconds(run))
     return best
 
 
@@ -105,7 +107,7 @@ def resident() -> dict[str, float]:
 
 @contextmanager
 def watched() -> Iterator[dict[str, float]]:
-    """The most memory that is resident while something runs."""
+    """The peak of resident memory within the context, in MB."""
     most, over = resident(), threading.Event()
 
     def look() -> None:
@@ -122,45 +124,45 @@ def watched() -> Iterator[dict[str, float]]:
         thread.join()
 
 
-def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, told: Any) -> None:
+def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, results: Any) -> None:
     torch.set_num_threads(1)
     dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=ranks)
     batches, best = batches_of(path, (rank, ranks)), {}
     shape, group = Shape(1, COLUMNS, True, False), Ranks()
     length = StreamSums.length(shape)
-    # of a pass for the gradient also what its sums cost
+    # a pass for the gradient includes its sum over ranks
     work: dict[str, Callable[[], object]] = {
         "gradient in float32": lambda: group.sum_of(lambda: float32_pass(batches, shape, POINT), length),
         "gradient": lambda: group.sum_of(lambda: slopes_pass(batches, shape, POINT, curvature=False), length),
         "whole fit": lambda: StreamedMKCRegression().fit(batches),
     }
     for _ in range(repeats):
-        for name, one in work.items():
+        for name, run in work.items():
             dist.barrier()
             begin = time.process_time()
-            wall = seconds(one)
-            # of the slowest rank, as all wait for it
+            wall = seconds(run)
+            # all ranks wait for the slowest
             slowest = torch.tensor([wall, time.process_time() - begin])
             dist.all_reduce(slowest, dist.ReduceOp.MAX)
             best[name] = [min(pair) for pair in zip(best.get(name, [math.inf] * 2), slowest.tolist(), strict=True)]
     if rank == 0:
-        told.put(best)
+        results.put(best)
     dist.destroy_process_group()
 
 
 def of_ranks(ranks: int, path: Path, repeats: int) -> dict[str, list[float]]:
-    """Seconds of two passes and of a fit with so many processes of one thread, by the clock and of the CPU."""
+    """Wall and CPU seconds of two passes and of a fit with ``ranks`` processes of one thread."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     context = multiprocessing.get_context("spawn")
-    told = context.SimpleQueue()
+    results = context.SimpleQueue()
     processes = [
-        context.Process(target=rank_main, args=(rank, ranks, port, path, repeats, told)) for rank in range(ranks)
+        context.Process(target=rank_main, args=(rank, ranks, port, path, repeats, results)) for rank in range(ranks)
     ]
     for process in processes:
         process.start()
-    best: dict[str, list[float]] = told.get()
+    best: dict[str, list[float]] = results.get()
     for process in processes:
         process.join()
     return best
@@ -169,7 +171,7 @@ def of_ranks(ranks: int, path: Path, repeats: int) -> dict[str, list[float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", type=int, default=10_000_000)
-    parser.add_argument("--folder", type=Path, default=None, help="where the file is written")
+    parser.add_argument("--folder", type=Path, default=None, help="folder of the file")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -188,10 +190,10 @@ def main() -> None:
         print(f"{'a pass':<32}{'ns a row':>10}{'of the rate of read and sum':>30}")
         for name, time_taken in best.items():
             print(f"  {name:<30}{1e9 * time_taken / options.rows:>10.2f}{best['read and sum'] / time_taken:>29.0%}")
-        one, two = (of_ranks(ranks, path, max(2, options.repeats // 2)) for ranks in (1, 2))
+        single, double = (of_ranks(ranks, path, max(2, options.repeats // 2)) for ranks in (1, 2))
         print(f"{'ranks of one thread':<32}{'one, s':>10}{'two, s':>10}{'ratio':>10}{'ratio of CPU time':>20}")
-        for name in one:
-            (wall, cpu), (wall_of_two, cpu_of_two) = one[name], two[name]
+        for name in single:
+            (wall, cpu), (wall_of_two, cpu_of_two) = single[name], double[name]
             ratios = f"{wall / wall_of_two:>10.2f}{cpu / cpu_of_two:>20.2f}"
             print(f"  {name:<30}{wall:>10.2f}{wall_of_two:>10.2f}{ratios}")
 

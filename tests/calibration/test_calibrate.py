@@ -80,7 +80,7 @@ def test_field_strength_scales_the_corrected_field(demo):
     assert abs(float(norm.median()) - 50.0) < 0.05
 
 
-def test_residuals_stay_in_the_unit_of_the_recording_whatever_the_field_strength(demo):
+def test_residuals_are_in_the_unit_of_the_recording_for_any_field_strength(demo):
     a, b = calibrate(demo[0]), calibrate(demo[0], field_strength=1.0)
     assert b.field_unit == "µT"
     assert b.after == pytest.approx(a.after)
@@ -116,7 +116,7 @@ def test_gaussian_noise_rejects_nothing_and_round_trips_an_infinite_sigma():
 
 
 @pytest.mark.e2e
-def test_gaussian_noise_is_called_heavy_tailed_in_few_recordings_whatever_sigma_is():
+def test_gaussian_noise_is_rarely_called_heavy_tailed_for_any_sigma():
     made = [calibrate(recorded(noisy_ellipsoid(200, seed=seed))) for seed in range(20)]
     assert sum(math.isfinite(c.sigma) for c in made) > 4
     assert sum(not c.tails.is_gaussian for c in made) <= 2
@@ -200,7 +200,7 @@ def test_apply_keeps_every_row_and_passes_missing_values_on(demo_calibration):
     assert field["field_x"].isnan().tolist() == [False, True, False]
 
 
-def test_samples_that_are_not_finite_and_unsorted_times_are_told():
+def test_samples_that_are_not_finite_and_unsorted_times_are_reported():
     points = noisy_ellipsoid()
     time = torch.arange(len(points)) / 50.0
     points[5, 0], points[6, 1] = math.nan, math.inf
@@ -273,7 +273,7 @@ def test_semi_axes_of_unusual_lengths_are_warned_of():
     assert "longest semi-axis is 2.4 times the shortest" in warning
 
 
-def test_a_warning_of_missing_directions_says_whether_the_result_holds():
+def test_a_warning_of_missing_directions_states_whether_the_result_is_valid():
     points = noisy_ellipsoid(4000)
     away = torch.nn.functional.normalize((points - torch.tensor([5.0, -9.0, 20.0])), dim=-1)
     small, large = points[away[:, 2] < 0.7], points[away[:, 2] < 0.0]
@@ -284,7 +284,7 @@ def test_a_warning_of_missing_directions_says_whether_the_result_holds():
     assert "holds all the same" not in warning
 
 
-def test_exact_points_are_no_trouble():
+def test_exact_points_are_calibrated():
     c = calibrate(recorded(noisy_ellipsoid(noise=0.0)))
     assert c.center == pytest.approx((5.0, -9.0, 20.0))
     assert c.after.rms < 1e-6

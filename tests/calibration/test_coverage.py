@@ -56,7 +56,7 @@ def test_the_gap_of_a_cap_is_opposite_and_as_wide_as_the_rest(degrees):
     assert nearest_axis(gap.direction) == "-z"
 
 
-def test_one_direction_covers_the_near_cap():
+def test_a_single_direction_covers_its_cap():
     found = coverage(torch.tensor([[0.0, 0.0, 7.0]], dtype=torch.float64))
     assert found.fraction == pytest.approx(cap_share(NEAR_DEGREES), abs=0.003)
     assert found.gaps[0].degrees > 175.0

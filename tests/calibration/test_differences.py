@@ -68,7 +68,7 @@ def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
     assert f"{len(points)} samples" in sentences[1]
 
 
-def test_an_older_one_in_other_units_is_converted(pair, points):
+def test_an_older_calibration_in_other_units_is_converted(pair, points):
     new, old = pair
     in_gauss = dataclasses.replace(
         old,

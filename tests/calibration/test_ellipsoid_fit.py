@@ -266,7 +266,7 @@ UPRIGHT = torch.tensor([0, 0, 0, 1 / 35, 0, 0, 1 / 45, 0, 1 / 60], dtype=torch.f
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0, 5.0])
-def test_the_distance_is_the_orthogonal_one_to_first_order(noise):
+def test_the_distance_is_orthogonal_to_first_order(noise):
     points = fibonacci_sphere(300) * AXES + noise * sample(0, 300, 3)
     exact = torch.tensor([orthogonal_distance(p, AXES.numpy()) for p in points.numpy()], dtype=torch.float64)
     error = (sampson_distance(UPRIGHT, points) - exact).abs()
@@ -380,13 +380,13 @@ def test_the_finish_has_the_kind_of_errors_of_its_estimator():
     assert hasattr(finished(LeastAbsoluteDeviations()).fit(points), "center_se_")
 
 
-def test_without_a_finish_there_is_none():
+def test_without_a_finish_finish_is_none():
     assert EllipsoidFit().fit(disturbed(0)).finish_ is None
     with pytest.raises(ValueError, match="`finish` to be None or 'maximum_likelihood' but got 'ml'"):
         EllipsoidFit(finish="ml")
 
 
-def test_a_finish_is_refused_where_the_algebraic_fit_is():
+def test_a_finish_is_rejected_if_the_algebraic_fit_is():
     sphere = fibonacci_sphere(1000)
     cap = 50.0 * sphere[sphere[:, 2] > math.cos(math.radians(60))]
     with pytest.raises(NotIdentifiableError, match="Not identifiable"):
@@ -524,7 +524,7 @@ def test_mostly_equal_points_are_refused():
     assert "more than half of the points are equal" in str(refused(points))
 
 
-def test_half_of_the_points_equal_is_no_nan():
+def test_half_of_the_points_equal_gives_no_nan():
     points = surface(100) + 0.1 * sample(0, 100, 3)
     points[::2] = points[0]
     try:
@@ -598,7 +598,7 @@ def test_a_cloud_of_noise_is_accepted_with_infinite_max_scatter():
 
 
 @pytest.mark.parametrize(("value", "error"), [(0.0, ValueError), (math.nan, ValueError), ("wide", TypeError)])
-def test_a_scatter_that_is_no_share_is_refused(value, error):
+def test_an_invalid_max_scatter_is_rejected(value, error):
     with pytest.raises(error, match="`max_scatter`"):
         EllipsoidFit(max_scatter=value)
 
@@ -642,13 +642,13 @@ def test_points_that_are_not_finite_are_refused(bad):
 
 
 @pytest.mark.parametrize("points", [torch.ones(20, 3, dtype=torch.int64), [[1.0, 2.0, 3.0]], np.full((20, 3), "x")])
-def test_what_is_no_floating_tensor_is_refused(points):
+def test_points_must_be_a_floating_tensor(points):
     with pytest.raises(TypeError, match="`points`"):
         EllipsoidFit().fit(points)
 
 
 @pytest.mark.parametrize("estimator", ["lts", 3, MKCRegression, np.ones(3)])
-def test_what_is_no_estimator_is_refused_when_the_fit_is_made(estimator):
+def test_an_invalid_estimator_is_rejected_by_the_constructor(estimator):
     with pytest.raises(TypeError, match=r"`estimator` to be an estimator of mkc_torch\.linear but got") as refused:
         EllipsoidFit(estimator)
     assert ("the class MKCRegression; make one, MKCRegression(...)" in str(refused.value)) == (
@@ -671,12 +671,12 @@ def test_an_unfitted_ellipsoid_is_an_error():
         (torch.ones(19), ValueError, r"`sample_weight` of shape \(20,\) but got \(19,\); give a weight for each"),
     ],
 )
-def test_weights_that_are_none_are_refused(weight, error, message):
+def test_invalid_weights_are_rejected(weight, error, message):
     with pytest.raises(error, match=message):
         EllipsoidFit().fit(surface(20), weight)
 
 
-def test_points_to_calibrate_are_looked_at():
+def test_points_to_calibrate_are_checked():
     fit = EllipsoidFit().fit(surface(100))
     for points, error, message in (
         (surface(20).tolist(), TypeError, r"`points` .* got list; make a tensor of it"),
@@ -767,7 +767,7 @@ def test_what_a_point_of_weight_0_holds_does_not_matter():
     torch.testing.assert_close(fit.semi_axes_, expected.semi_axes_, rtol=0, atol=1e-8)
 
 
-def test_a_refused_fit_leaves_no_results_of_its_own_or_of_an_earlier_one():
+def test_a_failed_fit_leaves_no_results_not_even_of_an_earlier_fit():
     sphere = 50.0 * fibonacci_sphere(400)
     fit = EllipsoidFit().fit(sphere)
     with pytest.raises(NotIdentifiableError, match="Not identifiable") as refused:
@@ -846,7 +846,7 @@ def test_much_noise_in_all_directions_is_reported_and_the_finish_has_a_smaller_b
     assert float((finished_.center_ - CENTER).abs().max()) < 1.96 * float(finished_.center_se_.max())
 
 
-def test_points_that_something_else_moves_have_no_bias_of_noise():
+def test_infinite_max_scatter_has_no_bias_by_noise():
     points = surface(300) + 2.0 * sample(0, 300, 3)
     noisy, moved = (
         EllipsoidFit(LeastSquares()).fit(points),

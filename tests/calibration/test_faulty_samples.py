@@ -33,7 +33,7 @@ def recorded(points, rate=50.0, **columns):
     return Recording({"time": time, **dict(zip(AXES, points.unbind(-1), strict=True)), **columns})
 
 
-def test_a_sensor_that_freezes_to_the_end_is_named_where_its_noise_would_not_let_it():
+def test_a_sensor_frozen_to_the_end_is_recognised_by_its_noise():
     points = turned()
     points[1500:] = points[1500]
     (warning,) = faults(recorded(points))
@@ -108,7 +108,7 @@ def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, spee
     st.sampled_from([None, 0, 1, 2]), st.integers(60, 400), st.integers(100, 1400), st.integers(0, 99), st.booleans()
 )
 @settings(max_examples=15, deadline=None)
-def test_a_freeze_of_all_axes_or_of_one_is_named_with_its_place(axis, length, begin, seed, coarse):
+def test_a_freeze_of_all_axes_or_a_single_axis_is_located(axis, length, begin, seed, coarse):
     points = turned(seed=seed)
     if coarse:
         points = digits(points, 0.15)
@@ -130,7 +130,7 @@ def test_a_freeze_of_all_axes_or_of_one_is_named_with_its_place(axis, length, be
 
 @given(st.sampled_from([0, 1, 2]), st.sampled_from([-1.0, 1.0]), st.floats(0.6, 0.9), st.integers(0, 99))
 @settings(max_examples=12, deadline=None)
-def test_one_axis_that_is_cut_off_is_named_and_the_rest_is_calibrated(axis, side, share, seed):
+def test_a_clipped_axis_is_reported_and_the_rest_is_calibrated(axis, side, share, seed):
     points = digits(turned(seed=seed), 0.1)
     center = torch.tensor([4.0, -7.0, 11.0])
     limit = round(float(center[axis]) + side * share * 45.0, 1)
@@ -141,7 +141,7 @@ def test_one_axis_that_is_cut_off_is_named_and_the_rest_is_calibrated(axis, side
     assert warning.count("cut off") == 1
 
 
-def test_what_is_left_of_a_clipped_recording_is_calibrated():
+def test_the_remaining_samples_of_a_clipped_recording_are_calibrated():
     points = digits(turned(4000), 0.1)
     points[:, 0] = points[:, 0].clamp(max=40.0)
     c = calibrate(recorded(points))
@@ -151,7 +151,7 @@ def test_what_is_left_of_a_clipped_recording_is_calibrated():
 
 
 @pytest.mark.e2e
-def test_standard_errors_do_not_reach_from_one_run_to_the_next():
+def test_standard_errors_treat_runs_as_independent():
     # two runs with correlated ends: if they were joined, the lags between them would count
     points = turned(1200, noise=0.2)
     drift = torch.cat([torch.linspace(1.0, 0.0, 600), torch.linspace(0.0, 1.0, 600)]).double()

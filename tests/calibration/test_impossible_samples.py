@@ -47,7 +47,7 @@ def test_a_code_for_every_fifth_value_is_left_out():
     assert f"`mag_x` is 32767 {int(bad.sum())} times" in left.warnings[0]
 
 
-def test_several_columns_and_values_are_told_one_by_one_and_no_more_than_a_few():
+def test_at_most_a_few_columns_and_values_are_listed():
     recording = spoiled(tumbling(N, noise=0.3), 1e5, [7])
     recording = spoiled(recording, -2e5, [8], "mag_z")
     assert (

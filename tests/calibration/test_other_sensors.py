@@ -62,7 +62,7 @@ def test_an_acceleration_in_g_has_a_warning():
     assert "not gravity; the columns may be in g" in c.warnings[0]
 
 
-def test_what_is_no_sensor_or_not_there_is_refused():
+def test_an_unknown_or_missing_sensor_is_rejected():
     with pytest.raises(ValueError, match="'mag' or 'accel'"):
         calibrate(recorded(fibonacci_sphere(40)), sensor="gyro")
     with pytest.raises(MissingColumnError, match="accel_x"):

@@ -73,7 +73,7 @@ def test_weights_are_those_of_the_fit(calibration, recording):
     np.testing.assert_array_equal(shown, np.sort(calibration.weight(recording.magnetometer()).numpy()))
 
 
-def test_one_from_a_file_needs_a_recording(calibration, recording):
+def test_a_calibration_from_a_file_needs_a_recording(calibration, recording):
     read = Calibration.from_json(calibration.to_json())
     assert read == calibration
     with pytest.raises(ValueError, match="has no samples to draw; pass its recording"):
@@ -100,7 +100,7 @@ def test_a_notebook_shows_numbers_with_their_errors(calibration):
 
 
 @pytest.mark.parametrize("count", [1, 30, 4000])
-def test_what_is_covered_is_what_a_direction_is_near(count):
+def test_covered_directions_are_near_a_sample(count):
     lon, lat = np.meshgrid(np.linspace(-3.1, 3.1, 25), np.linspace(-1.5, 1.5, 13))
     directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions[:, 2] = directions[:, 2].abs()  # half of the sphere

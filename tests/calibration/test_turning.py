@@ -38,7 +38,7 @@ def test_samples_in_no_order_are_neither():
     assert turning(points[:10]) is None
 
 
-def test_of_a_rest_as_many_samples_are_taken_as_of_a_window_and_evenly():
+def test_a_rest_is_thinned_evenly_to_a_window():
     taken = thin_at_rest(tumbling(N, noise=0.3, moments=resting(N, 500, 1500)).magnetometer())
     inside = torch.nonzero(taken[550:1450]).flatten()
     assert 10 <= len(inside) <= 30
@@ -58,7 +58,7 @@ def test_a_sensor_that_mostly_rests_is_calibrated(first, share):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 2])
-def test_a_step_while_the_sensor_rests_could_be_of_any_size_and_is_none(seed):
+def test_a_step_during_a_rest_is_not_identifiable_and_not_reported(seed):
     """It shows only in a single direction, and tangents at a large step do not describe zero."""
     result = diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, seed=seed, moments=resting(N, 0, 900)))
     assert result.verdict == "adequate"
@@ -133,12 +133,12 @@ def tilting(seed, share, tilt=0.14, size=34.0):
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("tilt", [0.14, 0.3])
-def test_outliers_to_one_side_of_a_tilting_sensor_draw_no_ellipsoid_of_their_own(seed, tilt):
+def test_one_sided_outliers_of_a_tilting_sensor_do_not_form_an_ellipsoid(seed, tilt):
     with pytest.raises(NotIdentifiableError, match=r"[Ss]ingle samples|too few directions"):
         calibrate(tilting(seed, 0.2, tilt))
 
 
-def test_the_way_passes_by_samples_that_stand_apart_and_keeps_the_turns():
+def test_the_path_ignores_outliers_and_keeps_the_turns():
     slow = np.arange(N) / 200.0
     clean = tumbling(N, moments=slow).magnetometer()
     measured = tumbling(N, noise=0.3, moments=slow, sensor=outliers(0.2)).magnetometer()
@@ -154,12 +154,12 @@ def test_samples_too_sparse_for_a_path_are_still_calibrated():
     assert calibrate(rare).center == pytest.approx(OFFSET.tolist(), abs=0.3)
 
 
-def test_where_hardly_a_sample_would_be_left_all_are_taken():
+def test_all_samples_are_used_if_too_few_would_remain():
     recording = tumbling(200, noise=4.0, rate=10.0, sensor=np.where(np.arange(200)[:, None] % 3 == 0, 30.0, 0.0))
     assert int(thin_at_rest(recording.magnetometer()).sum()) >= 20
 
 
-def test_a_long_recording_is_confirmed_by_every_few_samples_of_its_way(monkeypatch):
+def test_a_long_recording_is_confirmed_by_a_subsample_of_its_path(monkeypatch):
     lengths = []
     fit = EllipsoidFit.fit
     monkeypatch.setattr(EllipsoidFit, "fit", lambda self, X, *rest: lengths.append(len(X)) or fit(self, X, *rest))

@@ -40,12 +40,12 @@ def apply(model, path):
 @pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.process)])
 def run(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("challenge") / "out"
-    told = []
+    reported = []
     result = run_challenge(
         diagnose, apply, cases=3, empty=3, seed=3, output=output, workers=request.param, subject=magnetometer(DURATION),
-        progress=lambda stage, done, total: told.append((stage, done, total)),
+        progress=lambda stage, done, total: reported.append((stage, done, total)),
     )  # fmt: skip
-    return result, output, told
+    return result, output, reported
 
 
 def test_the_hash_matches_the_key(run):
@@ -69,8 +69,8 @@ def test_what_failed_is_scored_as_failed(run):
 
 
 def test_progress_covers_each_stage(run):
-    _, _, told = run
-    assert {stage for stage, done, total in told if done == total} == {
+    _, _, reported = run
+    assert {stage for stage, done, total in reported if done == total} == {
         "draw", "diagnose", "second recordings", "baseline",
     }  # fmt: skip
 

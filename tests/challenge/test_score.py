@@ -55,8 +55,8 @@ def test_false_alarms_are_claims_that_physics_is_missing():
 @pytest.mark.parametrize(("grade", "claimed"), [("left_out", 1), ("small", 1), (None, 1), ("unconfirmed", 0),
                                                 ("nearest", 0)])  # fmt: skip
 def test_the_grade_decides_whether_a_finding_is_a_claim(grade, claimed):
-    told = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
-    result = score([key("a"), key("b", "empty")], {"a": told, "b": told})
+    reported = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
+    result = score([key("a"), key("b", "empty")], {"a": reported, "b": reported})
     assert result.named.count == result.false_alarms.count == claimed
     assert result.confusion["nothing"] == {"hard_iron_step" if claimed else "unknown": 1}
     assert [b.found.count for b in result.power_z if b.found.total] == [1]
@@ -185,11 +185,11 @@ def at(places, effect="coulomb_friction", **more):
 
 
 def test_located_right_counts_effects_with_several_ports():
-    told = finding("coulomb_friction") | {"channels": ["rate of speed"]}
+    reported = finding("coulomb_friction") | {"channels": ["rate of speed"]}
     right, wrong = at(["rate of speed", "rate of turn"]), at(["rate of turn"])
-    assert score([right], {"a": says(told)}).located.count == 1
-    assert score([wrong], {"a": says(told)}).located.count == 0
-    assert score([wrong], {"a": says(told)}).driver.total == 0
+    assert score([right], {"a": says(reported)}).located.count == 1
+    assert score([wrong], {"a": says(reported)}).located.count == 0
+    assert score([wrong], {"a": says(reported)}).driver.total == 0
     assert score([key("a")], {"a": says(finding("hard_iron_step"))}).located.total == 0
 
 
@@ -204,8 +204,8 @@ def test_an_inseparable_rival_is_right_at_its_own_place():
 
 def test_other_thresholds_can_be_given():
     asked = (Threshold("located_right", 0.5, 1.0, "somewhere"),)
-    told = finding("coulomb_friction") | {"channels": ["rate of turn"]}
-    (found,) = score([at(["rate of turn"])], {"a": says(told)}, thresholds=asked).measured
+    reported = finding("coulomb_friction") | {"channels": ["rate of turn"]}
+    (found,) = score([at(["rate of turn"])], {"a": says(reported)}, thresholds=asked).measured
     assert found.holds
 
 

@@ -18,8 +18,8 @@ from tests.cli.test_diagnose import mkc, refused
 def adequate(paths, folder):
     for path in paths:
         (folder / path.stem).mkdir()
-        told = {"verdict": "adequate", "findings": []}
-        (folder / path.stem / "diagnosis.json").write_text(json.dumps(told))
+        reported = {"verdict": "adequate", "findings": []}
+        (folder / path.stem / "diagnosis.json").write_text(json.dumps(reported))
 
 
 def test_scenarios_are_scored_and_printed_with_their_aims(tmp_path, monkeypatch):

@@ -186,9 +186,9 @@ def test_unsorted_and_repeated_times_are_reported(tmp_path):
     path = table(tmp_path / "times.csv", noisy_ellipsoid(300), time=time)
     result = mkc("calibrate", path, "--output", tmp_path / "out")
     assert result.exit_code == 0
-    told = " ".join(result.stdout.split())
-    assert "ran backwards" in told
-    assert "repeat the time" in told
+    reported = " ".join(result.stdout.split())
+    assert "ran backwards" in reported
+    assert "repeat the time" in reported
 
 
 @pytest.mark.parametrize("factor", [1e306, 1e-306])

@@ -126,7 +126,7 @@ def test_the_model_corrects_a_second_recording(stepped, tmp_path):
     output = tmp_path / "corrected.csv"
     result = mkc("apply", folder / "model.json", new, "--output", output)
     assert result.exit_code == 0, result.output
-    assert "note: hard_iron_step is bound to the time" in result.stdout
+    assert "note: hard_iron_step depends on the time" in result.stdout
     corrected = Recording.read(output)
     assert corrected.names == (*Recording.read(new).names, "field_x", "field_y", "field_z")
     length = corrected.stack("field_x", "field_y", "field_z").norm(dim=-1)
@@ -160,7 +160,7 @@ def test_apply_distinguishes_models_from_other_files(stepped, tmp_path):
     for change, words in (
         ({"schema": "mkc-model/9"}, ['its schema is "mkc-model/9"', "mkc diagnose"]),
         ({"schema": None}, ["its schema is missing"]),
-        ({"effects": [content["effects"][0] | {"effect": "of_my_own"}]}, ['"of_my_own" is not known']),
+        ({"effects": [content["effects"][0] | {"effect": "of_my_own"}]}, ['"of_my_own" is unknown']),
         ({"parameters": "none"}, ["damaged"]),
     ):
         (tmp_path / "odd.json").write_text(json.dumps(content | change), encoding="utf-8")
@@ -203,9 +203,9 @@ def test_a_clock_that_jumps(tmp_path):
     clock[250:] += 5.0
     clock[[10, 11]] = clock[[11, 10]]
     clock[50] = clock[49]
-    told = warnings_of(quiet(tmp_path / "a.csv", time=clock), tmp_path / "out")
+    reported = warnings_of(quiet(tmp_path / "a.csv", time=clock), tmp_path / "out")
     for words in ("ran backwards 1 time", "Dropped 1 of 500 samples that repeat", "1 gap of more than"):
-        assert words in told
+        assert words in reported
 
 
 @pytest.mark.e2e
@@ -219,9 +219,9 @@ def test_columns_that_can_drive_nothing(tmp_path):
         still=torch.full((500,), 3.0),
         empty=torch.full((500,), math.nan),
     )
-    told = warnings_of(path, tmp_path / "out")
+    reported = warnings_of(path, tmp_path / "out")
     for words in ("`still` is constant", "`empty` has no finite values", "`temperature` and `copy` are copies"):
-        assert words in told
+        assert words in reported
 
 
 @pytest.mark.e2e
@@ -348,7 +348,7 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--surrogates", "18"), "at least 19 at level 0.05"),
         ((path, *out, *known, "--seed", "-1"), "--seed"),
         ((path, *out, *known, "--noise", "norm"), "--noise"),
-        ((path, *out, *known, "--noise", "norm=much"), "is no number"),
+        ((path, *out, *known, "--noise", "norm=much"), "is not a number"),
         ((path, *out, *known, "--noise", "norm=0"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=inf"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), "given twice"),
@@ -413,9 +413,9 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
         while not out.is_dir() and process.poll() is None and time.monotonic() < waited:
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=60)
+        _, reported = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "Traceback" not in told
+    assert "Traceback" not in reported
     assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
 
 

@@ -50,7 +50,7 @@ def test_a_finding_in_a_dozen_lines():
         "compare a smooth correction by all recorded columns and by time reaches",
         "noise autoregressive: noise with a memory",
         "If it is hard-iron step: look for what changed at that time; use the calibration from after the step.",
-        "to do To tell hard-iron step from current field (current), record again: a step does not come",
+        "to do To distinguish hard-iron step from current field (current), record again: a step does not come",
         "The model found here corrects for hard-iron step: confirm it on a second recording.",
         "mkc apply model.json NEW.csv --output corrected.csv",
         "warning 3 samples",
@@ -71,8 +71,8 @@ def test_where_in_the_states_a_finding_lies():
 def test_nothing_found():
     text = flat(shown(make_diagnosis(0)))
     assert "The recording shows no missing physics." in text
-    assert "how sure p = 0.37; 64 candidates, level 0.05" in text
-    assert "to do Use the simulation without findings" in text
+    assert "how sure p = 0.37, corrected for 64 candidates, level 0.05" in text
+    assert "to do The simulation can be used" in text
 
 
 def test_several_findings_are_numbered():
@@ -133,8 +133,8 @@ def test_without_a_smooth_correction_there_is_no_line_of_it():
 
 def test_a_rare_p_value_contradicts_an_adequate_verdict():
     text = flat(shown(make_diagnosis(0, p_value=0.04)))
-    assert "Nothing is missing" not in text
-    assert "Something is there that noise alone rarely makes" in text
+    assert "no missing physics" not in text
+    assert "The strongest candidate is significant" in text
     assert "how sure p = 0.04" in text
 
 
@@ -157,7 +157,7 @@ def test_the_four_answers_stand_first():
     quiet = make_diagnosis(0, simulation="Pendulum", environment=make_environment(process_noise=(), disturbance=()))
     assert answers(quiet).startswith(
         "flight_07 against Pendulum The recording shows no missing physics. "
-        "follows angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
+        "fit angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
         "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named nothing unexplained nothing"
     )
 
@@ -168,14 +168,14 @@ def test_process_noise_is_located_before_any_finding():
     )
     told = answers(pushed)
     assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in told
-    assert "noise Process noise acts on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in told
+    assert "noise Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in told
     assert "named nothing unexplained the rate of `rate`" in told
 
 
 def test_a_simulation_that_does_not_follow_names_nothing():
     text = flat(shown(make_unfit(), width=200))
-    assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. follows angle: the")
-    assert "explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by 0.360 rad" in text
+    assert text.startswith("flight_07 against Pendulum The simulation does not fit the recording. fit angle: the")
+    assert "explains 12 % of the variance; RMSE 0.360 rad, of the output's mean 0.350 rad" in text
     assert "why Another start reaches 0.006 rad" in text
     assert "named nothing: a simulation must fit before physics is named" in text
     for words in ("Use the simulation", "how sure", "compare", "unexplained"):
@@ -189,7 +189,7 @@ def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
         assert f"named nothing confirmed; hard-iron step: {grade}" in text
         assert "unexplained unnamed structure" in text
     shape = flat(shown(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
-    assert "likelier by 163 nats (p = 0.002 if the name is right); 0.0071 |x|^1.52 sign(x)" in shape
+    assert "gains 163 nats (p = 0.002 if the name is right); 0.0071 |x|^1.52 sign(x)" in shape
 
 
 def test_each_output_has_its_own_unit():

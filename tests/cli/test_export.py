@@ -143,9 +143,9 @@ def test_the_new_calibration_is_compared_with_the_old(done, tmp_path):
     other = table(tmp_path / "other.csv", noisy_ellipsoid(300, seed=5) + torch.tensor([0.0, 2.0, 0.0]))
     result = mkc("calibrate", other, "--output", tmp_path / "out", "--compare-with", old)
     assert result.exit_code == 0, result.output
-    told = " ".join(result.stdout.split())
+    reported = " ".join(result.stdout.split())
     shown = (tmp_path / "out" / "other" / "report.html").read_text(encoding="utf-8")
-    for text in (told, shown):
+    for text in (reported, shown):
         assert "Beside the calibration mast" in text
         assert "It differs: offset y by +" in text
         assert "matrix yz" in text
@@ -159,7 +159,7 @@ def test_the_compared_calibration_is_never_replaced(good, tmp_path):
     old = tmp_path / "good" / "calibration.json"
     before = old.read_bytes()
     result = mkc("calibrate", good, "--output", tmp_path, "--compare-with", old, "--field-strength", 48, "--force")
-    refused(result, "--output would replace", "choose another --output")
+    refused(result, "--output would replace", "choose another")
     assert old.read_bytes() == before
 
 

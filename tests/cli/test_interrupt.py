@@ -38,8 +38,8 @@ def test_one_line_while_torch_is_imported(tmp_path):
         while not begun.exists() and process.poll() is None and time.monotonic() < waited:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=60)
-    assert told == "mkc: interrupted; nothing was written.\n"
+        _, reported = process.communicate(timeout=60)
+    assert reported == "mkc: interrupted; nothing was written.\n"
     assert process.returncode == 130
 
 
@@ -73,7 +73,7 @@ def interrupting(monkeypatch, command, name, after=0):
     monkeypatch.setattr(module, name, interrupted)
 
 
-def told(result, sentence):
+def reported(result, sentence):
     assert result.exit_code == 130
     assert result.stderr == f"mkc: interrupted; {sentence}\n"
 
@@ -83,7 +83,7 @@ def test_an_interrupted_calibrate_names_the_recordings_without_results(tmp_path,
     paths = [table(tmp_path / f"{name}.csv", noisy_ellipsoid(200)) for name in "abc"]
     interrupting(monkeypatch, "calibration_files", "fit", after=1)
     result = mkc("calibrate", *paths, "--output", tmp_path / "out")
-    told(result, f"nothing was written for {paths[1]}, {paths[2]}.")
+    reported(result, f"nothing was written for {paths[1]}, {paths[2]}.")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a"]
     assert "a\noffset" in result.stdout
 
@@ -91,7 +91,7 @@ def test_an_interrupted_calibrate_names_the_recordings_without_results(tmp_path,
 def test_an_interrupted_diagnose_names_the_recordings_without_results(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
     interrupting(monkeypatch, "diagnosis_files", "diagnose_file")
-    told(
+    reported(
         mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path / "out"),
         f"nothing was written for {path}.",
     )
@@ -103,11 +103,11 @@ def test_an_interrupted_apply_or_demo_reports_its_files(tmp_path, monkeypatch):
     assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
     interrupting(monkeypatch, "correction", "correct")
     output = tmp_path / "o.csv"
-    told(
+    reported(
         mkc("apply", tmp_path / "a" / "calibration.json", path, "--output", output), f"nothing was written to {output}."
     )
     interrupting(monkeypatch, "demonstration", "simulated_recording")
-    told(mkc("demo", "--output", tmp_path / "demo"), f"nothing was written to {tmp_path / 'demo'}.")
+    reported(mkc("demo", "--output", tmp_path / "demo"), f"nothing was written to {tmp_path / 'demo'}.")
     assert not (tmp_path / "demo").exists()
 
 

@@ -14,7 +14,7 @@ from mkc_torch.simulation import load_simulation
 
 
 def mkc(*arguments):
-    return CliRunner().invoke(app, [str(one) for one in arguments])
+    return CliRunner().invoke(app, [str(item) for item in arguments])
 
 
 @pytest.mark.parametrize(("command", "kind"), [("new-simulation", "Dynamics"), ("new-effect", "GainEffect")])
@@ -30,7 +30,7 @@ def test_two_files_are_written_and_nothing_is_replaced(tmp_path, monkeypatch, co
     assert result.exit_code == 1
     assert "test_two_kites.py exists; choose another name, or replace it with `--force`." in result.stderr
     # neither of the two, where one cannot be
-    assert [one.name for one in tmp_path.iterdir()] == ["test_two_kites.py"]
+    assert [item.name for item in tmp_path.iterdir()] == ["test_two_kites.py"]
     assert (tmp_path / "test_two_kites.py").read_text(encoding="utf-8") == "mine"
     assert mkc(command, "two_kites", "--force", "--output", tmp_path).exit_code == 0
     assert "TwoKites" in (tmp_path / "test_two_kites.py").read_text(encoding="utf-8")

@@ -254,7 +254,7 @@ def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_p
 def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     given = {}
 
-    def told(*_arguments, **options):
+    def reported(*_arguments, **options):
         given.update(options)
         raise ValueError("far enough")
 
@@ -267,7 +267,7 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     assert "they are `voltage`" in flat(result.stderr)
     result = mkc(*command, "--noise", "voltage=0.01", "--input-hold", "voltage=held")
     assert "inputs in the equations of this simulation but got `voltage`; it has none" in flat(result.stderr)
-    monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", told)
+    monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", reported)
     result = mkc(
         *command, "--noise", "voltage=0.01, other=2", "--noise", "third=1e-3", "--input-hold", "temperature=held"
     )

@@ -166,8 +166,8 @@ def test_a_diagnosis_reports_its_stages():
     from mkc_torch.recording.demonstration import concealed_recording
     from mkc_torch.simulation import Magnetometer
 
-    told = []
-    diagnose(Magnetometer(), concealed_recording(), surrogates=19, progress=told.append)
-    assert told[:2] == ["reading the recording", "fitting the simulation alone"]
-    assert re.fullmatch(r"trying \d+ effects", told[2])
-    assert re.fullmatch(r"trying \d+ effects beside 1 found", told[3])
+    reported = []
+    diagnose(Magnetometer(), concealed_recording(), surrogates=19, progress=reported.append)
+    assert reported[:2] == ["reading the recording", "fitting the simulation alone"]
+    assert re.fullmatch(r"trying \d+ effects", reported[2])
+    assert re.fullmatch(r"trying \d+ effects beside 1 found", reported[3])

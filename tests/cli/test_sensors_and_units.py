@@ -166,7 +166,7 @@ def test_the_users_simulation_declares_its_own_units():
 def test_inspect_shows_columns_rates_units_and_the_command(folder):
     result = mkc("inspect", folder / "one.csv", folder / "two.csv")
     assert result.exit_code == 0, result.output
-    told = flat(result.stdout)
+    reported = flat(result.stdout)
     for words in (
         "table: 300 rows, 50 Hz, 5.98 s, no gaps",
         "magX [nT] numbers nT mag_x",
@@ -175,7 +175,7 @@ def test_inspect_shows_columns_rates_units_and_the_command(folder):
         f"mkc calibrate {folder / 'one.csv'} --output results",
         "magnetometer mag1: mag_x from mag1_x",
     ):
-        assert words in told, told
+        assert words in reported, reported
 
 
 @pytest.mark.slow

@@ -177,9 +177,9 @@ def test_ctrl_c_ends_all_processes_and_its_files_are_whole(tmp_path):
         assert process.poll() is None, process.communicate()
         os.killpg(process.pid, signal.SIGINT)
         # copies have the same streams, which end when the last one has
-        _, told = process.communicate(timeout=120)
-    assert process.returncode == 130, told
-    assert told.startswith(f"mkc: interrupted; what was known until then was written for {path}.\n")
+        _, reported = process.communicate(timeout=120)
+    assert process.returncode == 130, reported
+    assert reported.startswith(f"mkc: interrupted; what was known until then was written for {path}.\n")
     assert search_of(out / "a")["stopped"]["reason"] == "interrupt"
 
 

@@ -162,6 +162,6 @@ def test_two_runs_into_one_folder_do_not_mix(commands, monkeypatch):
     monkeypatch.setattr(os, "fsync", meanwhile)
     assert mkc(*command).exit_code == 0
     assert second[0].exit_code == 1, second[0].exception
-    told = " ".join(second[0].output.split())
-    assert "is being written by another mkc; wait for it, or choose another output folder" in told
+    reported = " ".join(second[0].output.split())
+    assert "is being written by another mkc; wait for it, or choose another output folder" in reported
     assert len(written(command[-1])) == files

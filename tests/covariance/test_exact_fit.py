@@ -1,4 +1,4 @@
-"""Samples of which many lie on a hyperplane: it is reported, and samples near a hyperplane are not."""
+"""Exact fits: many samples on a hyperplane are an error that reports it; samples near a hyperplane are fitted."""
 
 import math
 import pickle
@@ -19,7 +19,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def on_a_plane(on: int = 40, N: int = 60) -> Tensor:
-    """The first ``on`` samples fulfil z = 2 x - y + 5."""
+    """(N, 3) samples; the first ``on`` fulfil z = 2 x - y + 5."""
     X = sample(0, N, 3)
     X[:on, 2] = 2.0 * X[:on, 0] - X[:on, 1] + 5.0
     return X
@@ -43,7 +43,7 @@ def test_the_error_reports_the_plane(dtype):
     assert "take `h` well above 40" in str(error)
 
 
-def test_a_plane_of_fewer_than_h_samples_is_no_exact_fit():
+def test_a_plane_of_fewer_than_h_samples_is_not_an_exact_fit():
     X = on_a_plane()
     assert float(torch.linalg.eigvalsh(MCD(h=50).fit(X).covariance_).min()) > 0.01
     with pytest.raises(ExactFitError):

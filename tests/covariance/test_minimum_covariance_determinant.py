@@ -21,7 +21,7 @@ def sample(seed: int, *shape: int) -> Tensor:
 
 
 def contaminated(seed: int, N: int = 60, p: int = 3, share: float = 0.3) -> Tensor:
-    """Correlated points, the first rows far off."""
+    """Correlated samples (N, p); the first ``share`` of the rows are far outliers."""
     X = sample(seed, N, p) @ (torch.eye(p, dtype=torch.float64) + 0.5 * sample(seed + 1, p, p))
     X[: int(share * N)] += 10.0 + sample(seed + 2, int(share * N), p)
     return X
@@ -48,7 +48,7 @@ def test_estimates_equal_robustbase(reference):
     assert float(fit.objective_) == pytest.approx(reference.objective, rel=1e-6)
     assert fit.raw_location_.tolist() == pytest.approx(list(reference.raw_location), rel=1e-6)
     assert fit.location_.tolist() == pytest.approx(list(reference.location), rel=1e-6)
-    # of a single column R's has the divisor h, where its criterion and every other has h - 1
+    # R divides the variance of a single column by h; its criterion and all its covariances divide by h - 1
     divisor = reference.h / (reference.h - 1) if len(reference.location) == 1 else 1.0
     variance = [divisor * value for value in reference.raw_variance]
     assert fit.raw_covariance_.diagonal().tolist() == pytest.approx(variance, rel=1e-6)
@@ -155,7 +155,7 @@ def test_large_samples_reach_a_fixed_point():
     assert set(nearest.tolist()) == set(fit.support_.nonzero().flatten().tolist())
 
 
-# what it is for
+# robustness and consistency
 
 
 @pytest.mark.parametrize("p", [1, 2, 4])
@@ -221,7 +221,7 @@ def test_the_determinant_of_few_samples_is_unbiased(N, p):
 # limits and properties
 
 
-def test_every_sample_without_reweighting_is_the_sample_covariance():
+def test_full_support_without_reweighting_gives_the_sample_covariance():
     X = contaminated(0)
     for fit in (MCD(1.0, reweight=False).fit(X), MCD(h=60, reweight=False).fit(X)):
         torch.testing.assert_close(fit.location_, X.mean(0))
@@ -280,7 +280,7 @@ def test_the_order_of_samples_does_not_matter():
     assert torch.equal(shuffled.support_, fit.support_[order])
 
 
-def test_single_precision_gives_the_same_in_single_precision():
+def test_single_precision_equals_double_precision():
     X = (contaminated(0) + 1e3).float()
     single, double = MCD().fit(X), MCD().fit(X.double())
     for name in ("location_", "covariance_", "distances_", "weights_", "objective_"):
@@ -320,7 +320,9 @@ def test_distances_equal_the_mahalanobis_formula():
     torch.testing.assert_close(fit.mahalanobis(new), squared.sqrt())
     many = MCD().fit(torch.stack([contaminated(0), contaminated(1)]))
     torch.testing.assert_close(many.mahalanobis(new)[0], fit.mahalanobis(new[0]))
-    assert fit.distance_cutoff_ == pytest.approx(3.0575, abs=1e-4)  # sqrt of 9.3484, of any table
+    assert fit.distance_cutoff_ == pytest.approx(
+        3.0575, abs=1e-4
+    )  # sqrt(9.3484), the 0.975 quantile of chi-square with 3 degrees of freedom
 
 
 def test_support_fraction_and_h_are_equivalent():

@@ -118,7 +118,7 @@ def test_arrays_are_accepted_and_the_given_estimator_stays_unfitted():
         _ = scatter.location_
 
 
-# refusals
+# bad arguments
 
 
 def test_bad_arguments_are_refused():

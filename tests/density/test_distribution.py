@@ -225,7 +225,7 @@ def test_samples_follow_the_cdf(sigma, length):
     assert ((x - 5.0) ** 2).mean().item() == pytest.approx(p.variance.item(), abs=4 * spread)
 
 
-def test_samples_in_float32_follow_the_cdf_too():
+def test_samples_in_float32_follow_the_cdf():
     torch.manual_seed(4)
     p = MKCDistribution(1.5, 2.0, 30.0, loc=-1.0)
     x = p.rsample((20_000,))
@@ -480,12 +480,12 @@ def test_log_prob_has_gradients_in_every_parameter():
     assert torch.autograd.gradgradcheck(lambda v, *a: MKCDistribution(*a).log_prob(v), (value, *leaves))
 
 
-def test_there_is_no_silent_kl_divergence():
+def test_kl_divergence_is_not_implemented():
     with pytest.raises(NotImplementedError):
         kl_divergence(MKCDistribution(2.0, 1.0, 5.0), MKCDistribution(2.0, 1.0, 5.0))
 
 
-def test_works_inside_independent_and_transformed_distributions():
+def test_independent_and_transformed_distributions_accept_it():
     base = MKCDistribution(torch.tensor([0.5, 2.0, INF]), 1.0, 10.0)
     joint = Independent(base, 1)
     x = torch.tensor([[0.1, -2.0, 3.0], [5.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Helpers of alternating fits: weights of an E-step, the Gaussian state, states of a part of a batch."""
+"""Helpers of alternating fits: weights of an E-step, the Gaussian state, and states of some problems of a batch."""
 
 import torch
 

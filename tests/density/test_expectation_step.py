@@ -1,3 +1,5 @@
+"""The expectation step: maximum likelihood, annealing, narrow domains, and damping."""
+
 import math
 
 import pytest
@@ -37,9 +39,9 @@ def test_gaussian_residuals_reach_infinite_sigma_exactly():
 
 def test_annealed_step_takes_a_share_of_kappa_and_fits_d_for_it():
     error = residuals()
-    ones = torch.ones_like(error)
-    full = expectation_step(error, ones, **DOMAIN)
-    part = expectation_step(error, ones, **DOMAIN, share=0.25)
+    weight = torch.ones_like(error)
+    full = expectation_step(error, weight, **DOMAIN)
+    part = expectation_step(error, weight, **DOMAIN, share=0.25)
     torch.testing.assert_close(part.kappa, 0.25 * full.kappa)
     d = fit_density(error, **DOMAIN, sigma=2 * full.kappa.rsqrt()).d
     torch.testing.assert_close(part.d, d)

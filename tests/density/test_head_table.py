@@ -1,4 +1,4 @@
-"""The table of the head against the quadrature."""
+"""The table of the head equals the quadrature."""
 
 import math
 
@@ -16,7 +16,7 @@ def uniform(low, high, *shape, seed=0):
 
 @pytest.mark.parametrize(("shortest", "longest", "rounding"), [(1.0, 15.0, 5e-6), (15.0, 1e7, 5e-7)])
 def test_many_normalisers_in_single_precision_equal_double_precision(shortest, longest, rounding):
-    """Mostly by quadrature, where the tail cancels in the derivative, and by the table alone."""
+    """Short domains mostly use the quadrature, where the tail cancels in the derivative; long domains the table."""
     n = 5000
     kappa = torch.cat(
         [uniform(0.0, 1.0, n), uniform(0.0, 400.0, n), torch.exp(uniform(-14.0, 5.99, n)), torch.zeros(9)]
@@ -48,7 +48,7 @@ def test_the_table_is_more_accurate_than_single_precision():
 
 
 @pytest.mark.parametrize("reach", [9.0, 50.0])
-def test_nan_zero_and_no_elements_go_through_the_table(reach):
+def test_nan_zero_and_empty_tensors_are_accepted(reach):
     kappa = torch.full((10, 10), 0.1)
     kappa[2, 3], kappa[4, 5] = math.nan, 0.0
     length = torch.full_like(kappa, reach)
@@ -59,13 +59,13 @@ def test_nan_zero_and_no_elements_go_through_the_table(reach):
     assert log_partition(kappa[:0], length[:0]).shape == (0, 10)
 
 
-def test_second_derivatives_and_transposed_elements():
+def test_second_derivatives_of_transposed_elements_equal_double_precision():
     kappa = uniform(0.05, 2.0, 9, 20).float().mT.requires_grad_()
     length = uniform(1.0, 60.0, 9, 20, seed=1).float().mT
     found, expected = [], []
     for results, dtype in ((found, torch.float32), (expected, torch.float64)):
         k = kappa.detach().to(dtype).requires_grad_()
         (slope,) = torch.autograd.grad(log_partition(k, length.to(dtype)).sum(), k, create_graph=True)
-        (bend,) = torch.autograd.grad(slope.sum(), k)
-        results += [slope.detach().double(), bend.double()]
+        (curvature,) = torch.autograd.grad(slope.sum(), k)
+        results += [slope.detach().double(), curvature.double()]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

@@ -20,7 +20,7 @@ def mixed(seed, count=4000):
     return error
 
 
-def of_one_kernel(learned, other, bound):
+def single_kernel_likelihood(learned, other, bound):
     fit = fit_density(learned, bound=bound)
     return float(MKCDistribution(fit.sigma, fit.d, fit.bound).log_prob(other).mean())
 
@@ -33,7 +33,7 @@ def test_held_out_likelihood_of_a_decreasing_tail_is_near_the_truth_and_above_a_
     several = float(fit_kernels(learned, bound=bound).log_prob(other).mean())
     truth = float(stats.t(freedom).logpdf(other).mean())
     assert several == pytest.approx(truth, abs=5e-3)
-    assert several > of_one_kernel(learned, other, bound) + (0.02 if freedom < 3.0 else 0.005)
+    assert several > single_kernel_likelihood(learned, other, bound) + (0.02 if freedom < 3.0 else 0.005)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -42,7 +42,7 @@ def test_uniform_outliers_and_gaussian_errors_are_described_as_by_a_single_kerne
     for error, bound in ((mixed(seed), 20.0), (normal, 10.0)):
         order = torch.randperm(4000, generator=torch.Generator().manual_seed(seed))
         learned, other = error[order[:2000]], error[order[2000:]]
-        first = of_one_kernel(learned, other, bound)
+        first = single_kernel_likelihood(learned, other, bound)
         assert float(fit_kernels(learned, bound=bound).log_prob(other).mean()) == pytest.approx(first, abs=0.01)
 
 
@@ -115,8 +115,8 @@ def test_residuals_without_a_density_are_refused(error, bound, match):
 
 def test_a_bound_of_a_single_channel_applies_to_all():
     both = torch.cat([drawn(0, 1.0), drawn(1, 1.0)], -1)
-    of_one, of_each = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
-    assert of_one.bound.tolist() == of_each.bound.tolist() == [90.0, 90.0]
+    shared, separate = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
+    assert shared.bound.tolist() == separate.bound.tolist() == [90.0, 90.0]
 
 
 def test_there_is_a_kernel_for_every_octave_up_to_the_bound():

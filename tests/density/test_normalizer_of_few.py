@@ -1,4 +1,4 @@
-"""The normaliser in NumPy equals that of the tensors, in value and derivatives, over its whole range."""
+"""The normaliser in NumPy equals the normaliser in PyTorch, in value and derivatives, over the whole range."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ SECTIONS = ("agreement", "steps", "training", "capture", "compiled", "variants",
 
 
 def main() -> None:
-    """Run the sections."""
+    """Run the chosen sections; exit with an error if values differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS)

@@ -21,7 +21,7 @@ SHAPES: tuple[tuple[tuple[int, ...], int], ...] = (
     ((200_001, 1), -1),
 )
 TOLERANCE = {torch.float32: 3e-5, torch.float64: 1e-7, torch.bfloat16: 2e-2, torch.float16: 4e-3}
-"""Largest difference over the largest number, by the dtype of the predictions."""
+"""Tolerance of the largest difference, relative to the largest number, by the dtype of the predictions."""
 
 
 def found(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> list[Tensor]:
@@ -54,7 +54,7 @@ def cases() -> list[Case]:
 
 
 def compared(device: str, case: Case) -> list[tuple[str, float]]:
-    """Name of each compared quantity, and its difference from the reference over the largest number."""
+    """Name of each compared quantity, and its largest difference relative to the largest number."""
     name, shape, axis, reduction, weighted, dtype = case
     generator = torch.Generator().manual_seed(1)
     x, y = torch.randn(2, *shape, generator=generator)
@@ -77,7 +77,7 @@ def compared(device: str, case: Case) -> list[tuple[str, float]]:
 
 
 def print_agreement(device: torch.device) -> bool:
-    """Print the worst difference of each dtype; whether all are within the tolerances."""
+    """Print the largest difference of each dtype. Returns whether all are within the tolerances."""
     todo = cases()
     run = functools.partial(compared, str(device))
     if device.type == "cuda":  # compiling takes most of the time

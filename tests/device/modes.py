@@ -1,4 +1,4 @@
-"""The modes of the loss for every section, comparable losses, and the floor of memory traffic."""
+"""Modes of the loss, comparable losses, timing, and the rate of memory traffic."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LearnedStudentT(nn.Module):
 
 @dataclass
 class Step:
-    """Forward and backward pass of a loss on a batch, the fill of the upstream gradient included."""
+    """Forward and backward pass of a loss on a batch, including the fill of the upstream gradient."""
 
     loss: Callable[..., Tensor]
     parameters: list[nn.Parameter]
@@ -83,7 +83,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def seconds(step: Callable[[], object], device: torch.device, *, budget: float = 0.4, least: int = 5) -> float:
-    """Median time of a step, over groups of steps within a budget of seconds."""
+    """Median seconds of a step, over groups of steps within ``budget`` seconds."""
     for _ in range(3):
         step()
     synchronise(device)
@@ -106,12 +106,12 @@ def seconds(step: Callable[[], object], device: torch.device, *, budget: float =
 
 
 def copy_rate(device: torch.device, size: int) -> float:
-    """Bytes a second, read and written, of a copy of as many float32 numbers."""
+    """Bytes read and written per second by a copy of ``size`` float32 numbers."""
     source = torch.empty(size, device=device).normal_()
     out = torch.empty_like(source)
     return 8.0 * size / seconds(lambda: out.copy_(source), device, budget=0.2)
 
 
 def made(name: str, channels: int, device: torch.device, **options: Any) -> MKCLoss:
-    """The loss in a mode, past its first batches."""
+    """The loss in a mode."""
     return MKCLoss(channels, **{**MODES[name], **options}).to(device)

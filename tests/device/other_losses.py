@@ -1,4 +1,4 @@
-"""Losses of samples and of labels on a device: agreement with the CPU's float64, and time over the floor of memory."""
+"""Losses of samples and of labels on a device: agreement with float64 on the CPU, and time over the memory floor."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def samples(shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = t
 
 
 def labels(rows: int, classes: int, device: torch.device, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
-    """Logits and labels, of which a quarter is ignored."""
+    """Logits and labels; a quarter of the labels is ignored."""
     generator = torch.Generator(device).manual_seed(0)
     logits = 3.0 * torch.randn(rows, classes, generator=generator, device=device)
     target = torch.randint(0, classes, (rows,), generator=generator, device=device)
@@ -105,7 +105,7 @@ def step_of(loss: Callable[..., Tensor], leaves: list[Tensor], rest: list[Tensor
 
 
 def print_times(device: torch.device) -> None:
-    """Times of forward and backward over floors: 28 bytes an element of samples, two numbers a logit."""
+    """Print times of forward and backward over their floors: 28 bytes an element of samples, two numbers a logit."""
     size = ELEMENTS if device.type == "cuda" else 1 << 18
     rate = copy_rate(device, size)
 
@@ -132,7 +132,7 @@ def print_times(device: torch.device) -> None:
     row("samples, bounds of channels", lambda: of_samples(torch.full((4,), 50.0), size), 28.0 * size)
     row("samples, domains that end on the head", lambda: of_samples(6.0, size), 28.0 * size)
     row("samples, 1024", lambda: of_samples(50.0, 1024), 28.0 * 1024)
-    few = size // 64  # the formulas hold several hundred numbers an element
+    few = size // 64  # the formulas need several hundred numbers an element
     row(f"samples, impl='eager', {few}", lambda: of_samples(50.0, few, impl="eager"), 28.0 * few)
 
     def of_labels(loss: nn.Module, rows: int, classes: int, dtype: torch.dtype = torch.float32) -> Callable[[], None]:

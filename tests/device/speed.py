@@ -32,7 +32,7 @@ def makers(device: torch.device) -> dict[str, Callable[[], nn.Module]]:
 
 
 def kernels_and_syncs(step: Callable[[], object], device: torch.device) -> tuple[str, str]:
-    """How many kernels a step launches, and whether it waits for the device."""
+    """The number of kernels that a step launches, and whether it waits for the device."""
     if device.type != "cuda":
         return "-", "-"
     step()
@@ -53,7 +53,7 @@ def kernels_and_syncs(step: Callable[[], object], device: torch.device) -> tuple
 
 
 def captured_time(step: Step, device: torch.device) -> float | None:
-    """Time of a step replayed from a CUDA graph: the card's time without Python's; None without CUDA graphs."""
+    """Seconds of a step replayed from a CUDA graph, without Python; None without CUDA graphs."""
     if device.type != "cuda":
         return None
     stream = torch.cuda.Stream()
@@ -70,7 +70,7 @@ def captured_time(step: Step, device: torch.device) -> float | None:
 
 
 def measured(step: Step, size: int, rate: float, device: torch.device) -> str:
-    """One row: time, time of the card alone over the floor, memory over the input, kernels, host synchronisations."""
+    """A row: time, time of the replayed graph, ratio to the floor, memory over the input, kernels, synchronisations."""
     time = seconds(step, device, budget=0.2)
     try:
         alone = captured_time(step, device)
@@ -91,7 +91,7 @@ def measured(step: Step, size: int, rate: float, device: torch.device) -> str:
 
 
 def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool) -> None:
-    """The table of steps, eager or compiled."""
+    """Print the table of steps, eager or compiled."""
     rate = copy_rate(device, sizes[-1])
     print(f"  copy rate {rate / 1e12:.2f} TB/s; floor: 12 bytes an element; ms: eager, and replayed from a CUDA graph")
     print(
@@ -113,7 +113,7 @@ def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool)
 
 
 def print_variants(device: torch.device, size: int) -> None:
-    """Other dtypes, upstream gradients, weights, reductions and layouts at the largest size, over their own floors."""
+    """Print dtypes, upstream gradients, weights, reductions and layouts at the largest size, over their own floors."""
     rate = copy_rate(device, size)
     weight = torch.rand(size // CHANNELS, CHANNELS, device=device)
     upstream = torch.tensor(3.0, device=device)
@@ -164,7 +164,7 @@ class Training:
 
 
 def print_training(device: torch.device) -> None:
-    """A training step of a small perceptron under each loss, over Huber's; the losses in turn, three times."""
+    """Print the time of a training step with each loss, relative to Huber's; the losses in turn, three times."""
     times: dict[str, list[float]] = {}
     for _ in range(3):
         for name, make in makers(device).items():
@@ -176,7 +176,7 @@ def print_training(device: torch.device) -> None:
 
 
 def print_capture(device: torch.device) -> None:
-    """Every mode in a CUDA graph, replayed and compared with eager training."""
+    """Replay every mode from a CUDA graph, and print the difference from eager training."""
     if device.type != "cuda":
         print("  no CUDA graphs on this device")
         return

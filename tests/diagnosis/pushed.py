@@ -90,7 +90,7 @@ def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
     return recording, torch.from_numpy(added)
 
 
-def in_the_world(recording, system=Pendulum):
+def fitted_under_noise(recording, system=Pendulum):
     """Fit a simulation without effects, under its most likely noise."""
     prepared = system().prepare(recording).with_input_hold({"torque": "held"})
     baseline = fit_baseline(prepared, {}, NoiseSettings())
@@ -98,9 +98,9 @@ def in_the_world(recording, system=Pendulum):
 
 
 @functools.cache
-def swung_in_the_world(push="none", seed=0, N=500, drag=0.0):
+def fitted_swing(push="none", seed=0, N=500, drag=0.0):
     """Fit a recording of :func:`swung`."""
-    return in_the_world(swung(push, seed, N, drag)[0])
+    return fitted_under_noise(swung(push, seed, N, drag)[0])
 
 
 @functools.cache

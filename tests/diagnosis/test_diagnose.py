@@ -156,7 +156,7 @@ def test_a_model_without_its_driver_raises():
         (
             '{"schema": "mkc-model/1", "simulation": "magnetometer", "state": {}, "parameters": [], '
             '"effects": [{"effect": "magic", "drivers": [], "shape": {}, "parameters": []}]}',
-            '"magic" is not known',
+            '"magic" is unknown.*effects=',
         ),
         (
             '{"schema": "mkc-model/1", "simulation": "a", "state": {}, "parameters": [], "effects": '

@@ -160,7 +160,7 @@ def test_rivals_within_separable_are_inseparable(usual):
 
 @pytest.mark.e2e
 def test_remaining_gain_is_the_limit_of_the_warning(usual):
-    warned = [warning for warning in usual.warnings if "Something smooth remains along load" in warning]
+    warned = [warning for warning in usual.warnings if "smooth trend along load" in warning]
     assert len(warned) == 1
     quiet = diagnosis(Settings(evidence=EvidenceSettings(remaining_gain=100.0)))
     assert not set(warned) & set(quiet.warnings)

@@ -1,4 +1,4 @@
-"""Runs the commands that the README and the manual show; slow ones by a small variant that stands here."""
+"""Run the commands that the README and the manual show; slow commands are run as small variants."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from tests.docs.pages import ROOT
 MKC = typer.main.get_command(app).commands
 
 BUILD = ("--config-file", ".zensical.toml")
-"""What the site is built with, beside that nothing may be amiss."""
+"""Options of the build of the site, in addition to ``--strict``."""
 
 SMALL = {
     "mkc challenge --scenarios --family dynamics --only coloured --only pushed_white --only gusts --only slow_sensor "
     "--per-scenario 12 --hidden-per-scenario 4 --seed 27182 --workers 1 --output four": (
-        "--help"  # its parts are run by the commands below
+        "--help"  # the commands below run its parts
     ),
     "mkc challenge --scenarios --family dynamics --only slow_sensor --only lasting_push --only lasting_push_runs "
     "--only useless --per-scenario 6 --hidden-per-scenario 6 --seed 6161 --workers 1 --output newer": "--help",
@@ -38,9 +38,8 @@ SMALL = {
     "mkc challenge --scenarios --family dynamics --output scenarios_of_dynamics": (
         "--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"
     ),
-    "mkc challenge --scenarios --family dynamics --per-scenario 15 --hidden-per-scenario 8 --seed 8608 --output scenarios": (
-        "--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"
-    ),
+    "mkc challenge --scenarios --family dynamics --per-scenario 15 --hidden-per-scenario 8 --seed 8608 "
+    "--output scenarios": ("--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"),
     "mkc challenge --scenarios --family magnetometer --per-scenario 15 --hidden-per-scenario 5 --seed 7302 "
     "--output scenarios_of_sensors": "--per-scenario 1 --hidden-per-scenario 0 --only white --duration 15 --workers 1",
     "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
@@ -48,7 +47,7 @@ SMALL = {
         "--seed 1 --cases 0 --empty 1 --workers 1"
     ),
 }
-"""Commands that take minutes and more: what is added to them here."""
+"""Commands that take minutes or longer, and the options that the tests add to make them small."""
 
 EXAMPLES = {
     "examples/paper/density.py": "",
@@ -63,7 +62,7 @@ EXAMPLES = {
     "examples/concealed_physics/dynamics/silverbox.py": "--help",
     "examples/concealed_physics/dynamics/servo.py": "--help",
 }
-"""Scripts that are run here, with these arguments instead of those shown."""
+"""Scripts that the tests run, with these arguments instead of those shown."""
 
 TESTED = {
     "examples/paper/example_2.py": "test_example_2.py",
@@ -90,11 +89,11 @@ TESTED = {
     "examples/concealed_physics/real.py": "test_known_physics.py",
     "examples/concealed_physics/histone/petab_select_0009.py": "test_petab_select.py",
 }
-"""Scripts that tests/examples runs at a small size: here only their options are looked at."""
+"""Scripts that tests/examples runs at a small size: here only their options are checked."""
 
 
 def commands(line: str) -> list[list[str]]:
-    """The commands of a line, each in words; a comment is none.
+    """Split a line into commands, and each command into words; comments are left out.
 
     Example:
         >>> commands("cp a b && mkc demo  # all of it")
@@ -113,15 +112,15 @@ def run(words: list[str], folder: Path) -> None:
     """Run a command in the folder, or its small variant.
 
     Raises:
-        AssertionError: it fails, or it is of no kind that is known here.
+        AssertionError: the command fails, or is of an unknown kind.
     """
     match [words[0].removeprefix(".venv/bin/"), *words[1:]]:
         case ["python3", "-m", "venv", ".venv"]:
-            pass  # .ci/run makes one
+            pass  # .ci/run makes the environment
         case ["pip", "install", *arguments]:
             check_install(arguments)
         case ["python", "-m", "pytest", "-q", "-n", "auto"]:
-            pass  # .ci/run runs them
+            pass  # .ci/run runs the tests
         case ["mkc", *arguments]:
             run_mkc(arguments)
         case ["python", script, *arguments] if script.startswith("examples/"):
@@ -136,7 +135,7 @@ def run(words: list[str], folder: Path) -> None:
                 "tests.wheel",
             )
         ):
-            # minutes each: here only whether it is there
+            # minutes each: check only that the command exists
             is_package = hasattr(importlib.import_module(module), "__path__")
             entry = importlib.import_module(f"{module}.__main__" if is_package else module)
             assert callable(entry.main)
@@ -149,20 +148,22 @@ def run(words: list[str], folder: Path) -> None:
         case ["cp", source, target]:
             shutil.copy(folder / source, folder / target)
         case _:
-            raise AssertionError(f"no test knows how to run `{shlex.join(words)}`")
+            raise AssertionError(f"no case runs `{shlex.join(words)}`")
 
 
 def run_mkc(arguments: list[str]) -> None:
-    """In this process, as `mkc` itself does."""
+    """Run the command `mkc` in this process."""
     small = SMALL.get(shlex.join(["mkc", *arguments]), "").split()
     result = CliRunner().invoke(app, [*arguments, *small])
     assert result.exit_code == 0, f"mkc {shlex.join(arguments)}:\n{result.output}\n{result.exception!r}"
-    if arguments[0] == "challenge" and "--help" not in small:  # a recording that could not be diagnosed only counts against the proof
+    if (
+        arguments[0] == "challenge" and "--help" not in small
+    ):  # a recording that could not be diagnosed only counts against the proof
         assert re.search(r"^failed +none", result.output, re.MULTILINE), result.output
 
 
 def run_example(script: str, arguments: list[str], folder: Path) -> None:
-    """The script with few draws, or a look at its options where another test runs it."""
+    """Run the script with few draws; if another test runs it, check its options only."""
     unknown = [word for word in arguments if word.startswith("--") and word not in example_options(script)]
     assert not unknown, f"{script} has no {', '.join(unknown)}"
     if script in TESTED:
@@ -180,7 +181,7 @@ def run_example(script: str, arguments: list[str], folder: Path) -> None:
             runpy.run_path(str(ROOT / script), run_name="__main__")
         except SystemExit as end:
             code = end.code
-        finally:  # two scripts may have a module of one name beside them
+        finally:  # modules next to two scripts may have the same name
             for name in set(sys.modules) - before:
                 if Path(getattr(sys.modules[name], "__file__", None) or "").parent == (ROOT / script).parent:
                     del sys.modules[name]
@@ -188,10 +189,12 @@ def run_example(script: str, arguments: list[str], folder: Path) -> None:
 
 
 def example_options(script: str) -> set[str]:
-    """The options of a script, its own and those of what it imports from beside it."""
+    """The options of a script and of the modules that it imports from its folder."""
     own = (ROOT / script).read_text(encoding="utf-8")
-    beside = [(ROOT / script).with_name(f"{name}.py") for name in re.findall(r"^from (\w+) import", own, re.MULTILINE)]
-    texts = [own, *(path.read_text(encoding="utf-8") for path in beside if path.exists())]
+    imported = [
+        (ROOT / script).with_name(f"{name}.py") for name in re.findall(r"^from (\w+) import", own, re.MULTILINE)
+    ]
+    texts = [own, *(path.read_text(encoding="utf-8") for path in imported if path.exists())]
     return {option for text in texts for option in re.findall(r"add_argument\(\s*\"(--[\w-]+)\"", text)}
 
 
@@ -201,7 +204,7 @@ def mkc_options(command: str) -> set[str]:
 
 
 def check_install(arguments: list[str]) -> None:
-    """That pip is asked for this package, by extras that it has, or for a release of torch that it takes."""
+    """Check that pip installs this package with existing extras, or a release of torch."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
     extras = set(re.findall(r"^(\w+) = \[", section, re.MULTILINE))

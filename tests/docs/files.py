@@ -1,4 +1,4 @@
-"""The tables that the README and the manual name, small and with something to find in them."""
+"""Write the tables that the README and the manual name: small, with an effect to find."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from torch import Tensor
 
 from mkc_torch.recording import write_table
 
-# the only place of these tests that knows where the simulated sensors live
+# these tests import the simulated sensors only here
 from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
 from tests.simulation.fmu.made import COMPILER, PENDULUM, make_fmu
 
-DRAG = 0.35  # 1/rad, of a pendulum that is told to have none
+DRAG = 0.35
+"""Quadratic drag of the pendulum in 1/rad; the simulation leaves it out."""
 
 
 def write_examples(folder: Path) -> None:
-    """All of them, under the names that the pages use."""
+    """Write all tables, under the names that the pages use."""
     recording, another = (simulated_recording(seed)[0].columns for seed in (0, 1))
     renamed = {{"mag_x": "mx", "mag_y": "my", "mag_z": "mz"}.get(name, name): v for name, v in recording.items()}
     simulated, recorded = paired(0)
@@ -48,7 +49,7 @@ def write_examples(folder: Path) -> None:
 
 
 def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
-    """A magnetometer and a gyroscope that lean by ten degrees and turn round."""
+    """A magnetometer and a gyroscope that tilt by ten degrees and rotate about the vertical."""
     draw = torch.Generator().manual_seed(0)
     time = torch.arange(samples, dtype=torch.float64) / rate
     lean, zero = 0.17 * torch.sin(0.9 * time), torch.zeros(samples, dtype=torch.float64)
@@ -65,7 +66,7 @@ def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
 
 
 def sides() -> dict[str, Tensor]:
-    """An accelerometer that is turned through all directions."""
+    """An accelerometer, turned in all directions."""
     draw = torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(400, 3, generator=draw, dtype=torch.float64), dim=-1)
     force = 9.80665 * way * torch.tensor([1.01, 0.99, 1.0]) + torch.tensor([0.1, -0.2, 0.05])
@@ -82,7 +83,7 @@ def supplied() -> dict[str, Tensor]:
 
 
 def pendulum(number: int, samples: int = 150, rate: float = 20.0) -> dict[str, Tensor]:
-    """A driven pendulum with air drag, by twenty steps a sample; its angle has a noise of 5 mrad."""
+    """A driven pendulum with air drag, integrated in twenty steps a sample; the noise of its angle is 5 mrad."""
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     time = torch.arange(samples, dtype=torch.float64) / rate
     torque = 1.2 * torch.sin(0.9 * time + number) + torch.sin(2.7 * time + 2 * number)
@@ -97,13 +98,13 @@ def pendulum(number: int, samples: int = 150, rate: float = 20.0) -> dict[str, T
 
 
 def joined(*runs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Runs in one table, told apart by ``experiment``."""
+    """Runs in one table, distinguished by ``experiment``."""
     number = torch.cat([torch.full_like(run["time"], k) for k, run in enumerate(runs)])
     return {name: torch.cat([run[name] for run in runs]) for name in runs[0]} | {"experiment": number}
 
 
 def paired(number: int, samples: int = 300) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """What a simulator wrote, and what was recorded: eight per cent more, and a little with temperature."""
+    """A simulation and a recording, which is larger by eight per cent and depends slightly on temperature."""
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     time = torch.arange(samples, dtype=torch.float64) / 20.0
     temperature = 20.0 + 5.0 * torch.sin(0.3 * time + number) + 0.2 * time

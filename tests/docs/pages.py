@@ -1,4 +1,4 @@
-"""The README and the manual, cut into their fenced blocks and what is written inline."""
+"""Split the README and the manual into fenced blocks, inline code, links and headings."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ README = ROOT / "README.md"
 PAGES = (README, *sorted((ROOT / "docs").glob("*.md")))
 
 RUN, SHOWN = frozenset({"python", "sh"}), frozenset({"text", "json"})
-"""Languages of blocks that the tests run, and of those that show what something prints."""
+"""Languages of blocks that the tests run, and of blocks that show an output."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block; ``line`` is that of its first line in the page, from 1."""
+    """A fenced block; ``line`` is the number of its first line in the page, from 1."""
 
     page: Path
     line: int
@@ -26,7 +26,7 @@ class Block:
 
     @property
     def needs(self) -> str | None:
-        """The package that the first line of the block names, ``# needs NAME``; the project does not depend on it."""
+        """The optional package of the block, from its first line ``# needs NAME``, or None."""
         found = re.match(r"# needs (\w+)\n", self.text)
         return None if found is None else found[1]
 
@@ -54,17 +54,17 @@ def prose(page: Path) -> str:
 
 
 def inline(page: Path) -> list[str]:
-    """What stands between backticks in the prose, on one line each."""
+    """The inline code of the prose, each piece on a single line."""
     return [" ".join(found.replace(r"\|", "|").split()) for found in re.findall(r"`([^`]+)`", prose(page))]
 
 
 def links(page: Path) -> list[str]:
-    """Targets of links and pictures that lie in the repository."""
+    """Targets of links and pictures within the repository."""
     found = re.findall(r"\]\(([^)\s]+)\)", prose(page))
     return [target for target in found if "://" not in target]
 
 
 def anchors(page: Path) -> set[str]:
-    """What a link to a heading of the page can end with, as GitHub makes it."""
+    """The anchors of the headings of the page, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -1,4 +1,4 @@
-"""Every fenced block of the README and of the manual runs, in the order in which a reader meets it."""
+"""Every fenced block of the README and of the manual runs, in the order of the page."""
 
 from importlib.util import find_spec
 
@@ -26,15 +26,13 @@ FOUND = {
     "diagnose": {"result": "current_field"},
     "own_simulation": {"result": "quadratic_drag", "paired": "gain", "supplied": "supply_offset"},
 }
-"""What the diagnoses of a page find first in the tables that were made for it, by the name that the page gives them."""
-
+"""First findings of the diagnoses of a page, by the name of the diagnosis in the page."""
 
 NEEDS = {"large_data": "pyarrow", "own_simulation": "fmpy"}
-"""Packages that a page needs beside those of all."""
-
+"""Packages that a page needs in addition to those of all pages."""
 
 OPTIONAL = [block for page in PAGES for block in blocks(page) if block.needs is not None]
-"""Blocks of packages that this project does not depend on."""
+"""Blocks that need packages on which this project does not depend."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +44,7 @@ def examples(tmp_path_factory):
 
 @pytest.fixture
 def folder(examples, tmp_path, monkeypatch):
-    """Where a reader stands: the tables, and nothing else."""
+    """The working folder of a reader: the tables, and nothing else."""
     for table in examples.iterdir():
         (tmp_path / table.name).symlink_to(table)
     monkeypatch.chdir(tmp_path)
@@ -57,7 +55,7 @@ def run_python(block, names, folder):
     first, _, _ = block.text.partition("\n")
     if first.startswith("# ") and first.endswith(".py"):  # "save this as"
         (folder / first.removeprefix("# ")).write_text(block.text, encoding="utf-8")
-    # as many lines before it as in the page, so that a traceback says where to look
+    # the line numbers of a traceback are those of the page
     code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec")
     exec(code, names)
 
@@ -78,9 +76,9 @@ def test_every_block_of_a_page_runs(page, folder):
         pytest.skip("there is no compiler of C for its FMU")
     names = {"__name__": page.stem}
     for block in blocks(page):
-        print(f"{block}:")  # shown where it fails
+        print(f"{block}:")  # shown if the block fails
         if block.needs is not None and find_spec(block.needs) is None:
-            continue  # the next test says so
+            continue  # the next test reports it
         if block.language == "python":
             run_python(block, names, folder)
         elif block.language == "sh":
@@ -96,14 +94,14 @@ def test_the_package_of_an_optional_block_is_installed(block):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_block_says_what_it_is(page):
+def test_every_block_has_a_known_language(page):
     for block in blocks(page):
         assert block.language in RUN | SHOWN, f"{block}: its language is {block.language!r}"
         if block.language in SHOWN:
             assert "import " not in block.text, f"{block} looks like code that should run"
 
 
-def test_small_variants_are_of_commands_that_are_shown():
+def test_every_small_variant_belongs_to_a_shown_command():
     shown = [words for page in PAGES for b in blocks(page) if b.language == "sh" for line in b.text.splitlines()
              for words in commands(line)]  # fmt: skip
     assert set(SMALL) <= {" ".join(words) for words in shown}
@@ -112,7 +110,7 @@ def test_small_variants_are_of_commands_that_are_shown():
     assert all((ROOT / script).is_file() for script in scripts)
 
 
-def test_an_unknown_command_is_no_silent_success(tmp_path):
+def test_an_unknown_command_fails(tmp_path):
     for line in ("rm -rf results", "python other.py", "mkc nothing", "pip install -e .[none]"):
         with pytest.raises(AssertionError):
             run(commands(line)[0], tmp_path)

@@ -1,4 +1,4 @@
-"""The pages of the losses: figures that other pages have too, computed tables, pictures, and functions to copy."""
+"""The pages of the losses: numbers shared with other pages, computed tables, pictures, and functions to copy."""
 
 import inspect
 import math
@@ -17,24 +17,24 @@ LOSS, LOSSES = (ROOT / "docs" / f"{name}.md" for name in ("loss", "losses"))
 
 
 def rows(page, first):
-    """The cells of the rows of a page whose first cell matches, without the asterisks of bold type."""
+    """The cells of the table rows whose first cell matches, without the asterisks of bold type."""
     lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
     cells = [[cell.strip().strip("*") for cell in line.strip("|").split("|")] for line in lines]
     return [row for row in cells if re.fullmatch(first, row[0])]
 
 
 def defined(page, name, **names):
-    """A function or class of a page, from the block that defines it."""
+    """Execute the definition of a function or class in a page, and return it."""
     (block,) = [block for block in blocks(page) if re.search(rf"^(def|class) {name}\b", block.text, re.MULTILINE)]
     source = re.search(rf"^(?:def|class) {name}\b.*?(?=^\S|\Z)", block.text, re.MULTILINE | re.DOTALL)[0]
     exec(source, names)
     return names[name]
 
 
-# --- figures
+# --- numbers
 
 
-def test_rows_of_tables_with_wrong_targets_are_those_of_their_own_page():
+def test_rows_for_wrong_targets_equal_those_of_the_page_of_wrong_targets():
     kept = {tuple(row[:3]): row[3:] for row in rows(ROOT / "docs" / "wrong_targets.md", "(Carseats|diabetes|diamonds)")}
     copied = rows(LOSSES, "(Carseats|diabetes|diamonds)")
     assert len(copied) == 10
@@ -46,7 +46,7 @@ def test_rows_of_tables_with_wrong_targets_are_those_of_their_own_page():
     assert copied[3:] == [*ranks[3:7], ranks[9]]
 
 
-def test_likelihoods_of_real_errors_are_those_of_the_page_of_measurements():
+def test_likelihoods_of_real_errors_equal_those_of_the_page_of_measurements():
     pattern = r"(departure delays|returns, S&P 500|fire claims)"
     measured = {row[0]: row[1:] for row in rows(ROOT / "docs" / "measured.md", pattern)}
     copied = rows(LOSSES, pattern)
@@ -56,7 +56,7 @@ def test_likelihoods_of_real_errors_are_those_of_the_page_of_measurements():
         assert row[1:] == [gauss, by_rule, student, several]
 
 
-def test_errors_of_wrong_labels_are_those_of_the_page_of_measurements():
+def test_errors_with_wrong_labels_equal_those_of_the_page_of_measurements():
     text = " ".join(LOSSES.read_text(encoding="utf-8").split())
     found = re.search(
         r"is ([\d.]+) % after the last epoch, that of cross-entropy ([\d.]+) %; with none it is ([\d.]+) % instead of "
@@ -70,7 +70,7 @@ def test_errors_of_wrong_labels_are_those_of_the_page_of_measurements():
     assert list(found.groups()) == [cell.split(" ")[0] for cell in measured]
 
 
-def test_the_table_of_sigma_is_that_of_the_density():
+def test_the_table_of_sigma_equals_the_density():
     table = rows(LOSS, "(∞|\\d)")
     assert [row[0] for row in table] == ["∞", "5", "4", "3", "2", "1"]
     for row in table:
@@ -116,7 +116,7 @@ class StandIn:
         self.model, self.compute_loss_func = model, compute_loss_func
 
     def gradients(self, batches):
-        """Of the weights after one step of accumulated batches."""
+        """Gradients of the weights, accumulated over the batches."""
         self.model.zero_grad()
         count = sum(batch["labels"].ne(-100).sum() for batch in batches)
         for batch in batches:
@@ -124,12 +124,12 @@ class StandIn:
             labels = inputs.pop("labels")
             outputs = self.model(**inputs)
             self.compute_loss_func(outputs, labels, num_items_in_batch=count).backward()
-        return [one.grad.clone() for one in self.model.layers.parameters()]
+        return [parameter.grad.clone() for parameter in self.model.layers.parameters()]
 
 
 @pytest.fixture
 def network():
-    """The network of the page with a loss whose value has no state, and the function for it."""
+    """The network of the page with a loss without state, and its ``compute_loss_func``."""
     torch.manual_seed(0)
     network = defined(LOSSES, "Network", torch=torch, MKCLoss=MKCLoss)()
     network.criterion = MKCLoss(2, sigma=2.0, d=0.5, bound=50.0, reduction="sum")
@@ -162,17 +162,17 @@ def test_gradients_of_a_loss_outside_the_wrapped_module_are_averaged(tmp_path):
     average = defined(LOSS, "average_gradients", torch=torch)
     loss = MKCLoss(2, d=0.5, bound=50.0)
     loss(torch.randn(20, 2), torch.randn(20, 2)).backward()
-    before = [one.grad.clone() for one in loss.parameters()]
+    before = [parameter.grad.clone() for parameter in loss.parameters()]
     torch.distributed.init_process_group("gloo", f"file://{tmp_path}/store", rank=0, world_size=1)
     try:
         average(loss)
     finally:
         torch.distributed.destroy_process_group()
-    torch.testing.assert_close([one.grad for one in loss.parameters()], before)
+    torch.testing.assert_close([parameter.grad for parameter in loss.parameters()], before)
 
 
 def test_a_robust_scale_ignores_wrong_targets():
-    """The three lines of the first screen, undone."""
+    """The block standardises targets with the median and a robust scale; its inverse returns the targets."""
     (block,) = [block for block in blocks(LOSS) if block.text.startswith("middle = ")]
     y = 60_000.0 + 20_000.0 * torch.randn(4000, 1, generator=torch.Generator().manual_seed(0))
     y[::5] *= 1000.0

@@ -1,4 +1,4 @@
-"""The table of promises names tests that are there."""
+"""Every test in the table of promises exists, and is named once."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""The manual as a site: it builds without a warning, fetches nothing, and has a place for every public name."""
+"""The manual as a site: it builds without warnings, loads nothing from elsewhere, and documents every public name."""
 
 import importlib
 import re
@@ -19,14 +19,14 @@ LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source
 
 
 def public():
-    """The public rooms, as the page on architecture has them."""
+    """The public packages that the page on architecture names."""
     text = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
-    told = re.search(r"Public names are those of (.+?); a name with an underscore", text)[1]
-    return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", told)]
+    sentence = re.search(r"Public names are those of (.+?); a name with an underscore", text)[1]
+    return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", sentence)]
 
 
 class Page(HTMLParser):
-    """The ids of a page, and what a browser loads of its own accord."""
+    """The ids of a page, and the addresses that a browser loads with it."""
 
     def __init__(self, path):
         super().__init__()
@@ -42,7 +42,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The pages as built from a copy, for the command writes beside its sources."""
+    """The site, built from a copy: the command writes into the folder of its sources."""
     if find_spec("zensical") is None or find_spec("mkdocstrings_handlers") is None:
         pytest.skip("the extra `docs` is not installed")
     folder = tmp_path_factory.mktemp("site")
@@ -51,20 +51,20 @@ def site(tmp_path_factory):
     (folder / "mkc_torch").symlink_to(ROOT / "mkc_torch")
     words = [sys.executable, "-m", "zensical", "build", "--strict", *BUILD]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
-    told = re.sub(r"\x1b\[[\d;]*m", "", done.stdout + done.stderr)
-    assert done.returncode == 0, told
-    assert "griffe:" not in told, told  # an argument that is explained and not there
+    output = re.sub(r"\x1b\[[\d;]*m", "", done.stdout + done.stderr)
+    assert done.returncode == 0, output
+    assert "griffe:" not in output, output  # an argument in a docstring that does not exist
     return folder / "build" / "site"
 
 
-def test_every_public_room_has_a_page():
+def test_every_public_package_has_a_page():
     assert {*public(), "mkc_torch.density", "mkc_torch.challenge", "mkc_torch.report"} == {"mkc_torch", *ROOMS}
     assert len(ROOMS) == len(set(ROOMS))
 
 
 def test_every_page_is_in_the_navigation():
-    told = set(re.findall(r'"([\w/]+\.md)"', (ROOT / ".zensical.toml").read_text(encoding="utf-8")))
-    assert told == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    listed = set(re.findall(r'"([\w/]+\.md)"', (ROOT / ".zensical.toml").read_text(encoding="utf-8")))
+    assert listed == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
 
 
 def test_pictures_are_small_and_shown():
@@ -75,7 +75,7 @@ def test_pictures_are_small_and_shown():
 
 
 @pytest.mark.manual
-def test_every_public_name_has_a_place(site):
+def test_every_public_name_is_documented(site):
     pytest.importorskip("lightning")
     ids = set().union(*(Page(path).ids for path in (site / "api").glob("*.html")))
     names = {f"{room}.{name}" for room in ("mkc_torch", *ROOMS) for name in importlib.import_module(room).__all__}
@@ -84,33 +84,33 @@ def test_every_public_name_has_a_place(site):
 
 
 @pytest.mark.manual
-def test_the_parts_of_a_docstring_are_told_apart(site):
+def test_the_sections_of_a_docstring_are_recognised(site):
     page = (site / "api" / "losses.html").read_text(encoding="utf-8")
-    assert "Example:" not in page  # read as a section, and so set as code
+    assert "Example:" not in page  # parsed as a section, shown as code
     assert ":class:" not in page
-    for name in ("input", "target"):  # explained together, listed each
+    for name in ("input", "target"):  # documented together, listed separately
         assert re.search(rf"<b><code>{name}</code></b>|<code>{name}</code>", page)
 
 
 @pytest.mark.manual
-def test_pictures_are_there_and_nothing_is_fetched(site):
+def test_pictures_exist_and_nothing_is_loaded_from_elsewhere(site):
     for path in site.rglob("*.html"):
         for target in Page(path).loads:
             assert "://" not in target, f"{path.name} loads {target}"
-            # the page for what is not found is shown at any address
+            # 404.html is shown at any address
             if path.name != "404.html" and target and not target.startswith("data:"):
                 place = (path.parent / target.partition("?")[0].partition("#")[0]).resolve()
                 assert place.exists(), f"{path.name}: {target}"
 
 
 @pytest.mark.manual
-def test_style_sheets_name_no_other_place(site):
+def test_style_sheets_load_nothing_from_elsewhere(site):
     for path in site.rglob("*.css"):
         assert not re.search(r"url\(\s*[\"']?https?:|@import", path.read_text(encoding="utf-8")), path.name
 
 
 @pytest.mark.manual
-def test_no_page_needs_more_than_a_telephone_has(site):
+def test_every_page_fits_the_width_of_a_telephone(site):
     width = pytest.importorskip("tests.report.test_phone_width")
     if width.CHROMIUM is None:
         pytest.skip("no chromium on this machine: widths are not measured")

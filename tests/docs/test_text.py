@@ -1,4 +1,4 @@
-"""What the README and the manual say: lengths, links, and names and options that exist."""
+"""The README and the manual: their lengths and links, and whether names and options exist."""
 
 import pydoc
 import re
@@ -44,8 +44,8 @@ def test_the_readme_is_short():
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
 
 
-def test_the_second_command_of_the_readme_is_the_one_that_tests():
-    """`.ci/run` takes it from there."""
+def test_the_second_block_of_the_readme_runs_the_tests():
+    """`.ci/run` takes the command from there."""
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     program = re.search(r"awk '(.+?)' README.md", script)[1]
     found = subprocess.run(["awk", program, README], capture_output=True, text=True, check=True).stdout
@@ -71,7 +71,7 @@ def test_links_lead_somewhere(page):
 
 @each_page
 def test_lines_have_a_normal_width(page):
-    """Of a table a row is a line, and a command is to be copied whole."""
+    """Table rows may be longer."""
     for line in prose(page).splitlines():
         assert len(line) <= 120 or line.startswith("|"), f"{page.name}: {line}"
 

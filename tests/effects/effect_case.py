@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
-from mkc_torch.effects.courses import gained
+from mkc_torch.effects.courses import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.protocol import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
@@ -243,7 +243,7 @@ class OfEveryShape:
             with pytest.raises(NotImplementedError, match="`basis`"):
                 effect.basis(shape, context)
         if effect.has_waveform:
-            assert torch.equal(gained(effect.waveform(shape, context), gamma), change)
+            assert torch.equal(outer_product(effect.waveform(shape, context), gamma), change)
 
     def test_lasting_change_is_zero_without_an_amplitude(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0]

@@ -8,7 +8,7 @@ import torch
 from numpy.polynomial import legendre
 
 from mkc_torch.effects import SENSOR, Context
-from mkc_torch.effects.courses import after
+from mkc_torch.effects.courses import unit_step
 from tests.effects.contexts import make_context
 
 EFFECTS = {effect.id: effect for effect in SENSOR}
@@ -34,7 +34,7 @@ def test_a_step_is_constant_from_its_onset_on():
     before = TIME < 40.0
     assert torch.equal(change[before], torch.zeros(int(before.sum()), 3, dtype=torch.float64))
     assert torch.equal(change[~before], gamma.expand(int((~before).sum()), 3))
-    assert after(torch.tensor([1.0, 2.0, 3.0]), 2.0).tolist() == [0.0, 1.0, 1.0]
+    assert unit_step(torch.tensor([1.0, 2.0, 3.0]), 2.0).tolist() == [0.0, 1.0, 1.0]
 
 
 def test_onsets_cover_the_recording_except_its_ends():

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from mkc_torch.effects.courses import lagged, played
 from mkc_torch.effects.dynamics.bouc_wen_hysteresis import hysteretic_path
 from mkc_torch.effects.paired.between import shifted
-from mkc_torch.effects.runs import passed_on, passed_on_within
+from mkc_torch.effects.runs import clamped_recurrence, linear_recurrence
 
 RANDOM = np.random.default_rng(11)
 TIME = torch.arange(60, dtype=torch.float64)
@@ -20,9 +20,11 @@ def test_recurrence_has_the_derivatives_of_a_loop(dtype):
     factor, level = (0.5 * torch.randn(9, dtype=dtype, generator=generator) for _ in range(2))
     factor[4] = 0.0
     inputs = (factor.requires_grad_(), level.requires_grad_())
-    assert torch.autograd.gradcheck(passed_on, inputs, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(passed_on, inputs)
-    assert torch.autograd.gradcheck(lambda values: passed_on(factor.detach(), values), inputs[1], check_forward_ad=True)
+    assert torch.autograd.gradcheck(linear_recurrence, inputs, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(linear_recurrence, inputs)
+    assert torch.autograd.gradcheck(
+        lambda values: linear_recurrence(factor.detach(), values), inputs[1], check_forward_ad=True
+    )
 
 
 def test_recurrence_has_tangents_under_vmap():
@@ -30,7 +32,7 @@ def test_recurrence_has_tangents_under_vmap():
     factor, level = (0.5 * torch.randn(9, 4, dtype=torch.float64, generator=generator) for _ in range(2))
 
     def moved(theta):
-        return passed_on(torch.tanh(factor @ theta), torch.sin(level @ theta))
+        return linear_recurrence(torch.tanh(factor @ theta), torch.sin(level @ theta))
 
     theta = torch.randn(4, dtype=torch.float64, generator=generator)
     forward, reverse = torch.func.jacfwd(moved)(theta), torch.func.jacrev(moved)(theta)
@@ -39,7 +41,7 @@ def test_recurrence_has_tangents_under_vmap():
     differences = [(moved(theta + change) - moved(theta - change)) / 2e-6 for change in step]
     torch.testing.assert_close(forward, torch.stack(differences, -1), rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(
-        torch.func.vmap(passed_on, 1, 1)(factor, level)[:, 2], passed_on(factor[:, 2], level[:, 2])
+        torch.func.vmap(linear_recurrence, 1, 1)(factor, level)[:, 2], linear_recurrence(factor[:, 2], level[:, 2])
     )
 
 
@@ -55,8 +57,8 @@ def test_scans_equal_loops(N):
         z = max(float(low[k]), min(float(high[k]), z))
         affine.append(y)
         within.append(z)
-    np.testing.assert_allclose(passed_on(factor, level), affine, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(passed_on_within(low, high), within, rtol=0, atol=0)
+    np.testing.assert_allclose(linear_recurrence(factor, level), affine, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(clamped_recurrence(low, high), within, rtol=0, atol=0)
 
 
 def test_play_has_memory():

@@ -35,10 +35,10 @@ def drops(ball):
 
 @pytest.mark.manual
 def test_drag_of_a_light_ball_is_confirmed_by_its_second_drop(loaded, tmp_path):
-    one, other = drops("Whiffle_Ball_1")
-    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
+    item, other = drops("Whiffle_Ball_1")
+    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), item, [other], max_findings=1)
     (finding,) = proof.diagnosis.findings
-    alike = [one.effect for one in finding.alternatives if not one.separable]  # by one short drop
+    alike = [item.effect for item in finding.alternatives if not item.separable]  # by one short drop
     assert "linear_drag" in (finding.effect, *alike)
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
     assert before > 5.0
@@ -49,8 +49,8 @@ def test_drag_of_a_light_ball_is_confirmed_by_its_second_drop(loaded, tmp_path):
 
 @pytest.mark.manual
 def test_nothing_is_found_on_a_heavy_ball(loaded):
-    one, other = drops("Bowling_Ball")
-    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
+    item, other = drops("Bowling_Ball")
+    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), item, [other], max_findings=1)
     assert proof.diagnosis.verdict == "unexplained"  # its drops are not noise alone
     assert proof.diagnosis.findings == ()
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
@@ -60,10 +60,10 @@ def test_nothing_is_found_on_a_heavy_ball(loaded):
 @pytest.mark.manual
 def test_the_number_of_the_run_is_no_output(loaded):
     """Runs of one table come back with their numbers, which are always right."""
-    one, other = drops("Whiffle_Ball_1")
+    item, other = drops("Whiffle_Ball_1")
     both = Recording(
-        {name: torch.cat([one[name], other[name]]) for name in ("time", "height")}
-        | {"experiment": torch.cat([torch.zeros(len(one)), torch.ones(len(other))])}
+        {name: torch.cat([item[name], other[name]]) for name in ("time", "height")}
+        | {"experiment": torch.cat([torch.zeros(len(item)), torch.ones(len(other))])}
     )
     (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), both, [both], max_findings=0)
     assert proof.measured.shape == (len(both), 1)
@@ -77,5 +77,5 @@ def test_of_the_heaters_what_is_left_is_located(loaded):
     (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=2)
     assert proof.diagnosis.verdict == "unexplained"
     assert {push.place for push in proof.diagnosis.environment.process_noise} == {"temperature_1", "temperature_2"}
-    claimed = [one.effect for one in proof.diagnosis.findings if one.grade != "unconfirmed"]
+    claimed = [item.effect for item in proof.diagnosis.findings if item.grade != "unconfirmed"]
     assert claimed in ([], ["input_delay"])

@@ -49,8 +49,8 @@ def row(**changes):
 
 def cells(load, found):
     module = load("real")
-    one = next(one for one in load("known").real() if one.name == ROCKET)
-    return dict(zip(module.COLUMNS, module.line(one, found, load("by_hand").BY_HAND[ROCKET]), strict=True))
+    item = next(item for item in load("known").real() if item.name == ROCKET)
+    return dict(zip(module.COLUMNS, module.line(item, found, load("by_hand").BY_HAND[ROCKET]), strict=True))
 
 
 def test_a_right_diagnosis_is_compared_with_the_fit_by_hand(load):
@@ -77,7 +77,7 @@ def test_a_diagnosis_that_names_nothing_is_wrong_and_has_no_size(load):
 
 def test_each_recording_with_missing_physics_has_its_words(load):
     known, by_hand = load("known"), load("by_hand").BY_HAND
-    names = {one.name for part in (known.real, known.cases, known.data) for one in part()}
+    names = {item.name for part in (known.real, known.cases, known.data) for item in part()}
     assert set(by_hand) <= names
     adequate = {f"cases simulated/{name} run Pendulum" for name in ("held_input", "linear_input")}
     heavy = {f"data falling_balls {name} Ball" for name in load("known").HEAVY}
@@ -98,19 +98,19 @@ def test_a_stopped_search_is_marked_in_its_row(load):
     ],
 )
 def test_what_is_cut_of_a_recording_is_diagnosed(load, tmp_path, name, columns, rows):
-    one = next(one for one in load("known").data() if one.name == name)
-    if not one.recording.exists():
-        pytest.skip(f"no data file {one.recording}")
-    table = Recording.read(one.file_in(tmp_path), recognise=False)
+    item = next(item for item in load("known").data() if item.name == name)
+    if not item.recording.exists():
+        pytest.skip(f"no data file {item.recording}")
+    table = Recording.read(item.file_in(tmp_path), recognise=False)
     assert set(table.names) == columns
     assert rows is None or len(table) == rows
 
 
 def test_a_limit_that_is_over_at_once_is_a_row(load, tmp_path):
-    one = next(one for one in load("known").real() if one.name == ROCKET)
-    if not one.recording.exists():
-        pytest.skip(f"no data file {one.recording}")
-    name, found = load("real").diagnosed((one, tmp_path, 0.01))
+    item = next(item for item in load("known").real() if item.name == ROCKET)
+    if not item.recording.exists():
+        pytest.skip(f"no data file {item.recording}")
+    name, found = load("real").diagnosed((item, tmp_path, 0.01))
     assert name == ROCKET
     assert "0.01 s" in found["failed"]
     assert cells(load, found)["claimed"] == "no answer (wrong)"
@@ -124,16 +124,16 @@ def test_absent_recordings_are_named_and_left_out(load, tmp_path, capsys):
 
 
 def test_a_row_that_is_there_is_kept(load, tmp_path):
-    one = next(one for one in load("known").real() if one.name == ROCKET)
+    item = next(item for item in load("known").real() if item.name == ROCKET)
     folder = tmp_path / re.sub(r"\W", "_", ROCKET)
     folder.mkdir()
     (folder / "row.json").write_text(json.dumps(row()), encoding="utf-8")
-    assert load("real").diagnosed((one, tmp_path, 300.0)) == (ROCKET, row())
+    assert load("real").diagnosed((item, tmp_path, 300.0)) == (ROCKET, row())
 
 
 def test_a_diagnosis_that_fails_costs_its_row_alone(load, tmp_path):
-    one = next(one for one in load("known").real(tmp_path) if one.name == ROCKET)  # there is no such file
-    name, failed = load("real").diagnosed((one, tmp_path / "out", 300.0))
+    item = next(item for item in load("known").real(tmp_path) if item.name == ROCKET)  # there is no such file
+    name, failed = load("real").diagnosed((item, tmp_path / "out", 300.0))
     assert name == ROCKET
     assert failed["failed"]
     assert cells(load, failed)["claimed"] == "no answer (wrong)"

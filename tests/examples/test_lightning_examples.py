@@ -65,11 +65,11 @@ def test_mkc_em_is_closer_to_the_clean_function_than_the_squared_error_and_huber
 
 def test_peers_have_the_slopes_of_their_definitions():
     adaptive = loaded("peers").AdaptiveLoss(1)
-    z, one = torch.linspace(-3.0, 3.0, 7), torch.tensor(1.0)
+    z, item = torch.linspace(-3.0, 3.0, 7), torch.tensor(1.0)
     # the general loss at alpha = 1 is Charbonnier's, sqrt(z^2 + 1) - 1
-    torch.testing.assert_close(adaptive.rho(z, one), (z.square() + 1.0).sqrt() - 1.0)
+    torch.testing.assert_close(adaptive.rho(z, item), (z.square() + 1.0).sqrt() - 1.0)
     # whose partition function is 2 e K_1(1)
-    assert float(adaptive.log_partition(one).exp()) == pytest.approx(2.0 * torch.e * k1(1.0), rel=1e-5)
+    assert float(adaptive.log_partition(item).exp()) == pytest.approx(2.0 * torch.e * k1(1.0), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["diabetes", "Friedman 1"])
@@ -155,7 +155,7 @@ def wrong_targets():
 @pytest.mark.parametrize("kind", ["permuted", "uniform", "one-sided", "factor 1000", "stuck"])
 def test_a_share_of_the_targets_is_wrong_and_no_other(wrong_targets, kind):
     target = torch.rand(200, 1, generator=torch.Generator().manual_seed(0)) + 1.0
-    new, wrong = wrong_targets.spoilt(target, kind, 0.3, torch.Generator().manual_seed(1))
+    new, wrong = wrong_targets.contaminated(target, kind, 0.3, torch.Generator().manual_seed(1))
     assert int(wrong.sum()) == 60
     assert torch.equal(new[~wrong], target[~wrong])
     assert int((new[wrong] != target[wrong]).sum()) >= 55
@@ -180,6 +180,6 @@ def test_wrong_targets_leaves_no_row_out(wrong_targets, tmp_path):
 
 def test_an_error_of_a_cleaner_is_that_of_rows_held_out(wrong_targets):
     pytest.importorskip("cleanlab")
-    told = wrong_targets.outcomes("diabetes", "one-sided", 0.2, 0, steps=100, cleaner=True)
-    assert 0.3 < told[wrong_targets.CLEANER].error < 5.0
-    assert told[wrong_targets.MKC].precision > 0.6
+    reported = wrong_targets.outcomes("diabetes", "one-sided", 0.2, 0, steps=100, cleaner=True)
+    assert 0.3 < reported[wrong_targets.CLEANER].error < 5.0
+    assert reported[wrong_targets.MKC].precision > 0.6

@@ -53,6 +53,6 @@ def test_a_kernel_shows_pictures_and_tables(path, tmp_path):
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 2
     if path.stem != "network":  # recordings and results show themselves as tables
         assert sum("<table" in output.get("data", {}).get("text/html", "") for output in outputs) == 2
-    told = "".join(output.get("text", "") for output in outputs if output.output_type == "stream")
-    assert told
-    assert "Warning" not in told
+    reported = "".join(output.get("text", "") for output in outputs if output.output_type == "stream")
+    assert reported
+    assert "Warning" not in reported

@@ -122,7 +122,7 @@ def fuzz(ending: str, folder: Path, seconds: float) -> None:
         counts["seconds"] = time.monotonic() - begin
         (folder / "counts.json").write_text(json.dumps(counts), encoding="utf-8")
 
-    def one(data: bytes) -> None:
+    def read_input(data: bytes) -> None:
         counts["tried"] += 1
         path.write_bytes(data)
         try:
@@ -146,7 +146,7 @@ def fuzz(ending: str, folder: Path, seconds: float) -> None:
         write(work / f"seed{ending}", samples(12))
         (work / f"seed{ending}").rename(corpus / f"seed{place}")
     limits = [f"-max_total_time={int(seconds)}", f"-timeout={PATIENCE}", "-rss_limit_mb=4096", f"-max_len={LONGEST}"]
-    atheris.Setup([sys.argv[0], *limits, f"-artifact_prefix={folder}/", str(corpus)], one)
+    atheris.Setup([sys.argv[0], *limits, f"-artifact_prefix={folder}/", str(corpus)], read_input)
     save()
     atheris.Fuzz()
 

@@ -1,1 +1,1 @@
-"""The gate for changes of the verdict: recordings with known answers, diagnosed, judged and compared in pairs."""
+"""The gate for changes of the verdict: diagnoses recordings with known answers and compares two runs."""

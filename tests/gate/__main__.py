@@ -1,17 +1,18 @@
 """The gate for changes of the verdict: `python -m tests.gate --output DIR [--compare STORED.json]`.
 
 Diagnoses the real recordings and cases next to the repository, a few recordings of each scenario, and small draws of
-both proofs, always the same, and writes `DIR/gate.json`: for each recording verdict, findings, residuals, CPU
-and wall seconds, and whether it is right. Prints the counts and the recordings that are not right; with `--compare`,
-also each recording in which a stored `gate.json` and this one differ.
+both proofs. The draws are the same in every run. Writes `DIR/gate.json`: for each recording the verdict, findings,
+residuals, CPU and wall seconds, and whether it is right. Prints the counts and the recordings that are not right; with
+`--compare`, also the differences from a stored `gate.json`.
 
     python -m tests.gate --output before                                # on the tree before the change
     python -m tests.gate --output after --compare before/gate.json      # and after it
     python -m tests.gate --output quick --only real cases --match rocket
 
-Each recording has a process and a time limit (`--limit`, wall seconds). Its CPU seconds are those of `mkc diagnose`
-without the start of Python and without the report. Recordings that lie outside the repository are left out, with
-the file's name, where they are absent. Rows are kept while it runs: `--resume` goes on where an interrupted run ended.
+Each recording is diagnosed in its own process with a time limit (`--limit`, wall seconds). Its CPU seconds are those of
+`mkc diagnose` without the start of Python and without the report. Recordings outside the repository are left out if
+their files are absent; the file names are printed. Rows are written during the run: `--resume` continues an
+interrupted run.
 """
 
 from __future__ import annotations
@@ -36,42 +37,42 @@ RESULT = "gate.json"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the gate; 0 unless a comparison found a recording that was right and is not any more."""
+    """Run the gate. Returns 1 if a recording that was right in the compared run is wrong now, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, required=True, help="folder for the recordings, diagnoses and gate.json")
     parser.add_argument("--compare", type=Path, help="gate.json of another run")
-    parser.add_argument("--workers", type=int, default=2, help="processes at once")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of it")
-    parser.add_argument("--match", default="", help="recordings whose name has this text in it")
-    parser.add_argument("--limit", type=float, default=600.0, help="wall seconds for a recording")
-    parser.add_argument("--resume", action="store_true", help="keep the rows that are in --output already")
-    asked = parser.parse_args(arguments)
-    stored = json.loads(asked.compare.read_text(encoding="utf-8")) if asked.compare else None
+    parser.add_argument("--workers", type=int, default=2, help="parallel processes")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of the gate to run")
+    parser.add_argument("--match", default="", help="only recordings whose name contains this text")
+    parser.add_argument("--limit", type=float, default=600.0, help="time limit of a recording in wall seconds")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that --output already has")
+    options = parser.parse_args(arguments)
+    stored = json.loads(options.compare.read_text(encoding="utf-8")) if options.compare else None
     started = time.perf_counter()
-    result = run(asked.output, asked.only, asked.match, asked.workers, asked.limit, resume=asked.resume)
+    result = run(options.output, options.only, options.match, options.workers, options.limit, resume=options.resume)
     result["wall_seconds"] = round(time.perf_counter() - started, 1)
-    _write(asked.output, result)
+    _write(options.output, result)
     lines = [*count_lines(result), *wrong_lines(result["recordings"])]
     if stored is None:
         print("\n".join(lines))
         return 0
     differing = differences(stored["recordings"], result["recordings"])
     print("\n".join([*lines, *compared_lines(stored, result, differing)]))
-    return int(any("right True -> False" in told for told in differing.values()))
+    return int(any("right True -> False" in changes for changes in differing.values()))
 
 
 def run(
     output: Path, parts: Sequence[str], match: str, workers: int, limit_s: float, *, resume: bool
 ) -> dict[str, Any]:
-    """The gate's result: ``recordings``, name to row, and ``counts``, part to what is counted in it."""
-    answers = {one.name: one for one in _known(parts) if match in one.name}
-    jobs = [Job(one.name, one.recording, one.request) for one in answers.values()]
+    """Return ``recordings``, name to row, and ``counts``, part to its counts."""
+    answers = {answer.name: answer for answer in _known(parts) if match in answer.name}
+    jobs = [Job(answer.name, answer.recording, answer.request) for answer in answers.values()]
     draws: dict[str, list[drawn.Drawn]] = {}
     if "scenarios" in parts:
         draws["scenarios"] = list(drawn.all_scenarios(output, match=match, workers=workers))
     if "proofs" in parts:
         draws["proofs"] = list(drawn.both_proofs(output, match=match, workers=workers))
-    jobs += [job for group in draws.values() for one in group for job in one.jobs]
+    jobs += [job for group in draws.values() for draw in group for job in draw.jobs]
     rows: dict[str, dict[str, Any]] = {}
     if resume and (output / RESULT).is_file():
         there = json.loads((output / RESULT).read_text(encoding="utf-8"))["recordings"]
@@ -87,25 +88,25 @@ def run(
         if part in parts
     }
     for group in draws.values():
-        for one in group:
-            own = {job.name: rows[job.name] for job in one.jobs if job.name in rows}
+        for draw in group:
+            own = {job.name: rows[job.name] for job in draw.jobs if job.name in rows}
             if own:
                 first = next(iter(own))
-                counts[" ".join(first.split()[:2])] = one.counts(own)
-            for name, outcome in one.outcomes(own).items():
+                counts[" ".join(first.split()[:2])] = draw.counts(own)
+            for name, outcome in draw.outcomes(own).items():
                 if name in rows:
-                    rows[name] |= {"truth": one.truths[name]} | outcome
+                    rows[name] |= {"truth": draw.truths[name]} | outcome
     return {"counts": counts, "recordings": {job.name: rows[job.name] for job in jobs if job.name in rows}}
 
 
 def _known(parts: Sequence[str]) -> Iterator[known.Known]:
     for part, recordings in (("real", known.real), ("cases", known.cases)):
-        for one in recordings() if part in parts else ():
-            absent = [str(file) for file in (one.recording, one.file) if not file.exists()]
+        for answer in recordings() if part in parts else ():
+            absent = [str(file) for file in (answer.recording, answer.file) if not file.exists()]
             if absent:
                 print(f"left out: {', '.join(absent)} is absent")
             else:
-                yield one
+                yield answer
 
 
 def _judged(name: str, row: dict[str, Any], answers: Mapping[str, known.Known]) -> dict[str, Any]:

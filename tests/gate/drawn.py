@@ -1,4 +1,4 @@
-"""Recordings that are drawn for the gate: of each scenario, and of both proofs, always the same ones."""
+"""Draw the recordings of the gate, of each scenario and of both proofs; every run draws the same recordings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EMPTY_PER_SCENARIO = 6
 HIDDEN_PER_SCENARIO = 2
 
 PER_PROOF = {"magnetometer": 40, "dynamics": 20}
-"""Recordings with something hidden, and as many with nothing."""
+"""Recordings with a hidden effect in each proof; as many again have none."""
 
 Rows = Mapping[str, Mapping[str, Any]]
 """Name of a recording to its row."""
@@ -40,10 +40,10 @@ class Drawn:
     """The recordings of a family's scenarios, or of a proof.
 
     Attributes:
-        jobs: by the recordings' names in the run.
-        truths: of each, what is hidden.
-        counts: from the rows, measures in words to how many of how many.
-        outcomes: from the rows, of each recording whether it is a false alarm, or named.
+        jobs: their names are those of the recordings in the run.
+        truths: the hidden effects of each recording.
+        counts: returns the name of each measure with its count and total, from the rows.
+        outcomes: returns for each recording whether it is a false alarm, or was named, from the rows.
     """
 
     jobs: Sequence[Job]
@@ -69,10 +69,10 @@ def all_scenarios(
     empty: int = EMPTY_PER_SCENARIO,
     hidden: int = HIDDEN_PER_SCENARIO,
 ) -> Iterator[Drawn]:
-    """Both families' scenarios; of the recordings those whose name has ``match`` in it."""
+    """Draw the scenarios of both families; only recordings whose name contains ``match``."""
     for family in (dynamics_scenarios(), magnetometer_scenarios()):
         addresses = [
-            # a number of its own for each recording, which its file's name has in it
+            # a unique number for each recording, part of its file name
             _Address(name, partial(scenario.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
             for place, scenario in enumerate(family.scenarios)
             for hides, total in ((False, empty), (True, scenario.hidden(empty, hidden)))
@@ -85,7 +85,7 @@ def all_scenarios(
 def both_proofs(
     output: Path, *, match: str = "", workers: int = 1, sizes: Mapping[str, int] = PER_PROOF
 ) -> Iterator[Drawn]:
-    """Both proofs; of the recordings those whose name has ``match`` in it."""
+    """Draw both proofs; only recordings whose name contains ``match``."""
     for subject in (magnetometer(), dynamics()):
         size, text = sizes[subject.name], subject.simulations.read_text(encoding="utf-8") if subject.simulations else ""
         addresses = [
@@ -97,7 +97,7 @@ def both_proofs(
 
 
 def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple[list[Job], dict[str, Any]]:
-    """The jobs of recordings that are drawn and written, and their keys by the names in the run."""
+    """Draw and write the recordings. Returns their jobs, and their keys by the names in the run."""
     folder.mkdir(parents=True, exist_ok=True)
     with Pool(workers) as pool:
         drawn = every(pool, partial(_write, folder), addresses, partial(silent, "draw"))
@@ -126,7 +126,7 @@ def _of_scenarios(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, Sce
         counted_apart = f"{sum(case.alone for case in of_apart)}/{len(of_apart)}"
         return {
             "false alarms": f"{sum(case.stated.alarm for case in empty)}/{len(empty)}",
-            **({"a name alone where one run cannot tell": counted_apart} if of_apart else {}),
+            **({"a wrong single name in one run": counted_apart} if of_apart else {}),
             "strong named": f"{total.named.count}/{total.named.total}",
             "strong named wrong": f"{total.wrong.count}/{total.wrong.total}",
             "useless unfit": f"{sum(case.stated.verdict == 'unfit' for case in useless)}/{len(useless)}",
@@ -141,7 +141,7 @@ def _of_scenarios(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, Sce
             for name, case in zip(keys, cases, strict=True)
         }
 
-    return Drawn(jobs, {name: _truth(key.key) | _pushed(key) for name, key in keys.items()}, counts, outcomes)
+    return Drawn(jobs, {name: _truth(key.key) | _environment(key) for name, key in keys.items()}, counts, outcomes)
 
 
 def _of_proof(jobs: Sequence[Job], keys: Mapping[str, Key]) -> Drawn:
@@ -159,20 +159,20 @@ def _of_proof(jobs: Sequence[Job], keys: Mapping[str, Key]) -> Drawn:
         }
 
     def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
-        told = {}
+        outcomes = {}
         for name, key in keys.items():
-            one = scored(rows, [name])
+            own = scored(rows, [name])
             if key.kind == "empty":
-                told[name] = {"false_alarm": bool(one.false_alarms.count)}
+                outcomes[name] = {"false_alarm": bool(own.false_alarms.count)}
             else:
-                told[name] = {"named": bool(sum(part.named.count for part in one.power_z) or one.doubles[2])}
-        return told
+                outcomes[name] = {"named": bool(sum(part.named.count for part in own.power_z) or own.doubles[2])}
+        return outcomes
 
     return Drawn(jobs, {name: _truth(key) for name, key in keys.items()}, counts, outcomes)
 
 
 def _request(recording: Path, simulation: str) -> Request:
-    """With the text of a simulation's file, which is written beside the recording, or of the magnetometer."""
+    """The request with ``simulation``, a source text written next to the recording; empty for the magnetometer."""
     if not simulation:
         return Request(simulation=MAGNETOMETER, force=True, report=False)
     file = recording.with_suffix(".py")
@@ -183,7 +183,7 @@ def _request(recording: Path, simulation: str) -> Request:
 
 
 def _by_key(rows: Rows, names: Mapping[str, str]) -> dict[str, Mapping[str, Any] | None]:
-    """Rows by the keys' names, as the scores take diagnoses; None where a diagnosis failed."""
+    """Rows by the names of their keys, as the scores expect them; None where a diagnosis failed."""
     return {key: rows[name] if name in rows and rows[name]["verdict"] else None for name, key in names.items()}
 
 
@@ -192,5 +192,5 @@ def _truth(key: Key) -> dict[str, Any]:
     return {"kind": key.kind, "hidden": effects}
 
 
-def _pushed(key: ScenarioKey) -> dict[str, Any]:
-    return {"push": asdict(key.disturbance) if key.disturbance else None, "useless": key.useless}
+def _environment(key: ScenarioKey) -> dict[str, Any]:
+    return {"disturbance": asdict(key.disturbance) if key.disturbance else None, "useless": key.useless}

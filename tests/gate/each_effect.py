@@ -1,8 +1,8 @@
-"""How often each effect is named where it is hidden alone and well to be seen.
+"""How often each effect is named where it is the only hidden effect and is clearly detectable.
 
 ``python -m tests.gate.each_effect --effects input_lag input_square --per-effect 6 --output DIR`` draws recordings of
-the proof of differential equations until so many of each effect have z and z_sep of at least ten, has them diagnosed,
-and prints what was named. What a folder has already is not diagnosed again.
+the proof of differential equations until ``--per-effect`` recordings of each effect have z and z_sep of at least ten.
+Diagnoses them and prints the names found. Recordings that a folder has a diagnosis of are not diagnosed again.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ SEED = 11
 
 
 def strong_cases(effect: str, seed: int, most: int) -> Iterator[Case]:
-    """Recordings with that effect hidden, each with z and z_sep of at least ten.
+    """Draw recordings in which the effect is hidden, each with z and z_sep of at least ten.
 
     Args:
-        effect: its id.
-        seed: of all that is drawn.
-        most: settings that are tried.
+        effect: id of the effect.
+        seed: seed of all draws.
+        most: number of settings to try.
     """
     for index in range(most):
 
@@ -59,7 +59,7 @@ def strong_cases(effect: str, seed: int, most: int) -> Iterator[Case]:
 
 
 def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> System | None:
-    """The system with nothing else to hide; None where it does not have the effect, or does not show it."""
+    """Return the system with ``effect`` alone to hide; None if it cannot have or cannot identify the effect."""
     setting = system.draw(stream("setting"))
     scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     having = [draw for draw in system.inside if draw(stream("effect"), scene).effect == effect]
@@ -71,17 +71,18 @@ def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> 
     return replace(system, inside=(draws.choose(stream("which"), having),))
 
 
-def said_of(key: Key, folder: Path) -> tuple[bool, str]:
-    """Whether it was named right, and what was said: claims with their alternatives, or the verdict."""
+def score_case(key: Key, folder: Path) -> tuple[bool, str]:
+    """Return whether the first claim is right, and a text: the verdict, and the claims with alternatives."""
     (truth,) = key.effects
-    said = stated_diagnosis(content_of(folder / key.name / "diagnosis.json"))
+    stated = stated_diagnosis(content_of(folder / key.name / "diagnosis.json"))
     claims = [
-        " or ".join([one.named.effect, *(other.effect for other in one.others)]) + f" at {', '.join(one.named.at)}"
-        for one in said.claims
+        " or ".join([finding.named.effect, *(other.effect for other in finding.others)])
+        + f" at {', '.join(finding.named.at)}"
+        for finding in stated.claims
     ]
-    nearest = [f"nearest {one.named.effect}" for one in said.nearest]
-    right = bool(said.claims) and named_right(said.claims[0].named, truth)
-    return right, f"{said.verdict}: {'; '.join([*claims, *nearest]) or 'no name'}"
+    nearest = [f"nearest {finding.named.effect}" for finding in stated.nearest]
+    right = bool(stated.claims) and named_right(stated.claims[0].named, truth)
+    return right, f"{stated.verdict}: {'; '.join([*claims, *nearest]) or 'no name'}"
 
 
 def measure(effects: Sequence[str], per_effect: int, seed: int, output: Path, most: int) -> None:
@@ -102,12 +103,12 @@ def measure(effects: Sequence[str], per_effect: int, seed: int, output: Path, mo
                 write_table(path, case.recording.columns, overwrite=True)
                 (diagnoses / case.key.name).mkdir(exist_ok=True)
                 diagnose_dynamics([path], diagnoses)
-            right, text = said_of(case.key, diagnoses)
+            right, text = score_case(case.key, diagnoses)
             totals[effect][right] += 1
             (truth,) = case.key.effects
-            seen = f"z {truth.z:.0f}, z_sep {truth.z_sep:.0f}, size {truth.size:.3g}"
+            strength = f"z {truth.z:.0f}, z_sep {truth.z_sep:.0f}, size {truth.size:.3g}"
             mark = "right" if right else "WRONG"
-            print(f"{effect} | {case.key.name} | {truth.form} | {seen} | {mark} | {text}", flush=True)
+            print(f"{effect} | {case.key.name} | {truth.form} | {strength} | {mark} | {text}", flush=True)
     print("\n| effect | named right |\n|---|---:|")
     for effect, found in totals.items():
         print(f"| {effect} | {found[True]} of {sum(found.values())} |")
@@ -115,10 +116,10 @@ def measure(effects: Sequence[str], per_effect: int, seed: int, output: Path, mo
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--effects", nargs="+", required=True, metavar="ID", help="which effects")
-    parser.add_argument("--per-effect", type=int, default=30, help="recordings of each (default: 30)")
+    parser.add_argument("--effects", nargs="+", required=True, metavar="ID", help="ids of the effects")
+    parser.add_argument("--per-effect", type=int, default=30, help="recordings of each effect (default: 30)")
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--most", type=int, default=2000, help="settings tried for each (default: 2000)")
+    parser.add_argument("--most", type=int, default=2000, help="settings to try for each effect (default: 2000)")
     parser.add_argument("--output", type=Path, required=True, help="folder for recordings and diagnoses")
     options = parser.parse_args(arguments)
     measure(options.effects, options.per_effect, options.seed, options.output, options.most)

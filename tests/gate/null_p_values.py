@@ -3,13 +3,13 @@
 Draws empty recordings of a mass on a spring under six kinds of noise, searches each as `mkc diagnose` does, and takes
 the p-value of that search, which is `p_value` of `diagnosis.json`. Writes `p_values.json`, `null_p_values.svg` with a
 histogram for each kind, and `summary.md`: Kolmogorov's distance from the uniform distribution, and the share below the
-level with the interval of Clopper and Pearson. A run into the same folder goes on where it was ended.
+level with the interval of Clopper and Pearson. A run into the same folder continues an interrupted run.
 
     python -m tests.gate.null_p_values --per-kind 40 --output null
     python -m tests.gate.null_p_values --per-kind 5 --kinds white "held inputs" --output quick
 
-Above the level a p-value is only as fine as it has to be: the search draws noise until six draws come up to the
-recording, and asks no other kind of noise once one makes it likely.
+Above the level a p-value is coarse: the search stops drawing once six draws gain as much as the recording, and tries no
+further kind of noise once the recording is likely under the present kind.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ PValue = Callable[[Recording, int], float]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run it; 0 whatever the p-values are like."""
+    """Compute and print the table. Always returns 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, required=True, help="folder for the p-values, picture and summary")
-    parser.add_argument("--per-kind", type=int, default=40, help="recordings of each kind")
+    parser.add_argument("--per-kind", type=int, default=40, help="recordings of each kind of noise")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="kinds of noise")
     parser.add_argument("--surrogates", type=int, default=199, help="draws of noise in each search")
-    parser.add_argument("--seed", type=int, default=1, help="of all recordings")
-    asked = parser.parse_args(arguments)
-    settings = {"seed": asked.seed, "surrogates": asked.surrogates}
-    found = run(asked.output, asked.kinds, asked.per_kind, settings)
+    parser.add_argument("--seed", type=int, default=1, help="seed of all recordings")
+    options = parser.parse_args(arguments)
+    settings = {"seed": options.seed, "surrogates": options.surrogates}
+    found = run(options.output, options.kinds, options.per_kind, settings)
     rows = {kind: numbers(values) for kind, values in found.items()}
-    (asked.output / "summary.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
-    (asked.output / "null_p_values.svg").write_text(picture(found), encoding="utf-8")
+    (options.output / "summary.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+    (options.output / "null_p_values.svg").write_text(picture(found), encoding="utf-8")
     print("\n".join(table(rows)))
     return 0
 
@@ -56,14 +56,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(
     output: Path, kinds: Sequence[str], per_kind: int, settings: Mapping[str, Any], p_value: PValue | None = None
 ) -> dict[str, list[float]]:
-    """The p-values of each kind, kept in ``p_values.json`` as they come, with those that are there of other kinds.
+    """Compute the p-values of each kind, and write each to ``p_values.json``. Stored p-values of other kinds are kept.
 
     Args:
-        output: folder; what it has of the same settings is not searched again.
-        kinds: of :data:`KINDS`.
-        per_kind: recordings of each.
+        output: folder; its p-values of the same settings are not computed again.
+        kinds: names in :data:`KINDS`.
+        per_kind: recordings of each kind.
         settings: ``seed`` and ``surrogates``.
-        p_value: of a recording, with so many surrogates; default :func:`searched`.
+        p_value: returns the p-value of a recording with a number of surrogates; default :func:`searched`.
     """
     output.mkdir(parents=True, exist_ok=True)
     file = output / "p_values.json"
@@ -71,7 +71,7 @@ def run(
     found: dict[str, list[float]] = stored["p_values"] if stored.get("settings") == dict(settings) else {}
     started, search = time.process_time(), p_value or searched
     for index in range(per_kind):
-        for kind in kinds:  # by turns, so that a run that is ended has as many of each
+        for kind in kinds:  # kinds in turn: an interrupted run has as many of each
             values = found.setdefault(kind, [])
             if len(values) > index:
                 continue
@@ -83,14 +83,14 @@ def run(
 
 
 def searched(empty: Recording, surrogates: int) -> float:
-    """The p-value of the first search; nothing that it finds is kept, which no p-value depends on."""
+    """The p-value of the first search. No finding is kept; the p-value does not depend on it."""
     from mkc_torch import diagnose
 
     return diagnose(Spring(), empty, surrogates=surrogates, level=LEVEL, max_findings=0).p_value
 
 
 def numbers(p_values: Sequence[float]) -> dict[str, float]:
-    """What a row of the table has.
+    """The numbers of a row of the table.
 
     Example:
         >>> numbers([0.01, 0.2, 0.5, 0.9])["below"]

@@ -1,4 +1,4 @@
-"""Empty recordings of one simple system under each kind of noise: nothing is missing in the simulation of any."""
+"""Empty recordings of a simple system with each kind of noise: the simulation is complete."""
 
 from __future__ import annotations
 
@@ -16,25 +16,38 @@ from mkc_torch.simulation import Dynamics, Parameter
 
 Array = NDArray[np.float64]
 
-SAMPLES, STEP = 200, 0.05
+SAMPLES = 200
+
+STEP = 0.05
+"""Seconds from sample to sample."""
+
 FINE = 8
 """Steps of the integration between two samples."""
 
 NOISE = 0.01
-"""m, of the sensor."""
+"""Standard deviation of the sensor's white noise, m."""
 
-SLOW_SIZE, SLOW_SHARE = 0.02, 0.05
-"""m, and share of the recording that the sensor's slow error lasts."""
+SLOW_SIZE = 0.02
+"""Standard deviation of the sensor's slow error, m."""
+
+SLOW_SHARE = 0.05
+"""Correlation time of the sensor's slow error, as a share of the recording."""
 
 AR = 0.6
 """Correlation of the autoregressive sensor from sample to sample."""
 
-PUSH, LASTING_PUSH, LASTING_SHARE = 0.5, 0.3, 0.6
-"""m/s² of a push that is new at each sample, and of one that lasts; the share of the recording for which it does."""
+WHITE_DISTURBANCE = 0.5
+"""Standard deviation of white process noise, m/s²."""
+
+LASTING_DISTURBANCE = 0.3
+"""Standard deviation of slow process noise, m/s²."""
+
+LASTING_SHARE = 0.6
+"""Correlation time of slow process noise, as a share of the recording."""
 
 
 class Spring(Dynamics):
-    """A mass on a spring with a damper, of which the place alone is measured."""
+    """A mass on a spring with a damper; its place alone is measured."""
 
     states = ("place", "speed")
     inputs = ("force",)
@@ -49,26 +62,26 @@ class Spring(Dynamics):
 
 
 def recording(kind: str, seed: int) -> Recording:
-    """An empty recording of a kind of :data:`KINDS`; the same seed gives the same one."""
-    sensor, push, held = KINDS[kind]
+    """Draw an empty recording of a kind of :data:`KINDS`; the same seed gives the same recording."""
+    sensor, disturbance, held = KINDS[kind]
     random = np.random.default_rng([seed, list(KINDS).index(kind)])
     time = STEP * np.arange(SAMPLES)
     force = sum(
         random.normal() * np.sin(w * time + random.uniform(0.0, 2.0 * np.pi)) for w in (0.4, 0.9, 1.7, 2.9, 6.0)
     )
-    place = _moved(force, push(random), held, random.normal(0.0, 0.5, 2))
+    place = _moved(force, disturbance(random), held, random.normal(0.0, 0.5, 2))
     columns = {"time": time, "force": force, "place": place + sensor(random)}
-    return Recording({name: torch.from_numpy(one) for name, one in columns.items()}, name=kind)
+    return Recording({name: torch.from_numpy(values) for name, values in columns.items()}, name=kind)
 
 
-def _moved(force: Array, push: Array, held: bool, begin: Array) -> Array:
-    """The place at the samples, by the midpoint rule, exact to far below the noise."""
+def _moved(force: Array, disturbance: Array, held: bool, begin: Array) -> Array:
+    """The place at the samples, by the midpoint rule, with errors far below the noise."""
     h, found, x = STEP / FINE, [], begin
     for k in range(SAMPLES):
         found.append(x[0])
         rest = 0.0 if held or k == SAMPLES - 1 else force[k + 1] - force[k]
         for part in range(FINE):
-            acting = force[k] + rest * (part + 0.5) / FINE + push[k]
+            acting = force[k] + rest * (part + 0.5) / FINE + disturbance[k]
             middle = x + 0.5 * h * _rate(x, acting)
             x = x + h * _rate(middle, acting)
     return np.array(found)
@@ -82,33 +95,33 @@ def _white(random: np.random.Generator) -> Array:
     return NOISE * random.standard_normal(SAMPLES)
 
 
-def _forgetting(random: np.random.Generator, kept: float) -> Array:
-    """A stationary course of variance 1 that keeps so much of itself from sample to sample."""
-    course = random.standard_normal(SAMPLES)
-    course[1:] *= np.sqrt(1.0 - kept**2)
+def _autoregressive_series(random: np.random.Generator, correlation: float) -> Array:
+    """A stationary autoregressive series of variance 1 and lag-one correlation ``correlation``."""
+    series = random.standard_normal(SAMPLES)
+    series[1:] *= np.sqrt(1.0 - correlation**2)
     for k in range(1, SAMPLES):
-        course[k] += kept * course[k - 1]
-    return course
+        series[k] += correlation * series[k - 1]
+    return series
 
 
-def _slow_beside_white(random: np.random.Generator) -> Array:
-    return _white(random) + SLOW_SIZE * _forgetting(random, float(np.exp(-1.0 / (SLOW_SHARE * SAMPLES))))
+def _slow_and_white(random: np.random.Generator) -> Array:
+    return _white(random) + SLOW_SIZE * _autoregressive_series(random, float(np.exp(-1.0 / (SLOW_SHARE * SAMPLES))))
 
 
 def _autoregressive(random: np.random.Generator) -> Array:
-    return NOISE * _forgetting(random, AR)
+    return NOISE * _autoregressive_series(random, AR)
 
 
 def _none(random: np.random.Generator) -> Array:  # noqa: ARG001 - one signature
     return np.zeros(SAMPLES)
 
 
-def _anew(random: np.random.Generator) -> Array:
-    return PUSH * random.standard_normal(SAMPLES)
+def _white_disturbance(random: np.random.Generator) -> Array:
+    return WHITE_DISTURBANCE * random.standard_normal(SAMPLES)
 
 
-def _lasting(random: np.random.Generator) -> Array:
-    return LASTING_PUSH * _forgetting(random, float(np.exp(-1.0 / (LASTING_SHARE * SAMPLES))))
+def _lasting_disturbance(random: np.random.Generator) -> Array:
+    return LASTING_DISTURBANCE * _autoregressive_series(random, float(np.exp(-1.0 / (LASTING_SHARE * SAMPLES))))
 
 
 Draw = Callable[[np.random.Generator], Array]
@@ -116,11 +129,11 @@ Draw = Callable[[np.random.Generator], Array]
 KINDS: Mapping[str, tuple[Draw, Draw, bool]] = MappingProxyType(
     {
         "white": (_white, _none, False),
-        "slow sensor error": (_slow_beside_white, _none, False),
+        "slow sensor error": (_slow_and_white, _none, False),
         "autoregressive sensor": (_autoregressive, _none, False),
-        "process noise, white": (_white, _anew, False),
-        "process noise, lasting": (_white, _lasting, False),
+        "process noise, white": (_white, _white_disturbance, False),
+        "process noise, lasting": (_white, _lasting_disturbance, False),
         "held inputs": (_white, _none, True),
     }
 )
-"""What the sensor adds, what pushes the speed, and whether the force is held between samples."""
+"""Sensor error, process noise of the speed, and whether the force is held between samples, by kind of noise."""

@@ -1,4 +1,4 @@
-"""Diagnoses in processes of their own, each with a time limit, its CPU seconds counted."""
+"""Run diagnoses, each in its own process with a time limit, and count their CPU seconds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from typing import Any
 from mkc_torch.cli.diagnosis_request import Request
 
 _PRELOADED = "mkc_torch.cli.diagnosis_files"
-"""Imported once; the processes are forked from there, so that none waits for torch."""
+"""Imported once in the process that the others are forked from: no worker has to import torch."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A recording to diagnose, as ``mkc diagnose`` would be asked to."""
+    """A recording to diagnose, with the options of ``mkc diagnose``."""
 
     name: str
     recording: Path
@@ -30,22 +30,22 @@ class Job:
 def diagnosed(
     jobs: Sequence[Job], output: Path, *, workers: int, limit_s: float, task: Callable[[Job, Path], None] | None = None
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The rows of all jobs, by name, as they are done.
+    """Yield the name and the row of each job as it is completed.
 
     Args:
-        jobs: in the order in which they are begun.
-        output: a folder for each recording goes there.
-        workers: processes at once.
-        limit_s: wall seconds after which a diagnosis is ended and counts as failed.
-        task: writes ``row.json`` into the folder that it is given; default :func:`diagnose_job`.
+        jobs: in the order in which they are started.
+        output: parent of the folders of the recordings.
+        workers: parallel processes.
+        limit_s: wall seconds after which a diagnosis is killed and counts as failed.
+        task: writes ``row.json`` into its folder argument; default :func:`diagnose_job`.
     """
-    # Any, for the base class of contexts has no Process in its type
+    # Any: the base class of contexts has no Process in its type
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_PRELOADED])
-    # the preloaded process reads it: threads of OpenMP would not survive a fork
+    # read by the preloaded process: threads of OpenMP do not survive a fork
     os.environ["OMP_NUM_THREADS"] = "1"
 
-    def one(job: Job) -> dict[str, Any]:
+    def diagnosed_row(job: Job) -> dict[str, Any]:
         folder = output / job.name.replace(" ", "_").replace("/", "_")
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "row.json").unlink(missing_ok=True)
@@ -60,7 +60,7 @@ def diagnosed(
         return _row_of(folder, f"over the limit of {limit_s:g} s" if late else "", time.perf_counter() - started)
 
     with ThreadPoolExecutor(workers) as pool:
-        futures = {pool.submit(one, job): job.name for job in jobs}
+        futures = {pool.submit(diagnosed_row, job): job.name for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
@@ -76,7 +76,7 @@ def _row_of(folder: Path, failed: str, wall_seconds: float) -> dict[str, Any]:
 
 
 def diagnose_job(job: Job, folder: Path) -> None:
-    """Diagnose in this process and write ``row.json``, beside ``diagnosis.json`` and ``model.json``."""
+    """Diagnose in this process; write ``row.json``, ``diagnosis.json`` and ``model.json``."""
     from examples.concealed_physics.row import write_row
 
     write_row(job.recording, job.request, folder)

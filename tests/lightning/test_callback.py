@@ -955,10 +955,10 @@ def test_processes_end_with_equal_parameters_from_all_their_residuals(tmp_path):
     data = loader(error, batch_size=100)
     # learned, so that DistributedDataParallel would wait for gradients of parameters that have none
     trained(Replay(**LEARNED), data, MKCExpectationMaximization(), Written(tmp_path), **options)
-    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
-    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    left, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    assert all(torch.equal(a, b) for a, b in zip(left, other, strict=True))
     alone, _ = trained(Replay(**LEARNED), data, max_epochs=2)
-    torch.testing.assert_close(one, (alone.criterion.sigma.detach(), alone.criterion.d.detach()), rtol=1e-6, atol=0)
+    torch.testing.assert_close(left, (alone.criterion.sigma.detach(), alone.criterion.d.detach()), rtol=1e-6, atol=0)
 
 
 # --- without Lightning

@@ -586,19 +586,19 @@ def free_port():
 @pytest.mark.process
 def test_processes_add_up_to_the_histogram_of_all_residuals(tmp_path):
     multiprocessing.spawn(_reduced, (free_port(), str(tmp_path)), nprocs=2)
-    one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
-    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    left, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    assert all(torch.equal(a, b) for a, b in zip(left, other, strict=True))
     whole = filled(drawn(600, 2))
-    sums, count, batches, sigma, d = one
+    sums, count, batches, sigma, d = left
     torch.testing.assert_close(sums, whole.sums, rtol=1e-12, atol=0)
     assert torch.equal(count, whole.count)
     assert batches == 2
     torch.testing.assert_close(d, fitted(whole).d, rtol=1e-9, atol=0)
     torch.testing.assert_close(sigma, fitted(whole).sigma, rtol=1e-8, atol=0)
 
-    one, other = (torch.load(tmp_path / f"unknown-{rank}.pt") for rank in (0, 1))
-    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
-    collected, reach, last, reach_of_one, share = one
+    left, other = (torch.load(tmp_path / f"unknown-{rank}.pt") for rank in (0, 1))
+    assert all(torch.equal(a, b) for a, b in zip(left, other, strict=True))
+    collected, reach, last, reach_of_one, share = left
     assert torch.equal(reach_of_one, filled(batches_of(1)[0], bound=None).reach)
     assert ((share > 0) & (share < 1))[:2].all()
     reaches = torch.stack([filled(*batches_of(rank), bound=None).reach for rank in (0, 1)])

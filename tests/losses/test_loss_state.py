@@ -35,9 +35,9 @@ def state(loss):
     return copy.deepcopy(loss.state_dict())
 
 
-def assert_same(one, other):
-    assert list(one) == list(other)
-    torch.testing.assert_close(one, other, rtol=0.0, atol=0.0)
+def assert_same(left, other):
+    assert list(left) == list(other)
+    torch.testing.assert_close(left, other, rtol=0.0, atol=0.0)
 
 
 def after(*sizes, **options):
@@ -182,19 +182,19 @@ def test_a_fully_masked_batch_changes_no_scale():
 def test_activation_checkpointing_counts_a_batch_once(options, use_reentrant):
     model, twin = nn.Linear(3, 2), nn.Linear(3, 2)
     twin.load_state_dict(model.state_dict())
-    one, other = MKCLoss(2, **options), MKCLoss(2, **options)
+    left, other = MKCLoss(2, **options), MKCLoss(2, **options)
     for seed in range(5):
         x, y = torch.randn(50, 3, generator=generator(seed)), data(50, seed=seed)[1]
         x.requires_grad_()
-        value = checkpoint(lambda a, b: one(model(a), b), x, y, use_reentrant=use_reentrant)
-        assert one.schedule.steps.unique().tolist() == [seed + 1]
+        value = checkpoint(lambda a, b: left(model(a), b), x, y, use_reentrant=use_reentrant)
+        assert left.schedule.steps.unique().tolist() == [seed + 1]
         value.backward()
         plain = other(twin(x.detach()), y)
         plain.backward()
         assert value.item() == plain.item()
-        assert_same(state(one), state(other))
+        assert_same(state(left), state(other))
         for a, b in zip(
-            (*model.parameters(), *one.parameters()), (*twin.parameters(), *other.parameters()), strict=True
+            (*model.parameters(), *left.parameters()), (*twin.parameters(), *other.parameters()), strict=True
         ):
             torch.testing.assert_close(a.grad, b.grad, rtol=1e-6, atol=1e-8)
 
@@ -455,27 +455,27 @@ def test_processes_share_the_geometric_mean_scale_and_the_widest_range(
     processes,
 ):
     """Of three channels: with residuals in both processes, in the second alone, in none."""
-    one, other = (found["scale"] for found in processes)
-    assert one == other
+    left, other = (found["scale"] for found in processes)
+    assert left == other
     scale = 0.4 / 0.5244005
-    assert torch.tensor(one["log_scale"]).exp().tolist() == pytest.approx([2.0 * scale, 4.0 * scale, 1.0], rel=1e-2)
-    assert one["half_range"] == pytest.approx([4.0, 4.0, 1.0])
-    assert one["floor"] == pytest.approx([1.25e-3, 2e-3, 1e-3], rel=2e-2)
-    assert one["batches"] == [1, 1, 0]
+    assert torch.tensor(left["log_scale"]).exp().tolist() == pytest.approx([2.0 * scale, 4.0 * scale, 1.0], rel=1e-2)
+    assert left["half_range"] == pytest.approx([4.0, 4.0, 1.0])
+    assert left["floor"] == pytest.approx([1.25e-3, 2e-3, 1e-3], rel=2e-2)
+    assert left["batches"] == [1, 1, 0]
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("place", ["inside", "outside"])
 @pytest.mark.parametrize("kind", ROBUST)
 def test_processes_have_the_same_scale_and_schedule(processes, kind, place):
-    one, other = (found[f"{kind}, {place}"] for found in processes)
-    running = [name for name in one if name.startswith(("residual_scale", "schedule"))]
+    left, other = (found[f"{kind}, {place}"] for found in processes)
+    running = [name for name in left if name.startswith(("residual_scale", "schedule"))]
     assert len(running) == 8
-    assert {name: one[name] for name in running} == {name: other[name] for name in running}
-    assert one["schedule.steps"] == [25, 25]
-    scales = torch.tensor(one["residual_scale.log_scale"]).exp()
+    assert {name: left[name] for name in running} == {name: other[name] for name in running}
+    assert left["schedule.steps"] == [25, 25]
+    scales = torch.tensor(left["residual_scale.log_scale"]).exp()
     assert bool(((scales > 1.2) & (scales < 3.5)).all())  # between 1 and 4
-    assert min(one["schedule.share"]) > 0.0
+    assert min(left["schedule.share"]) > 0.0
 
 
 @pytest.mark.parametrize("kind", ROBUST)

@@ -248,7 +248,7 @@ def test_gradients_of_elements_and_sums_equal_the_mean_times_the_weight(reductio
     slopes = []
     for kind in (reduction, "mean"):
         inputs = leaf(x)
-        value = annealing(reduction=kind, **options)(one, y, weight)
+        value = annealing(reduction=kind, **options)(inputs, y, weight)
         slopes.append(torch.autograd.grad(value.sum() * (1.0 if kind != "mean" else weight.sum()), inputs)[0])
     torch.testing.assert_close(*slopes, rtol=1e-10, atol=1e-12)
 

@@ -47,8 +47,8 @@ def numbers(scale):
     return {name: value for name, value in scale.state_dict().items() if name not in ("recent", "position")}
 
 
-def assert_same_numbers(one, other, **tolerance):
-    torch.testing.assert_close(numbers(one), numbers(other), **(tolerance or {"rtol": 0.0, "atol": 0.0}))
+def assert_same_numbers(left, other, **tolerance):
+    torch.testing.assert_close(numbers(left), numbers(other), **(tolerance or {"rtol": 0.0, "atol": 0.0}))
 
 
 def quantile(residual):
@@ -89,9 +89,9 @@ def test_the_scale_is_robust_in_each_channel_and_about_0():
 @settings(max_examples=20, deadline=None)
 def test_all_numbers_have_the_unit_of_the_target(exponent, seed):
     unit, batches = 10.0**exponent, [randn(30, 2, seed=seed), randn(50, 2, seed=seed + 1)]
-    one, other = updated(*batches), updated(*(unit * batch for batch in batches))
+    left, other = updated(*batches), updated(*(unit * batch for batch in batches))
     for name in ("scale", "half_range", "floor", "bound"):
-        torch.testing.assert_close(unit * getattr(one, name), getattr(other, name), rtol=1e-9, atol=0.0)
+        torch.testing.assert_close(unit * getattr(left, name), getattr(other, name), rtol=1e-9, atol=0.0)
 
 
 def test_the_floor_is_a_thousandth_of_the_spread_of_the_first_residuals_about_their_mean():
@@ -298,10 +298,10 @@ def test_spaced_rows_are_rows_of_the_batch_whatever_its_layout(shape, axis, most
 def test_channels_in_the_second_dimension_equal_channels_last(shape):
     prediction, target = randn(*shape), randn(*shape, seed=1)
     weight = torch.rand(shape, generator=generator(), dtype=torch.float64)
-    one, other = ResidualScale(3).double(), ResidualScale(3).double()
-    one.update(prediction, target, weight, channel_dim=1)
+    left, other = ResidualScale(3).double(), ResidualScale(3).double()
+    left.update(prediction, target, weight, channel_dim=1)
     other.update(*(values.movedim(1, -1).contiguous() for values in (prediction, target, weight)))
-    torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(left.state_dict(), other.state_dict(), rtol=0.0, atol=0.0)
 
 
 # --- NumPy and torch

@@ -83,17 +83,17 @@ BAD = {
     ),
     # time
     "a day as people write it": (changed(2, "3 May,1,2,3"), 'column `time` holds text at line 2, "3 May"'),
-    "a day that is none": (
+    "an impossible day": (
         HEAD + "2024-02-30T10:00:00,1,2,3\n2024-02-30T10:00:01,1,2,3\n",
         'column `time` holds text at line 2, "2024-02-30T10:00:00"; write times as seconds, or as',
     ),
-    "an hour that is none": (HEAD + "2024-02-03T31:00:00,1,2,3\n", "write times as seconds, or as 2024-05-03T10"),
+    "an impossible hour": (HEAD + "2024-02-03T31:00:00,1,2,3\n", "write times as seconds, or as 2024-05-03T10"),
     "zones and none": (
         HEAD + "2024-02-03T10:00:00Z,1,2,3\n2024-02-03T10:00:01,1,2,3\n",
         "line 3.*write all stamps with a zone",
     ),
     "stamps and numbers": (HEAD + "2024-02-03T10:00:00,1,2,3\n1.0,1,2,3\n", 'holds text at line 3, "1.0"'),
-    "a time of day that is none": (HEAD + "10:00:00,1,2,3\n10:99:00,1,2,3\n", "line 3.*or as 10:00:00.25"),
+    "an impossible time of day": (HEAD + "10:00:00,1,2,3\n10:99:00,1,2,3\n", "line 3.*or as 10:00:00.25"),
     # columns
     "no magnetometer": (
         "time,speed\n0,1\n1,2\n",
@@ -119,7 +119,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_bad_text_is_refused_in_a_sentence_that_says_why(tmp_path, kind):
+def test_bad_text_is_rejected_with_the_reason(tmp_path, kind):
     content, message = BAD[kind]
     path = tmp_path / "bad.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -139,7 +139,7 @@ def test_the_kinds_are_many_and_their_messages_differ():
 
 @pytest.mark.parametrize("kind", ["a row too short", "two sensors", "binary", "zones and none", "two that may be it"])
 @pytest.mark.parametrize("command", ["calibrate", "inspect"])
-def test_the_commands_say_it_in_a_line_and_write_nothing(tmp_path, kind, command):
+def test_the_commands_report_it_in_a_line_and_write_nothing(tmp_path, kind, command):
     content, _ = BAD[kind]
     path = tmp_path / "bad.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -90,7 +90,7 @@ def test_a_parquet_of_the_same_samples_is_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"plain"}))
-def test_what_was_done_is_told(tmp_path, kind):
+def test_warnings_report_what_was_done(tmp_path, kind):
     assert read(tmp_path, KINDS[kind]).warnings
 
 

@@ -72,14 +72,14 @@ def test_a_frame_gives_what_its_file_gives(library, tmp_path):
     assert list(Recording(frame).experiments()) == ["left", "right"]
 
 
-def test_labels_that_are_missing_are_none():
+def test_missing_labels_are_nan():
     for dtype in ("string", "category", object):
         recording = Recording(pd.DataFrame({"experiment": pd.Series(["a", None, "b"], dtype=dtype), "x": [1, 2, 3]}))
         assert recording.labels["experiment"] == ("a", "b")
         assert recording["experiment"].isnan().tolist() == [False, True, False]
 
 
-def test_units_and_names_are_the_new_ones():
+def test_units_and_names_are_those_after_renaming():
     frame = pd.DataFrame({"mx": [1.0, 2.0]})
     recording = Recording.from_frame(frame, columns={"mag_x": "mx"}, units={"mag_x": "G"})
     assert recording.units == {"mag_x": "µT"}
@@ -118,12 +118,12 @@ def test_an_index_with_a_name_is_a_column():
         (pl.DataFrame(), "no column"),
     ],
 )
-def test_frames_that_are_no_table_of_numbers_are_refused(frame, message):
+def test_frames_without_numbers_are_rejected(frame, message):
     with pytest.raises(RecordingError, match=message):
         Recording(frame, name="r")
 
 
-def test_times_that_nobody_asked_for_are_left_out():
+def test_times_that_are_not_required_are_left_out():
     frame = pd.DataFrame({"x": [1.0], "written": pd.to_datetime(["2020-01-01"])})
     assert Recording(frame).warnings == ("Column `written` holds no numbers and is left out.",)
 
@@ -138,12 +138,12 @@ def test_times_that_nobody_asked_for_are_left_out():
         (np.array([1j]), "but got complex128"),
     ],
 )
-def test_columns_that_are_no_numbers_are_refused(values, message):
+def test_columns_without_numbers_are_rejected(values, message):
     with pytest.raises(RecordingError, match=message):
         Recording({"a": values})
 
 
-def test_what_is_no_frame_is_told_what_one_is():
+def test_an_object_that_is_not_a_frame_is_rejected():
     with pytest.raises(RecordingError, match="expected a DataFrame but got"):
         Recording.from_frame({"a": [1.0]})
 
@@ -153,7 +153,7 @@ def test_a_frame_is_written_as_a_recording(tmp_path):
     assert Recording.read(tmp_path / "r.csv")["x"].tolist() == [1.0, 2.0]
 
 
-def test_a_frame_in_the_place_of_a_recording_is_told_how_to_become_one():
+def test_a_frame_instead_of_a_recording_is_rejected_with_advice():
     frame = pd.DataFrame({"time": [0.0, 0.1]})
     with pytest.raises(TypeError, match=r"but got a DataFrame; make one, Recording\(recording\)"):
         diagnose(Magnetometer(), frame)

@@ -83,7 +83,7 @@ def test_parquet_becomes_text_with_all_its_digits(typed, tmp_path, ending):
     assert cells["list"] == ("[1, 2]", "[3]", "")
 
 
-def test_text_becomes_numbers_in_parquet_where_none_is_lost(tmp_path):
+def test_text_becomes_numbers_in_parquet_without_loss(tmp_path):
     source = tmp_path / "in.csv"
     source.write_text(
         "ns,value,serial,stamp,gone\n1735689600000000001,1.5,007,2026-01-01T00:00:00,\n"
@@ -101,7 +101,7 @@ def test_text_becomes_numbers_in_parquet_where_none_is_lost(tmp_path):
     assert Recording.read(target)["value"][0] == 1.5
 
 
-def test_columns_without_a_name_are_kept_without_one(tmp_path):
+def test_columns_without_a_name_are_kept(tmp_path):
     """Such as the index column of pandas, or the empty column after a trailing separator."""
     source = tmp_path / "in.csv"
     source.write_text(",mag_x,\n0,1.50,\n1,2.50,\n", encoding="utf-8")

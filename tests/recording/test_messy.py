@@ -25,7 +25,7 @@ EXPECTED_WARNINGS = {
     "names_with_units": ["`magX [uT]`, `magY [uT]`, `magZ [uT]` are taken as `mag_x`, `mag_y`, `mag_z`"],
     "time_restarts": ["The time starts again at row 1366 (line 1367)", "2 runs"],
     "timestamp_in_microseconds": ["µs since 1970"],
-    "two_topics": ["`x`, `y`, `z` are taken as `mag_x`", "converted from gauss, as the file says", "The times are µs"],
+    "two_topics": ["`x`, `y`, `z` are taken as `mag_x`", "converted from gauss, as the file", "The times are µs"],
 }
 
 

@@ -92,7 +92,7 @@ def test_the_command_knows_the_same_quantities():
 # --- sensors
 
 
-def test_sensors_of_one_kind_are_several_and_forms_of_one_are_a_question():
+def test_equal_sensors_are_several_and_forms_of_a_sensor_are_ambiguous():
     several = recognised([names("mag0_x", "mag0_y", "mag0_z", "mag1_x", "mag1_y", "mag1_z")])
     assert ([sensor.name for sensor in several.sensors], several.several) == (["mag0", "mag1"], True)
     forms = recognised([names(*(f"mag_{form}_{axis}" for form in ("raw", "cal") for axis in "xyz"))])
@@ -104,24 +104,24 @@ def test_the_own_name_wins_over_another_form():
     assert [sensor.columns["mag_x"] for sensor in found.sensors] == ["mag_x"]
 
 
-def test_an_incomplete_triple_is_none():
+def test_an_incomplete_triple_is_not_recognised():
     assert recognised([names("mag_x", "mag_y", "gyro_x")]).sensors == ()
 
 
-def test_what_stands_beside_goes_by_the_sensors_number():
+def test_companion_columns_match_the_sensors_number():
     columns = [f"{q}{n}_{axis}" for q in ("mag", "gyro") for n in (0, 1) for axis in "xyz"]
     found = recognised([names("time", *columns)])
     assert [sensor.columns["gyro_x"] for sensor in found.sensors] == ["gyro0_x", "gyro1_x"]
 
 
 @pytest.mark.parametrize("file", ["Magnetometer", "sensor_mag_0", "imu_mag_log"])
-def test_x_y_z_are_a_magnetometers_where_the_file_says_so(file):
+def test_x_y_z_are_a_magnetometer_by_the_name_of_the_file(file):
     assert is_about_magnetometer(file) == (file != "imu_gyro")
     assert [sensor.columns["mag_x"] for sensor in recognised([names("time", "x", "y", "z")], file).sensors] == ["x"]
 
 
 @pytest.mark.parametrize("file", ["log", "run_3", "gyroscope", "imu", "mag_and_gyro", "position"])
-def test_x_y_z_are_nothing_where_nothing_says_so(file):
+def test_x_y_z_without_a_hint_are_not_recognised(file):
     assert recognised([names("time", "x", "y", "z")], file).sensors == ()
 
 
@@ -129,7 +129,7 @@ PX4 = {"timestamp": [1], "timestamp_sample": [1], "device_id": [396825], "x": [0
 
 
 @pytest.mark.parametrize(("device", "is_one"), [(396825, True), (3014666, False), (0, False), (0xE50000, True)])
-def test_a_device_of_px4_says_what_it_is(device, is_one):
+def test_a_px4_device_id_identifies_a_magnetometer(device, is_one):
     """396825 = 0x060E19: type 0x06 (IST8310), address 0x0E, bus 3 of kind I2C; 3014666 = 0x2E000A, an ICM-42653."""
     table = topic(**PX4 | {"device_id": [device]})
     assert is_px4_magnetometer(table.table) == is_one
@@ -195,7 +195,7 @@ def test_topics_are_sensors_and_what_px4_makes_of_them_is_left_out(tmp_path, mon
     path = log(tmp_path, monkeypatch, voted, mag_topic("sensor_mag"))
     found = recognised(formats.read_topics(path))
     assert [sensor.topic for sensor in found.sensors] == [1]
-    assert found.left_out == ("Topic `vehicle_magnetometer` is left out: it is made of `sensor_mag`, which is there.",)
+    assert found.left_out == ("Topic `vehicle_magnetometer` is left out: it is derived from `sensor_mag`, which is read.",)
 
 
 def test_columns_of_a_topic_are_named_with_it(tmp_path, monkeypatch):
@@ -240,7 +240,7 @@ def test_without_recognition_only_the_time_is_known(tmp_path):
     assert recording.time.tolist() == pytest.approx([0.0, 5e-4])
 
 
-def test_units_that_are_asked_for(tmp_path):
+def test_requested_units_are_converted(tmp_path):
     text = "time,mag_x,mag_y,mag_z,gyro_x,temperature\n0,0.5,0.25,0.125,180,300\n1000,0.5,0.25,0.125,90,300\n"
     given = {"mag": "gauss", "time": "ms", "gyro": "deg/s", "temperature": "K"}
     recording = read(tmp_path, text, units=given)
@@ -318,18 +318,18 @@ STEADY = np.arange(0.0, 50.0, 0.5)
         (np.array([np.nan, np.nan]), []),
     ],
 )
-def test_where_a_time_starts_again(time, expected):
+def test_restarts_of_the_time_are_found(time, expected):
     assert restarts(time) == expected
 
 
-def test_runs_are_counted_from_their_own_first_sample_where_the_time_is_converted(tmp_path):
+def test_a_converted_time_starts_at_zero_in_each_run(tmp_path):
     rows = [f"{5000 + 20 * i},1,2,3" for i in range(40)] + [f"{100 + 20 * i},1,2,3" for i in range(40)]
     recording = read(tmp_path, "\n".join(["time_ms,mx,my,mz", *rows]) + "\n")
     assert recording["experiment"].unique().tolist() == [1.0, 2.0]
     assert recording.time[[0, 39, 40, 79]].tolist() == pytest.approx([0.0, 0.78, 0.0, 0.78])
 
 
-def test_a_header_that_stands_again_is_a_run_where_there_is_no_time(tmp_path):
+def test_a_repeated_header_starts_a_run_without_a_time(tmp_path):
     recording = read(tmp_path, "mx,my,mz\n1,2,3\n2,3,4\nmx,my,mz\n3,4,5\n")
     assert recording["experiment"].tolist() == [1.0, 1.0, 2.0]
     assert "There is no time" in recording.warnings[-1]

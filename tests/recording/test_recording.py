@@ -107,7 +107,7 @@ def test_units_follow_from_names():
     assert Recording({name: column(1) for name in units}).units == units
 
 
-def test_given_units_take_the_place_of_default_ones():
+def test_given_units_override_default_units():
     recording = Recording({"mag_x": column(1), "temperature": column(300)}, units={"temperature": "K"})
     assert recording.units == {"mag_x": "µT", "temperature": "K"}
 
@@ -127,7 +127,7 @@ def test_given_units_take_the_place_of_default_ones():
         ({"a\nb": column(1)}, "cannot name a column"),
     ],
 )
-def test_columns_that_are_no_table_are_refused(columns, message):
+def test_columns_that_do_not_form_a_table_are_rejected(columns, message):
     with pytest.raises(RecordingError, match=f"run: .*{message}"):
         Recording(columns, name="run")
 
@@ -298,7 +298,7 @@ def test_each_experiment_has_its_own_clock():
     )
 
 
-def test_a_gap_inside_an_experiment_is_found_and_the_step_between_experiments_is_none():
+def test_a_gap_in_a_run_is_found_and_the_step_between_runs_is_not_a_gap():
     group, time = column(0, 0, 0, 1, 1, 1, 1, 1), column(0, 1, 2, 900, 901, 902, 903, 950)
     again = Recording({"experiment": group, "time": time}, labels={"experiment": ["up", "down"]}).sorted_by_time()
     assert again.warnings == (
@@ -542,7 +542,7 @@ def test_a_parquet_file_name_is_no_pattern(tmp_path):
         ({"a": []}, "no rows"),
     ],
 )
-def test_a_parquet_table_that_cannot_be_used_says_why(tmp_path, columns, message):
+def test_an_unusable_parquet_table_is_an_error_with_the_reason(tmp_path, columns, message):
     pl.DataFrame(columns).write_parquet(tmp_path / "rec.parquet")
     if message is None:
         assert Recording.read(tmp_path / "rec.parquet").names == ("mag_x",)
@@ -565,7 +565,7 @@ def test_the_module_imports_without_the_table_reader():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_reading_without_the_table_reader_says_what_to_install(tmp_path, monkeypatch):
+def test_reading_without_polars_names_the_extra_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "polars", None)
     with pytest.raises(ImportError, match=r'pip install "mkc-torch\[cli\]"'):
         read(tmp_path, "a\n1\n")
@@ -583,7 +583,7 @@ EXTREMES = [0.0, -0.0, 0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -2.2250738585
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.tsv", "a.txt", "a.parquet"])
-def test_what_is_written_is_read_back_to_the_bit(tmp_path, name):
+def test_a_written_table_is_read_back_to_the_bit(tmp_path, name):
     columns = {"time": torch.arange(len(EXTREMES)), "mag_x": column(*EXTREMES), "b;c": column(*EXTREMES[::-1])}
     write_table(tmp_path / name, columns)
     again = Recording.read(tmp_path / name)
@@ -683,7 +683,7 @@ def test_words_for_a_missing_value_are_reported(tmp_path, word):
     assert same(recording["a"], [1, NAN, NAN, NAN, NAN])
     (warning,) = recording.warnings
     assert warning == (
-        f'Column `a` holds "{word.strip()}" or the like 2 times, first at line 3; it is read as no value.'
+        f'Column `a` holds "{word.strip()}" or the like 2 times, first at line 3; it is read as a missing value.'
     )
 
 

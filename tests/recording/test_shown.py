@@ -5,7 +5,7 @@ import numpy as np
 from mkc_torch.recording import Recording
 
 
-def test_a_recording_in_a_notebook_is_escaped_and_counts_what_is_missing():
+def test_a_recording_in_a_notebook_is_escaped_and_counts_missing_values():
     table = Recording({"a<b": np.array([1.0, np.nan, -3.0])}, name="<i>", units={"a<b": "µT"}, warnings=("x & y",))
     page = table._repr_html_()
     for word in ("&lt;i&gt;: 3 samples", "a&lt;b", "x &amp; y", "−3", ">1</td>"):

@@ -193,7 +193,7 @@ def test_a_column_that_the_caller_names_is_not_joined(tmp_path):
 
 
 @pytest.mark.parametrize("word", ["-", "--", "?", "#N/A", "None", "nil", "1.#QNAN", "#VALUE!", "<NA>"])
-def test_a_word_for_no_value_is_none(tmp_path, word):
+def test_a_word_for_a_missing_value_is_nan(tmp_path, word):
     lines = LINES.copy()
     lines[9] = f"0.16,{word},1,2"
     recording = Recording.read(write(tmp_path, "\n".join(lines)))
@@ -232,7 +232,7 @@ def test_rows_of_two_sensors_are_two_calibrations(tmp_path, name, labels, sensor
     assert len(Recording.read(path, recognise=False)) == 2 * ROWS
 
 
-def test_rows_of_several_topics_are_told_apart(tmp_path):
+def test_rows_of_several_sensors_are_separated(tmp_path):
     path = write(tmp_path, table("time,type,x,y,z", *two(("MAG", "ACC"))))
     recording = Recording.read(path)
     assert_same(recording)
@@ -240,7 +240,7 @@ def test_rows_of_several_topics_are_told_apart(tmp_path):
 
 
 @pytest.mark.e2e
-def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_one(tmp_path):
+def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_chosen_sensor(tmp_path):
     path = write(tmp_path, table("time,id,mag_x,mag_y,mag_z", *two(("0", "1"))))
     run = CliRunner()
     made = run.invoke(app, ["calibrate", str(path), "--output", str(tmp_path / "out")])
@@ -254,13 +254,13 @@ def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_one(tmp_path):
     assert corrected.stack("field_x", "field_y", "field_z").norm(dim=-1).std() < 0.5
 
 
-def test_rows_that_take_turns_without_a_column_that_says_so_are_told(tmp_path):
+def test_alternating_rows_without_a_sensor_column_have_a_warning(tmp_path):
     path = write(tmp_path, table("time,mag_x,mag_y,mag_z", *np.delete(np.array(two((0.0, 0.0))), 1, axis=0)))
     assert "rows of 2 sensors seem to take turns" in " ".join(Recording.read(path).warnings)
     assert interleaved(FIELD) == interleaved(np.random.default_rng(0).normal(size=(999, 3))) == 0
 
 
-def test_the_named_sensor_is_read_and_not_the_one_with_the_usual_names(tmp_path):
+def test_the_named_sensor_is_read_rather_than_the_usual_names(tmp_path):
     names = "time,mag_x,mag_y,mag_z,mag2_x,mag2_y,mag2_z"
     path = write(tmp_path, table(names, TIME, *XYZ, *OTHER.T))
     assert_same(Recording.read(path, sensor="mag2"), OTHER)
@@ -269,7 +269,7 @@ def test_the_named_sensor_is_read_and_not_the_one_with_the_usual_names(tmp_path)
     assert center == pytest.approx((-30.0, 5.0, 9.0), abs=0.2)
 
 
-def test_a_unit_that_the_numbers_contradict_is_told_with_the_one_that_fits(tmp_path):
+def test_a_contradicted_unit_has_a_warning_with_the_fitting_unit(tmp_path):
     path = write(tmp_path, table("time,mx [gauss],my [gauss],mz [gauss]", TIME, *XYZ))
     warnings = " ".join(calibrate(Recording.read(path)).warnings)
     assert (
@@ -278,7 +278,7 @@ def test_a_unit_that_the_numbers_contradict_is_told_with_the_one_that_fits(tmp_p
     assert "Nothing was converted" not in warnings
 
 
-def test_an_accelerometer_alone_is_told_how_it_is_calibrated(tmp_path):
+def test_a_file_with_only_an_accelerometer_gets_advice(tmp_path):
     path = write(tmp_path, table("time,acc_x,acc_y,acc_z", TIME, *XYZ))
     with pytest.raises(RecordingError, match="An accelerometer is calibrated by: `--quantity accel`") as refusal:
         read_magnetometer(path, {}, {}, None)
@@ -286,7 +286,7 @@ def test_an_accelerometer_alone_is_told_how_it_is_calibrated(tmp_path):
 
 
 @pytest.mark.parametrize("names", ["mag1,mag2,mag3", "mag_0,mag_1,mag_2", "mag(1),mag(2),mag(3)"])
-def test_numbered_columns_are_asked_for_with_the_option(tmp_path, names):
+def test_numbered_columns_need_the_columns_option(tmp_path, names):
     path = write(tmp_path, table(f"time,{names}", TIME, *XYZ))
     x, y, z = names.split(",")
     with pytest.raises(RecordingError) as refusal:
@@ -305,7 +305,7 @@ def test_numbered_columns_are_asked_for_with_the_option(tmp_path, names):
         ("rec.csv", PLAIN.replace("mag_z", "mag_z,a"), "other lines are the same, so correct the header"),
     ],
 )
-def test_a_refusal_says_what_to_do(tmp_path, name, content, message):
+def test_an_error_contains_a_remedy(tmp_path, name, content, message):
     with pytest.raises(RecordingError, match=message):
         Recording.read(write(tmp_path, content, name))
 
@@ -317,7 +317,7 @@ def frame(names, columns):
     return pd.DataFrame(dict(zip(names.split(","), columns, strict=True)))
 
 
-def test_a_frame_is_recognised_converted_and_told_as_its_file_is():
+def test_a_frame_is_recognised_and_converted_like_its_file():
     start = pd.Timestamp(START)
     for times in (
         pd.Series([start + pd.Timedelta(seconds=t) for t in TIME]),

@@ -87,7 +87,7 @@ def test_times_in_other_units_are_named(interval, shown, unit, since):
     assert f"looks like {unit} (50 samples a second then)" in sentence
 
 
-def test_several_units_are_named_one_by_one():
+def test_several_units_have_a_warning_each():
     assert len(warnings_of(vector("mag", 0.5), vector("gyro", 115.0), vector("accel", 1.0))) == 3
 
 
@@ -109,7 +109,7 @@ def turned(size, offset, share=1.0):
     return {f"mag_{axis}": field[:, k] for k, axis in enumerate("xyz")}
 
 
-def test_the_length_is_taken_without_the_offset_where_the_turns_tell_it():
+def test_the_length_excludes_the_offset_if_the_turns_determine_it():
     assert warnings_of(turned(45.0, (590.0, 0.0, 0.0))) == ()
     (sentence,) = warnings_of(turned(450.0, (2500.0, 0.0, 0.0)))
     assert "measures about 450 µT" in sentence

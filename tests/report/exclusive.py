@@ -26,11 +26,11 @@ Where = Literal["row", "finding", "report"]
 REASON = "|".join(
     re.escape(term(f"evidence.{key}"))
     for key in ("blocks_differ", "in_the_tail", "tail_less_likely", "free_run_farther", "free_run_closer")
-) + "|leaves the recording's range"  # fmt: skip
+) + "|open-loop simulation diverges"  # fmt: skip
 """Why likelihood and residual disagree."""
 
 CLAIM = r"[Ll]eft out of the simulation"
-PUSH = r"[Ss]omething unrecorded pushes|[Ss]omething slow is added"
+PUSH = r"Process noise (?:acts |remains )?on the rate|in addition to (?:its white|the sensor's) noise"
 NUMBER = r"\d[\d.]*(?: × 10\S+)?"
 
 
@@ -49,42 +49,42 @@ PAIRS = (
     Pair("surely better", "no change", "row", r"\d % less"),
     Pair("surely better", r"\d % more", "row", r"\d % less"),
     Pair("surely better", "[Nn]ot confirmed", "finding"),
-    Pair("surely better", "free run is farther off", "row"),
+    Pair("surely better", "open-loop residual is larger", "row"),
     Pair("surely better", rf"95 %: (−{NUMBER}|0(\.0+)?) to", "row"),
     Pair("[Nn]ot confirmed on", r"\b([5-9]|\d\d) % less", "finding", REASON),
     Pair("not shown to be better", r"\b([5-9]|\d\d) % less", "row", REASON),
-    Pair("(?<!surely )worse on unseen", r"\b([5-9]|\d\d) % less", "row", REASON),
-    Pair("worse on unseen", CLAIM, "finding"),
-    Pair("do not speak against it", rf"95 %: −{NUMBER} to −", "row", REASON),
-    Pair("do not speak against it", "[Nn]ot confirmed", "finding"),
-    Pair("differs by more than itself", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
+    Pair("(?<!surely )worse on held-out", r"\b([5-9]|\d\d) % less", "row", REASON),
+    Pair("worse on held-out", CLAIM, "finding"),
+    Pair("do not reject it", rf"95 %: −{NUMBER} to −", "row", REASON),
+    Pair("do not reject it", "[Nn]ot confirmed", "finding"),
+    Pair("varies between blocks by more", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
     Pair("not measured", r"nats per sample", "row"),
     # two sizes of the same name: of an output, robust, and of the fit's samples
     Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
     # what is missing
-    Pair("Nothing is missing", CLAIM, "report"),
-    Pair("Nothing is missing", "[Nn]earest in the catalogue", "report"),
-    Pair("Nothing is missing", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
-    Pair("Nothing is missing", PUSH, "report"),
-    Pair("Nothing is missing", "[Ss]tructure remains|remains along|does not follow|unnamed structure", "report"),
+    Pair("[Nn]o missing physics", CLAIM, "report"),
+    Pair("[Nn]o missing physics", "[Nn]earest in the catalogue", "report"),
+    Pair("[Nn]o missing physics", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
+    Pair("[Nn]o missing physics", PUSH, "report"),
+    Pair("[Nn]o missing physics", "[Ss]tructure remains|has structure|smooth trend along|does not fit|unnamed structure", "report"),
     Pair("no physics in the catalogue explains it", CLAIM, "report"),
-    Pair("No physics stands out", CLAIM, "report"),
-    Pair("Something is there that noise alone rarely makes", r"named +nothing surely", "report"),
-    Pair(r"named\W+nothing\b(?! surely)", f"{CLAIM}|[Nn]earest in the catalogue", "report"),
-    Pair(r"unexplained\W+nothing\b", f"Yet |{PUSH}|[Ss]tructure remains", "report", "explained"),
+    Pair("No physics is significant", CLAIM, "report"),
+    Pair("The strongest candidate is significant", r"named +nothing confirmed", "report"),
+    Pair(r"named\W+nothing\b(?! confirmed)", f"{CLAIM}|[Nn]earest in the catalogue", "report"),
+    Pair(r"unexplained\W+nothing\b", f"{PUSH}|[Ss]tructure remains|has structure|smooth trend along", "report", "explained"),
     # what is left
-    Pair("What is left is the sensor's noise", PUSH, "report"),
-    Pair("What is left is the sensor's noise", "[Ss]tructure remains|remains along|Look for what drives", "report"),
+    Pair("The residual is the sensor's noise", PUSH, "report"),
+    Pair("The residual is the sensor's noise", "[Ss]tructure remains|has structure|smooth trend along|Look for the cause of the disturbance", "report"),
     Pair("white", "is not white", "row"),
-    Pair(r"correlation time \S+ s", "is white: it is new at each sample", "row"),
+    Pair(r"correlation time \S+ s", r"is white\.", "row"),
     # what to do
-    Pair("Use the simulation without findings", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
-    Pair("Use the simulation without findings", "does not follow|[Ss]tructure remains|remains along|Do not rely", "report"),
-    Pair("Use the simulation without findings", "The model found here corrects|mkc apply", "report"),
-    Pair("Do not rely on this simulation", f"{CLAIM}|mkc apply|Use the simulation", "report"),
-    Pair("does not follow the recording", f"{CLAIM}|[Nn]earest in the catalogue|mkc apply", "report"),
+    Pair("The simulation can be used", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
+    Pair("The simulation can be used", "does not fit|[Ss]tructure remains|has structure|smooth trend along|Do not rely", "report"),
+    Pair("The simulation can be used", "The model found here corrects|mkc apply", "report"),
+    Pair("Do not rely on this simulation", f"{CLAIM}|mkc apply|The simulation can be used", "report"),
+    Pair("does not fit the recording", f"{CLAIM}|[Nn]earest in the catalogue|mkc apply", "report"),
     # where
-    Pair("throughout the recording", r"mainly (from|in)|everywhere|first at|anew at|from \S+ s on", "row"),
+    Pair("throughout the recording", r"mainly (from|in)|everywhere|first at|from \S+ s on", "row"),
     Pair("everywhere", r"mainly (from|in)", "finding"),
     # how sure
     Pair(CLAIM, r"size is 0 within its standard error", "finding"),
@@ -117,8 +117,8 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
     """The same name is to be corrected for and not to be."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
     corrected = set(re.split(", | for ", use)[1:])
-    refused = [re.sub(r"(Do not correct for|Do not build|Leave) (.*?)( yet| in:| alone).*", r"\2", item)
-               for start in ("Do not correct", "Do not build", "Leave") for item in _advised(d, start)]  # fmt: skip
+    refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
+               for start in ("Do not correct", "Do not add") for item in _advised(d, start)]  # fmt: skip
     return bool(corrected.intersection(refused))
 
 

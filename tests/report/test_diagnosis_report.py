@@ -108,7 +108,7 @@ def test_few_samples_have_a_page(samples, findings):
 def test_adequate_says_so_with_its_noise():
     text = text_of(page_of(0))
     assert "The recording shows no missing physics." in text
-    assert "would find as much in 37 % of recordings (p = 0.37; the level asked for is 0.05)" in text
+    assert "p = 0.37, corrected for 64 candidates (level 0.05)" in text
     assert "memory of 2 samples and 11 % outliers" in text
     assert "mkc apply" not in text
     assert "with the findings" not in text
@@ -235,7 +235,7 @@ def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(fi
     text = text_of(diagnosis_report(diagnosis))
     assert f"{SMOOTH} {diagnosis.ceiling.rmse:.3f} −0.895" in text
     assert "It is not an upper bound: a step or a sharp corner can exceed it." in text
-    present = f"{'with the findings it is' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
+    present = f"{'with the findings' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
     assert noise.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
 
 
@@ -282,8 +282,8 @@ def test_a_finding_that_hardly_changes_the_residual_is_small():
     headline, tone, doing, diagnosis = graded(0.05, (0.03, 0.07), 1.74, 1.70)
     assert headline == "Real, but small compared with the noise: hard-iron step."
     assert tone == "faint"
-    assert "Leave hard-iron step alone" in doing
-    assert "by 2.3 % only" in doing
+    assert "Do not correct for hard-iron step, unless" in doing
+    assert "by only 2.3 %" in doing
     assert top.apply_command(diagnosis) == ""
 
 
@@ -300,14 +300,14 @@ def test_structure_without_a_finding_is_not_called_nothing():
     quiet = make_diagnosis(0, samples=240)
     assert top.tone(quiet) == "good"
     rare = make_diagnosis(0, samples=240, p_value=0.04)
-    assert top.headline(rare).startswith("Something is there that noise alone rarely makes, but no effect")
+    assert top.headline(rare).startswith("The strongest candidate is significant, but no effect")
     smooth = make_diagnosis(0, samples=240, remaining=("temperature",))
     assert top.headline(smooth).startswith("The residual has a smooth trend along temperature that no effect")
     for diagnosis in (rare, smooth):
         assert top.tone(diagnosis) == "open"
         text = text_of(diagnosis_report(diagnosis))
-        assert "Nothing is missing" not in text
-        assert "Use the simulation without findings" not in text
+        assert "no missing physics" not in text
+        assert "The simulation can be used" not in text
     beside = make_diagnosis(1, samples=240, remaining=("load",))
     assert top.headline(beside).endswith(
         "A smooth trend along load that no effect in the catalogue explains."
@@ -351,7 +351,7 @@ def test_a_step_that_comes_and_goes_says_so():
     text = text_of(diagnosis_report(diagnosis))
     label = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then intermittent, mainly in 4 intervals, the longest from 34.0"
     assert text.count(label) == 2
-    assert top.headline(diagnosis) == "Left out of the simulation: hard-iron step."
+    assert top.headline(diagnosis) == "Left out of the simulation: intermittent hard-iron step."
     assert "from 6.2 s on" not in text
     assert "switched on and off, and that no column recorded, would look like this" in text
     assert "Look for something that is switched" in text
@@ -393,10 +393,10 @@ def test_the_noise_has_units_and_its_density_is_compared():
     assert "Is the density right? channel distance of the density" in text
     assert "drift of the offset 0.379 µT, its standard deviation over the recording" in text
     assert "cut-off of the drift period 7.21 s" in text
-    assert "memory of norm 0.260, 0.100" in text
+    assert "autoregression of norm coefficients 0.260, 0.100" in text
     assert "memory of turn_x" not in text
     assert "d = 0.310 µT, within ±12.0 µT" in text
-    assert "norm 0.021 0.034 (4 degrees of freedom) 0.05 no more than chance" in text
+    assert "norm 0.021 0.034 (4 degrees of freedom) 0.05 not significant" in text
     assert "turn_x 0.2 0.01 (2 degrees of freedom) 0.05 a Student-t is closer" in text
 
 
@@ -418,15 +418,15 @@ def test_candidates_are_in_the_order_of_their_bars():
     assert "not possible" in text
     assert text.index("offset dependence (motor_1) 294") < text.index("current field (current) 253")
     assert [bar.candidate for bar in bars((weak, strong, never))] == [strong, weak, never]
-    assert "by what each gains, which the bars show" in text
+    assert "Bars: gain of the linearised model" in text
 
 
 def test_channels_of_a_compared_vector_are_explained():
     diagnosis = make_diagnosis(0, samples=240, channels=2)
     traces = dataclasses.replace(diagnosis.traces, channels=("along", "across_1"))
     text = text_of(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
-    assert "along: the part of the residual along the ambient field" in text
-    assert "across_1 and across_2: the two parts at right angles" in text
+    assert "along: residual along the ambient field" in text
+    assert "across_1 and across_2: the two perpendicular residuals" in text
 
 
 def test_figures_above_are_told_of_only_where_they_are():

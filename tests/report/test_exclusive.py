@@ -100,7 +100,7 @@ def diagnoses(draw):
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))
     one = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
-    known = FitAssessment((one,), (), SimpleNamespace(disturbed=SimpleNamespace(disturbances=pushes)), lost=lost)
+    known = FitAssessment((one,), (), SimpleNamespace(selected=SimpleNamespace(disturbances=pushes)), lost=lost)
     if lost:
         found = []
     p_value = found[0].p_value if found else draw(st.floats(0.001, 1.0))
@@ -182,7 +182,7 @@ SPOILT = {
             "Do not correct for linear_drag yet: blocks that the fit has not seen do not confirm it.",
         )
     },
-    "Use the simulation without findings": {"advice": ("Use the simulation without findings, within what this recording covers.",)},
+    "The simulation can be used": {"advice": ("The simulation can be used within the range of this recording.",)},
 }
 
 
@@ -209,9 +209,9 @@ def test_a_report_that_contradicts_itself_is_caught(name):
         "held out  angle 0.300 → 0.300 rad (no change); surely better on held-out blocks; +0.3 nats per sample",
         "held out  residual 1.00 → 0.06 m (94 % less); not shown to be better on held-out blocks",
         "where  throughout the recording, mainly from 1.0 to 2.0 s",
-        "held out  held-out blocks do not speak against it; −0.3 nats per sample (95 %: −0.400 to −0.200)",
+        "held out  held-out blocks do not reject it; −0.3 nats per sample (95 %: −0.400 to −0.200)",
         "The recording shows no missing physics. linear drag: left out of the simulation",
-        "The simulation does not fit the recording. Use the simulation without findings",
+        "The simulation does not fit the recording. The simulation can be used",
     ],
 )
 def test_each_kind_of_pair_is_found_in_a_text(row):

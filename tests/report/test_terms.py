@@ -71,7 +71,7 @@ def test_values_are_put_in_as_they_are():
 @pytest.mark.parametrize(
     ("key", "changed", "seen"),
     [
-        ("unit.nats", "units of e", "units of e a sample"),
+        ("unit.nats", "units of e", "units of e per sample"),
         ("unit.unseen", "withheld", "surely better on withheld blocks"),
         ("evidence.surely", "certainly better", "certainly better"),
         ("verdict.left_out", "Missing: {findings}.", "Missing: hard-iron step"),

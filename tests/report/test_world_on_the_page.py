@@ -55,7 +55,7 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
     assert "The recording shows no missing physics." in box
     assert "angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance" in box
     assert "rate: residual 0.0310 rad/s; noise floor 0.0200 rad/s (estimated); explains 99.95 %" in box
-    assert "The residual is the sensor's noise. Input hold: torque is held." in box
+    assert "The residual is the sensor's noise. Input hold: torque is constant between samples." in box
     assert "µT" not in box.replace("reaches 0", "").split("For comparison")[0]
     assert '<h1 class="good">' in page
 
@@ -78,13 +78,13 @@ def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
     box = box_of(page)
     assert box.startswith("The simulation does not fit the recording.")
     assert (
-        "angle: the simulation explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by "
-        "0.360 rad; noise floor 0.00500 rad (declared)"
+        "angle: the simulation explains 12 % of the variance; RMSE 0.360 rad, of the output's mean 0.350 rad; "
+        "noise floor 0.00500 rad (declared)"
     ) in box
     assert "Why Another start reaches 0.006 rad: gravity = −9.81 with the other sign. damping ends at its bound" in box
     assert '<h1 class="bad">' in page
     text = text_of(page)
-    for words in ("Use the simulation without findings", "Nothing is missing", "The candidates", "hard-iron", "tell apart"):
+    for words in ("The simulation can be used", "no missing physics", "The candidates", "hard-iron", "tell apart"):
         assert words not in text
 
 
@@ -98,17 +98,17 @@ def test_one_colour_for_adequate_another_for_unfit_and_unexplained():
 def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
     page = diagnosis_report(pushed())
     parsed(page)
-    assert page.index("Course of the forcing over time") < page.index("Residual over time before and after")
+    assert page.index("Disturbance over time, and") < page.index("Residual over time before and after")
     box = box_of(page)
     assert box.startswith("Process noise acts on the rate of rate, and no physics in the catalogue explains it.")
-    assert "Process noise acts on the rate of rate: 0.228 ± 0.021 rad/s², correlation time 0.7 s." in box
-    assert "Noise without what pushes rate is less likely by 311 nats. No physics is significant in addition to it." in box
+    assert "Process noise on the rate of rate: 0.228 ± 0.021 rad/s², correlation time 0.7 s." in box
+    assert "A model without this noise of rate is 311 nats less likely. No physics is significant in addition to it." in box
     text = text_of(page)
     assert "It is not white: it is correlated up to 0.7 s. It goes along with none of the inputs, at no lag." in text
     for name in ("Over angle", "Over rate", "Over torque"):
         assert name in text
     assert "the rate of rate 0.228 ± 0.021 rad/s² 0.7 s 311" in text
-    assert "Nothing is missing" not in text
+    assert "no missing physics" not in text
 
 
 @pytest.mark.parametrize("samples", [1, 2, 5000])
@@ -132,8 +132,8 @@ def test_runs_are_not_joined_by_a_line():
 def test_something_slow_in_a_sensor_is_told_as_such():
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
     text = text_of(diagnosis_report(pushed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
-    assert "angle beside the sensor's noise, and no physics" in text
-    assert "angle beside its noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
+    assert "angle drift in addition to the sensor's noise, and no physics" in text
+    assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
 
 
@@ -142,15 +142,15 @@ def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
     page = diagnosis_report(made)
     assert top.headline(made) == (
         "The residual has structure that no effect in the catalogue explains. Nearest in the catalogue: hard-iron step "
-        "(a free curve of the same variables is likelier by 163 nats)."
+        "(a free curve of the same variables gains 163 nats)."
     )
     text = text_of(page)
     assert "Left out" not in text
     assert "Nearest in the catalogue: hard-iron step" in text
     assert "Free curve with its 95 % band, and the named shape" in text
-    assert "The formula nearest to the free curve: 0.0071 |x|^1.52 sign(x) ." in text
-    assert "likelier by 163 nats (p = 0.002 if the name is right)" in text
-    assert page.index("Free curve and the shape of finding 1") < page.index("Curve of finding 1 is, and")
+    assert "Nearest formula: 0.0071 |x|^1.52 sign(x) ." in text
+    assert "gains 163 nats (p = 0.002 if the name is right)" in text
+    assert page.index("Free curve and the shape of finding 1") < page.index("Curve of finding 1, and")
     parsed(page)
     # of another driver than the named form: the free curve alone
     curve = dataclasses.replace(made.findings[0].curve, driver="difference")
@@ -183,14 +183,14 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
     for held, reason in (
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "the gain varies between blocks by more than its mean"),
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", **diverged), "diverges in 1 of 25 blocks without the finding"),
-        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely likelier on held-out blocks: what is likelier is in the tail"),
-        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely likelier on held-out blocks: what is likelier is in the tail"),
-        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on held-out blocks: what is less likely is in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely more likely on held-out blocks: the gain is in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely more likely on held-out blocks: the gain is in the tail"),
+        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on held-out blocks: the loss is in the tail"),
         (
             HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m", decides=False),
-            "not shown to be better on held-out blocks: the free run",
+            "not shown to be better on held-out blocks: the open-loop",
         ),
-        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not speak against it: the free run is closer"),
+        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not reject it: the open-loop residual is smaller"),
     ):
         assert reason in unseen.better(held)
         assert unseen.diverged(held) == ""
@@ -237,7 +237,7 @@ def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
     made = make_diagnosis(1, samples=200, warnings=("A column is empty.", "hard_iron_step may be a door."))
     page = diagnosis_report(made)
     assert top.warned(made) == ["Hard-iron step may be a door.", "A column is empty."]
-    assert page.index("Alternatives") < page.index("may be a door") < page.index("The statistician")
+    assert page.index("Alternatives") < page.index("may be a door") < page.index("Statistics</h2>")
 
 
 def test_the_statisticians_numbers_are_one_click_below():
@@ -259,7 +259,7 @@ def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
 
 
 def test_nats_are_explained_once_where_they_are_met():
-    text = "How much likelier one model is than another is told in nats"
+    text = "Log-likelihood gains are in nats"
     for made in (make_diagnosis(3, samples=100, channels=2), pushed()):
         page = diagnosis_report(made)
         assert page.count(text) == 1

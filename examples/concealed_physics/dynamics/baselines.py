@@ -1,7 +1,7 @@
-"""PySINDy and a small neural ODE beside the simulations: the same training runs, unseen runs and measure of error.
+"""PySINDy and a small neural ODE compared with the simulations: same training runs, unseen runs and error measure.
 
 Both are tuned inside the training runs: fitted on the first part of each, judged by a free run over the rest, and then
-fitted anew on all of it. PySINDy's library has the terms of the simulation and those of the catalogue that can be
+refitted on all of it. PySINDy's library has the terms of the simulation and those of the catalogue that can be
 written as a sum of known functions of states and inputs; delays, lags and saturations cannot. The neural ODE adds a
 perceptron to the rates that the simulation knows, whose parameters are trained with it; it names nothing.
 
@@ -41,7 +41,7 @@ from free_run import (
     spread,
     windows,
 )
-from held_out import DATA, prove, told
+from held_out import DATA, finding_text, prove
 from systems import Case, balls, heaters, servo, silverbox
 from torch import Tensor
 from torch.nn.functional import linear
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 FITTED = 0.7
 """Share of each training run that is fitted while settings are chosen; the rest judges them."""
 THRESHOLDS = (0.0, 0.003, 0.01, 0.03, 0.06, 0.1, 0.2, 0.4)
-"""Least share of a rate's norm that a term is kept for."""
+"""Smallest share of a rate's norm for which a term is kept."""
 RIDGES = (1e-6, 0.05)
 """The second is PySINDy's own."""
 ORDERS = (2, 4, 8, 16)
@@ -65,14 +65,14 @@ WIDTHS = (0.3, 0.1)
 PLACES = (0.65, 0.9)
 """Of the smoothed sign and of the stops, as shares of the typical speed and the largest deflection."""
 NEARLY = 1.05
-"""Of candidates whose held-out error is within this factor of the least, that of fewest terms is taken."""
+"""The candidate with the fewest terms is chosen among those with a held-out error within this factor of the least."""
 HIDDEN = 16
 EPOCHS = 300
 CHECKS = 5
 RATE = 1e-2
 """The neural ODE's: units in each of two layers, epochs, how often it is judged, and Adam's learning rate."""
 JOINED = 1.0
-"""Weight of the gaps between the windows of multiple shooting, beside that of the data."""
+"""Weight of the gaps between the windows of multiple shooting, relative to the data."""
 
 METHODS = ("PySINDy", "neural ODE")
 SYSTEMS: dict[str, Callable[[Path], list[Case]]] = {
@@ -98,7 +98,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Physics:
-    """What the baselines are told of a system.
+    """Knowledge of a system that the baselines get.
 
     Attributes:
         own: per state, the terms that the simulation has in its rate.
@@ -110,7 +110,7 @@ class Physics:
         piece: steps of the pieces that the held-out part is simulated in, each from its own start; 0 for a free run
             from the start of the run.
         absolute: the measure is the mean absolute error, and not the root mean square.
-        unit, factor: what errors are told in, and how many of it are one of the recording's unit.
+        unit, factor: unit of reported errors, and its number in the recording's unit.
         shapes: whether the library has terms that bend somewhere.
     """
 
@@ -149,31 +149,31 @@ def stops(x: Tensor, shape: Shape) -> Terms:
 
 
 def ball_terms(x: SimpleNamespace, _u: SimpleNamespace, _p: SimpleNamespace, _shape: Shape) -> Terms:
-    """Of a body in the air."""
+    """Return the terms for a body in the air."""
     v = x.speed
     return {"1": lambda: torch.ones_like(v), "v": lambda: v, "v|v|": lambda: v * v.abs()}
 
 
 def heater_terms(x: SimpleNamespace, u: SimpleNamespace, _p: SimpleNamespace, _shape: Shape) -> Terms:
     """Of two bodies that are heated, exchange heat and radiate."""
-    one, two = x.temperature_1, x.temperature_2
+    first, second = x.temperature_1, x.temperature_2
     return {
-        "1": lambda: torch.ones_like(one),
-        "T1": lambda: one,
-        "T2": lambda: two,
-        "Q1": lambda: u.heater_1.expand_as(one),
-        "Q2": lambda: u.heater_2.expand_as(one),
-        "T2 - T1": lambda: two - one,
-        "T1 - T2": lambda: one - two,
-        "T1^4": lambda: ((one + 273.15) / 293.15) ** 4,
-        "T2^4": lambda: ((two + 273.15) / 293.15) ** 4,
-        "T1|T1|": lambda: one * one.abs(),
-        "T2|T2|": lambda: two * two.abs(),
+        "1": lambda: torch.ones_like(first),
+        "T1": lambda: first,
+        "T2": lambda: second,
+        "Q1": lambda: u.heater_1.expand_as(first),
+        "Q2": lambda: u.heater_2.expand_as(first),
+        "T2 - T1": lambda: second - first,
+        "T1 - T2": lambda: first - second,
+        "T1^4": lambda: ((first + 273.15) / 293.15) ** 4,
+        "T2^4": lambda: ((second + 273.15) / 293.15) ** 4,
+        "T1|T1|": lambda: first * first.abs(),
+        "T2|T2|": lambda: second * second.abs(),
     }
 
 
 def silverbox_terms(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace, shape: Shape) -> Terms:
-    """Of a driven oscillator."""
+    """Return the terms for a driven oscillator."""
     y, v = x.output, x.speed
 
     def load() -> Tensor:
@@ -191,7 +191,7 @@ def silverbox_terms(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace, 
 
 
 def servo_terms(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace, shape: Shape) -> Terms:
-    """Of a motor with a pendulum."""
+    """Return the terms for a motor with a pendulum."""
     angle, v = x.position, x.speed
 
     def load() -> Tensor:
@@ -268,7 +268,7 @@ PHYSICS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method reaches on the unseen runs, and how.
+    """Result of a method on the unseen runs.
 
     Attributes:
         errors: of each unseen run, in the recording's unit; infinite where it diverges.
@@ -336,7 +336,7 @@ class Problem:
         return free_run(rate, begin, runs)[..., self.outputs]
 
     def judged(self, rate: Rate, models: int = 0) -> Tensor:
-        """Error of a free run on the part of the training runs that is held out."""
+        """Return the open-loop error on the held-out part of the training runs."""
         begins, absolute = self.case.system.initial_window, self.physics.absolute
         since = self.train.since
         held_out = self.train.present & (since > FITTED * since[-1])
@@ -349,18 +349,18 @@ class Problem:
         return error(simulated, self.train, held_out, absolute=absolute)
 
     def seen(self, rate: Rate) -> float:
-        """Error of a free run on all of the training runs."""
+        """Return the open-loop error on all training runs."""
         simulated = self.simulate(rate, self.train, self.case.system.initial_window)
         return float(error(simulated, self.train, self.train.present, absolute=self.physics.absolute))
 
     def with_drives(self, x: Float[Tensor, "*batch n"], u: Tensor) -> Float[Tensor, "*batch n+d"]:
-        """The states, and what the inputs drive the system by."""
+        """Return the states and the driving terms of the inputs."""
         if not u.shape[-1]:
             return x
         drives = self.physics.drives(*self.names(x, u))
         return torch.cat([x, *(drive.expand(x.shape[:-1]).unsqueeze(-1) for drive in drives)], -1)
 
-    def told(self, value: float) -> str:
+    def in_unit(self, value: float) -> str:
         """An error with its unit."""
         return f"{value * self.physics.factor:.3g} {self.physics.unit}" if math.isfinite(value) else "diverged"
 
@@ -382,7 +382,7 @@ def problem_of(case: Case, fitted: Tensor) -> Problem:
 
 
 def plain(case: Case) -> tuple[Tensor, list[float]]:
-    """Parameters of the simulation as it is, and its errors on the unseen runs."""
+    """Return the fitted parameters of the simulation, and its errors on the unseen runs."""
     absolute = PHYSICS[case.system.name].absolute
     model = diagnose(case.system, case.train, effects=(), max_findings=0).model
     assert model is not None
@@ -405,7 +405,7 @@ def shortened(case: Case) -> Case:
 
 
 def recorded_error(case: Case, test: Recording, simulated: Mapping[str, Tensor], *, absolute: bool) -> float:
-    """Of a simulated recording's outputs, where they are scored."""
+    """Return the error of simulated outputs, where they are scored."""
     names = outputs_of(case.system, test)
     away = test.stack(*names) - torch.stack([simulated[name] for name in names], -1)
     away = away[test["time"] - test["time"][0] > case.scored_from]
@@ -413,7 +413,7 @@ def recorded_error(case: Case, test: Recording, simulated: Mapping[str, Tensor],
 
 
 def ours(case: Case) -> Outcome:
-    """Our own diagnosis, as in the example of the system's name."""
+    """Return the result of `diagnose`, as in the example of the system."""
     findings = 3 if case.name == "heaters" else 1
     proofs = prove(case.system, case.train, list(case.tests.values()), max_findings=findings)
     scored = [proof.time - proof.time[0] > case.scored_from for proof in proofs]
@@ -422,7 +422,7 @@ def ours(case: Case) -> Outcome:
         (proof.mean_absolute(rows) if absolute else proof.root_mean_square(rows))[1]
         for proof, rows in zip(proofs, scored, strict=True)
     ]
-    return Outcome(errors, told(proofs[0].diagnosis), "as in the example")
+    return Outcome(errors, finding_text(proofs[0].diagnosis), "as in the example")
 
 
 @dataclass(frozen=True)
@@ -541,7 +541,7 @@ def shape_of(x: Float[Tensor, "S n"], setting: Setting) -> Shape:
 
 
 def sparse_rate(problem: Problem, models: Sequence[Sparse]) -> Rate:
-    """The rates of the models beside each other, (models, R, n)."""
+    """Return the rates of several models, (models, R, n)."""
     base = torch.stack([model.base for model in models]).unsqueeze(1)  # (models, 1, p)
     known = rate_of(problem.case.system, base)
     coefficients = torch.stack([model.coefficients for model in models])
@@ -568,12 +568,12 @@ def sparse_rate(problem: Problem, models: Sequence[Sparse]) -> Rate:
 
 
 def single(rate: Rate) -> Rate:
-    """Of a batch of one model, that one."""
+    """Return the model of a batch of one."""
     return lambda x, u: rate(x.unsqueeze(-3), u).squeeze(-3)
 
 
 def simplest(errors: Sequence[float], sizes: Sequence[int]) -> int:
-    """Of the candidates nearly as good as the best one, that of fewest terms, and of these the best.
+    """Return the best of the candidates with the fewest terms among those nearly as good as the best.
 
     Example:
         >>> simplest([2.0, 1.0, 1.04, 1.02], [1, 5, 3, 3])
@@ -589,7 +589,7 @@ def sparse_settings(physics: Physics) -> list[Setting]:
     widths, places = (WIDTHS, PLACES) if physics.shapes else (WIDTHS[:1], PLACES[:1])
     methods = [f"differences of order {o}" for o in ORDERS] + [f"Savitzky-Golay over {w}" for w in SMOOTHED_OVER]
     bases = (False, True) if any(physics.own.values()) else (False,)
-    return [Setting(*one) for one in product(methods, bases, THRESHOLDS, RIDGES, widths, places)]
+    return [Setting(*item) for item in product(methods, bases, THRESHOLDS, RIDGES, widths, places)]
 
 
 def term_names(problem: Problem) -> list[str]:
@@ -628,12 +628,12 @@ def sindy(problem: Problem, early: Problem) -> Outcome:
     both = [(problem, again) for again in sparse_candidates(problem, problem.train, [setting])]
     both.append((early, tried[index]))
     # what is fitted to all of the runs is left only where it does not even simulate these
-    of, model = min(both, key=lambda one: one[0].seen(single(sparse_rate(one[0], [one[1]]))))
+    of, model = min(both, key=lambda item: item[0].seen(single(sparse_rate(item[0], [item[1]]))))
     settings = (
         f"{setting.differentiation}, threshold {setting.threshold:g}, ridge {setting.ridge:g}"
         + (f", width {setting.width:g}, stops at {setting.place:g}" if problem.physics.shapes else "")
         + (", fitted to the first part alone" if model is tried[index] else "")
-        + f"; {len(tried)} tried, held-out error {problem.told(errors[index])}; "
+        + f"; {len(tried)} tried, held-out error {problem.in_unit(errors[index])}; "
         + equations(of, model, numbers=True)
     )
     return Outcome(of.unseen(single(sparse_rate(of, [model]))), equations(of, model), settings)
@@ -662,7 +662,7 @@ class Network:
 
 
 def new_network(problem: Problem, runs: Runs, seed: int) -> Network:
-    """One that corrects nothing yet."""
+    """Return a network whose correction is 0."""
     x = problem.from_measured(runs)
     u = torch.cat([runs.inputs[:, 0], runs.inputs[-1:, -1]])
     values = problem.with_drives(x, u)
@@ -760,7 +760,7 @@ def neural_ode(problem: Problem, early: Problem, seed: int = 0) -> Outcome:
     settings = f"windows of {length} steps, {epochs} of {EPOCHS} epochs"
     with torch.no_grad():
         errors = problem.unseen(with_all)
-    return Outcome(errors, "-", f"{settings}; held-out error {problem.told(judged[length, epochs])}")
+    return Outcome(errors, "-", f"{settings}; held-out error {problem.in_unit(judged[length, epochs])}")
 
 
 @dataclass(frozen=True)
@@ -773,15 +773,15 @@ class Row:
 
 
 def compared(case: Case, methods: Sequence[str], seed: int) -> Row:
-    """A case by the simulation as it is and by each of the methods, told as they come."""
+    """Run a case with the simulation and each method, and print the results as they arrive."""
     physics = PHYSICS[case.system.name]
 
-    def told_of(outcome: Outcome) -> str:
+    def result_text(outcome: Outcome) -> str:
         return " and ".join(in_unit([value], physics) for value in outcome.errors)
 
     (fitted, errors), seconds = timed(lambda: plain(case))
     simulated = Outcome(errors, "-", "no effects", seconds)
-    print(f"{case.name}: simulation {told_of(simulated)}", flush=True)
+    print(f"{case.name}: simulation {result_text(simulated)}", flush=True)
     outcomes = {}
     if "PySINDy" in methods or "neural ODE" in methods:
         start, for_both = timed(lambda: plain(shortened(case))[0] if len(fitted) else fitted)
@@ -796,7 +796,7 @@ def compared(case: Case, methods: Sequence[str], seed: int) -> Row:
         if method != "ours":
             seconds += for_both + (simulated.seconds if len(fitted) else 0.0)
         outcomes[method] = replace(outcome, seconds=seconds)
-        print(f"  {method}: {told_of(outcome)}; {outcome.name}; {outcome.settings}; {seconds:.0f} s", flush=True)
+        print(f"  {method}: {result_text(outcome)}; {outcome.name}; {outcome.settings}; {seconds:.0f} s", flush=True)
     return Row(case, simulated, outcomes)
 
 
@@ -819,7 +819,7 @@ def mean_of(errors: Sequence[float]) -> tuple[float, int]:
 
 
 def in_unit(errors: Sequence[float], physics: Physics) -> str:
-    """Their mean in the unit of the system; how many diverged is said."""
+    """Return the mean error in the unit of the system, and the number of diverged runs."""
     mean, diverged = mean_of(errors)
     if len(errors) == diverged:
         return "diverged"

@@ -6,7 +6,7 @@ Data: de Silva et al., "Discovery of Physics from Data: Universal Laws and Discr
 from __future__ import annotations
 
 import torch
-from held_out import arguments, picture, prove, told
+from held_out import arguments, finding_text, picture, prove
 from systems import Ball, balls
 
 __all__ = ["Ball"]
@@ -19,7 +19,7 @@ def main() -> None:
         (proof,) = prove(case.system, case.train, list(case.tests.values()), max_findings=1)
         before, after = proof.mean_absolute(proof.time - proof.time[0] > case.scored_from)
         errors.append((before, after))
-        print(f"{case.name:20s} {told(proof.diagnosis):60s} other drop {before:6.2f} -> {after:5.2f} m")
+        print(f"{case.name:20s} {finding_text(proof.diagnosis):60s} other drop {before:6.2f} -> {after:5.2f} m")
         if options.output and case.name == "Whiffle_Ball_1":
             picture(proof, options.output, "A whiffle ball's second drop, predicted from its first second", "m")
     before, after = torch.tensor(errors).mean(0).tolist()

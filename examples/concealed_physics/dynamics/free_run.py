@@ -1,6 +1,6 @@
-"""Free runs of differential equations over recorded inputs, many runs and many models beside each other.
+"""Open-loop runs of differential equations over recorded inputs, with many runs and models in parallel.
 
-Shapes: N samples, R runs, S moments in a step, n states, m outputs, u inputs; "*batch" are models beside each other.
+Shapes: N samples, R runs, S moments in a step, n states, m outputs, u inputs; "*batch" are parallel models.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _DEGREE = 5
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs beside each other; those that are shorter stand still at their last sample.
+    """Parallel runs; shorter runs hold their last sample.
 
     Attributes:
         time: (N, R) in s.
@@ -125,7 +125,7 @@ def windows(runs: Runs, length: int) -> Runs:
 
 
 def free_run(rate: Rate, begin: Float[Tensor, "*batch R n"], runs: Runs) -> Float[Tensor, "N *batch R n"]:
-    """The states from the first ones on, by the classical Runge-Kutta method; not finite where they diverge."""
+    """Return the states by the classical Runge-Kutta method; not finite where they diverge."""
     parts = (runs.inputs.shape[1] - 1) // 2
     steps = (runs.time.diff(dim=0) / parts).unsqueeze(-1)
     x = begin
@@ -151,7 +151,7 @@ def first_states(
     seconds: float | None,
     iterations: int = 8,
 ) -> Float[Tensor, "*batch R n"]:
-    """First states that fit what is measured in the first seconds, by Levenberg's and Marquardt's method.
+    """Fit initial states to the first seconds of the measurement, by Levenberg-Marquardt.
 
     Args:
         rate: of the states.
@@ -205,7 +205,7 @@ def first_states(
 def error(
     simulated: Float[Tensor, "N *batch R m"], runs: Runs, scored: Bool[Tensor, "N R"], *, absolute: bool
 ) -> Float[Tensor, "*batch"]:
-    """Mean absolute or root mean square error of what is scored; infinite where a run diverges there.
+    """Return the mean absolute or RMS error of the scored samples; infinite where a run diverges.
 
     Example:
         >>> time = torch.arange(2.0).unsqueeze(-1)
@@ -228,7 +228,7 @@ def named(names: tuple[str, ...], values: Float[Tensor, "*batch n"]) -> SimpleNa
 
 
 def rate_of(system: Dynamics, values: Float[Tensor, " p"]) -> Rate:
-    """What a simulation says of its states' rates, with these parameters."""
+    """Return the rates of a simulation's states, with these parameters."""
     p = named(tuple(system.parameters), values)
 
     def rate(x: Tensor, u: Tensor) -> Tensor:

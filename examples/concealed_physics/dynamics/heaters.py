@@ -5,7 +5,7 @@ Data: Hedengren, "Temperature Control Lab", github.com/APMonitor/arduino, Apache
 
 from __future__ import annotations
 
-from held_out import arguments, picture, prove, told
+from held_out import arguments, finding_text, picture, prove
 from systems import heaters
 
 
@@ -14,7 +14,7 @@ def main() -> None:
     case = heaters(options.data)
     (proof,) = prove(case.system, case.train, list(case.tests.values()))
     before, after = proof.root_mean_square()
-    print(f"{told(proof.diagnosis)}\nother run: {before:.2f} -> {after:.2f} °C")
+    print(f"{finding_text(proof.diagnosis)}\nother run: {before:.2f} -> {after:.2f} °C")
     if options.output:
         picture(proof, options.output, "The other run of the heaters, first sensor", "°C")
 

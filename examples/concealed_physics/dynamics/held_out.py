@@ -1,4 +1,4 @@
-"""What these examples share: diagnose on some runs, simulate others with and without what was found."""
+"""Shared by the examples: diagnose on some runs, and simulate others with and without the findings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mkc_torch import Diagnosis, Recording, diagnose
 from mkc_torch.simulation import Dynamics
 
 DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "dynamics"
-"""Where the recordings lie by default: beside the project's folder."""
+"""Default folder of the recordings, next to the project's folder."""
 
 
 @dataclass(frozen=True)
@@ -39,29 +39,29 @@ class Proof:
 
 
 def prove(system: Dynamics, train: Recording, tests: Sequence[Recording], *, max_findings: int = 3) -> list[Proof]:
-    """Diagnose the simulation on some runs, and simulate others by what was found."""
+    """Diagnose the simulation on some runs, and simulate others with the findings."""
     found = diagnose(system, train, max_findings=max_findings)
-    naive = diagnose(system, train, effects=(), max_findings=0)
+    nominal = diagnose(system, train, effects=(), max_findings=0)
     assert found.model is not None
-    assert naive.model is not None
+    assert nominal.model is not None
     proofs = []
     for test in tests:
-        columns, plain = found.model(test), naive.model(test)
+        columns, plain = found.model(test), nominal.model(test)
         names = [name for name in columns if name not in ("time", "experiment")]
-        before, after = (torch.stack([one[name] for name in names], -1) for one in (plain, columns))
+        before, after = (torch.stack([run[name] for name in names], -1) for run in (plain, columns))
         proofs.append(Proof(found, columns["time"], test.stack(*names), before, after))
     return proofs
 
 
-def told(diagnosis: Diagnosis) -> str:
+def finding_text(diagnosis: Diagnosis) -> str:
     """The findings in a line."""
     if not diagnosis.findings:
         return f"nothing found (p = {diagnosis.p_value:.2f})"
     parts = []
     for finding in diagnosis.findings:
         rivals = [a.effect for a in finding.alternatives if not a.separable]
-        beside = f", not told apart from {', '.join(rivals)}" if rivals else ""
-        parts.append(f"{finding.effect} (p = {finding.p_value:.2f}{beside})")
+        undecided = f", not distinguished from {', '.join(rivals)}" if rivals else ""
+        parts.append(f"{finding.effect} (p = {finding.p_value:.2f}{undecided})")
     return "; then ".join(parts)
 
 

@@ -6,7 +6,7 @@ arXiv:2410.08650, github.com/Rhoban/bam, Apache-2.0.
 
 from __future__ import annotations
 
-from held_out import arguments, picture, prove, told
+from held_out import arguments, finding_text, picture, prove
 from systems import servo
 
 
@@ -15,7 +15,7 @@ def main() -> None:
     case = servo(options.data)
     (proof,) = prove(case.system, case.train, list(case.tests.values()), max_findings=1)
     before, after = proof.mean_absolute()
-    print(f"{told(proof.diagnosis)}\nopen loop at the other gains: {before:.3f} -> {after:.3f} rad")
+    print(f"{finding_text(proof.diagnosis)}\nopen loop at the other gains: {before:.3f} -> {after:.3f} rad")
     if options.output:
         picture(proof, options.output, "The first runs at a gain that the fit has not seen", "rad", slice(0, 400))
 

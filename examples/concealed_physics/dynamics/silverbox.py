@@ -6,7 +6,7 @@ European Control Conference 2013.
 
 from __future__ import annotations
 
-from held_out import arguments, picture, prove, told
+from held_out import arguments, finding_text, picture, prove
 from systems import silverbox
 
 
@@ -14,7 +14,7 @@ def main() -> None:
     options = arguments(__doc__.splitlines()[0])
     case = silverbox(options.data)
     proofs = prove(case.system, case.train, list(case.tests.values()), max_findings=1)
-    print(told(proofs[0].diagnosis))
+    print(finding_text(proofs[0].diagnosis))
     for name, proof in zip(case.tests, proofs, strict=True):
         before, after = proof.root_mean_square(proof.time - proof.time[0] > case.scored_from)
         print(f"free run on {len(proof.time)} samples of the {name}: {1e3 * before:.2f} -> {1e3 * after:.3f} mV")

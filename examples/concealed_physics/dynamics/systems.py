@@ -1,4 +1,4 @@
-"""Four simulations of a few lines, and the recordings that each is to be diagnosed on and proven on.
+"""Four simulations of a few lines, with the recordings for diagnosis and for proof.
 
 Data:
     falling balls: de Silva et al., "Discovery of Physics from Data: Universal Laws and Discrepancies", Frontiers in AI
@@ -24,7 +24,7 @@ from mkc_torch import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 
 EVERY = 8
-"""Of the servo's samples one in so many is used: they come at 190 Hz."""
+"""Every how many samples of the servo, at 190 Hz, are used."""
 
 SILVERBOX_TRAIN = (45_000, 8_192)
 SILVERBOX_TESTS = {"multisine": (100_000, 8_192), "arrow": (0, 40_000)}
@@ -116,10 +116,10 @@ class Servo(Dynamics):
 
 @dataclass(frozen=True)
 class Case:
-    """A simulation, the runs it is learned from, and the unseen ones.
+    """A simulation, its training runs, and the unseen runs.
 
     Attributes:
-        name: of the system, or of the one of several.
+        name: name of the system, or of one of several.
         system: the simulation.
         train: the runs to learn from.
         tests: the unseen ones, by name.
@@ -134,7 +134,7 @@ class Case:
 
 
 def balls(data: Path) -> list[Case]:
-    """Every ball's first drop, and its other one."""
+    """Return the first and the second drop of every ball."""
     drops = {
         name: Recording({"time": drop["time"], "height": drop["height"]}, name=name.split("/")[0])
         for name, drop in Recording.read(data / "falling_balls" / "ball_drops.csv").experiments().items()
@@ -144,7 +144,7 @@ def balls(data: Path) -> list[Case]:
 
 
 def heaters(data: Path) -> Case:
-    """One run, and the other one."""
+    """Return one run for training and the other for proof."""
     train, test = (Recording.read(data / "heaters" / f"run_{rate}.csv") for rate in ("1s", "3s"))
     return Case("heaters", Heaters(), train, {"other run": test})
 
@@ -179,9 +179,9 @@ def servo_runs(folder: Path, gains: tuple[int, ...]) -> Recording:
         raise FileNotFoundError(f"{folder / f'*_kp{missing[0]}.csv'}: there is no such file.")
     for number, (path, gain) in enumerate(files):
         run = Recording.read(path)
-        one = {name: run[name][::EVERY] for name in ("time", "position", "goal_position", "torque_enable")}
-        one["kp"] = torch.full_like(one["time"], float(gain))
-        one["experiment"] = torch.full_like(one["time"], float(number))
-        for name, values in one.items():
+        part = {name: run[name][::EVERY] for name in ("time", "position", "goal_position", "torque_enable")}
+        part["kp"] = torch.full_like(part["time"], float(gain))
+        part["experiment"] = torch.full_like(part["time"], float(number))
+        for name, values in part.items():
             columns.setdefault(name, []).append(values)
     return Recording({name: torch.cat(parts) for name, parts in columns.items()})

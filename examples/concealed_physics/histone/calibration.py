@@ -78,12 +78,12 @@ class Calibration:
         """Return fits by selection: the better of two starts, the shared rate and the parameters of ``near``."""
         found: dict[Selection, Fit] = {}
         by_size: dict[int, list[Selection]] = {}
-        for one in selections:
-            by_size.setdefault(len(one), []).append(one)
+        for item in selections:
+            by_size.setdefault(len(item), []).append(item)
         for same in by_size.values():
             for start in [{}] if near is None else [{}, near.parameters]:
-                for one, fit in zip(same, self._from(start, same), strict=True):
-                    found[one] = min(found.get(one, fit), fit, key=lambda fit: fit.aicc)
+                for item, fit in zip(same, self._from(start, same), strict=True):
+                    found[item] = min(found.get(item, fit), fit, key=lambda fit: fit.aicc)
         return found
 
     def by_effects(self, selection: Selection) -> Fit:
@@ -110,13 +110,13 @@ class Calibration:
 
     def _from(self, start: Mapping[int, float], selections: Sequence[Selection]) -> list[Fit]:
         """Fit selections of one size; rates that are not in the start begin at the shared rate."""
-        numbers = [sorted(one) for one in selections]
+        numbers = [sorted(item) for item in selections]
         places = torch.tensor(numbers, dtype=torch.long).reshape(len(selections), -1)
-        begin = [[start.get(-1, NOMINAL_LOG_RATE), *(start.get(number, 0.0) for number in one)] for one in numbers]
+        begin = [[start.get(-1, NOMINAL_LOG_RATE), *(start.get(number, 0.0) for number in item)] for item in numbers]
         theta, squares = self._least_squares(torch.tensor(begin, dtype=torch.float64), places)
         return [
-            Fit(self.aicc(value, len(one)), dict(zip((-1, *one), row, strict=True)))
-            for one, value, row in zip(numbers, squares.tolist(), theta.tolist(), strict=True)
+            Fit(self.aicc(value, len(item)), dict(zip((-1, *item), row, strict=True)))
+            for item, value, row in zip(numbers, squares.tolist(), theta.tolist(), strict=True)
         ]
 
     def _residual(self, theta: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,8 +131,8 @@ class Calibration:
     def _least_squares(self, theta: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
         """Parameters (B, 1 + k) and sums of squares (B,) by Levenberg-Marquardt within the bounds.
 
-        What has converged leaves the batch. `mkc_torch.nonlinear.minimise`, which keeps all of it to the last one's
-        end, takes ten times as long here.
+        Converged fits leave the batch. `mkc_torch.nonlinear.minimise` keeps the whole batch until the last fit converges
+        and takes ten times as long here.
         """
         damping = torch.full((len(theta),), 1e-2, dtype=torch.float64)
         residual, slopes = self._residual(theta, places)

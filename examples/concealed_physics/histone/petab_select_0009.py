@@ -47,8 +47,8 @@ def starts(count: int, seed: int) -> list[Selection]:
 def pooled(found: Sequence[Found]) -> dict[Selection, Fit]:
     """The models of all searches within 2 of the best of all, best first."""
     every: dict[Selection, Fit] = {}
-    for one in found:
-        for selection, fit in one.good.items():
+    for entry in found:
+        for selection, fit in entry.good.items():
             every[selection] = min(every.get(selection, fit), fit, key=lambda fit: fit.aicc)
     least = min(fit.aicc for fit in every.values())
     close = {selection: fit for selection, fit in every.items() if fit.aicc < least + CLOSE}
@@ -97,12 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = []
     for start in starts(options.starts, options.seed):
         clock = time.process_time()
-        one = Search(calibration, start).best_first()
-        found.append(one)
-        least = one.good[one.best].aicc
+        entry = Search(calibration, start).best_first()
+        found.append(entry)
+        least = entry.good[entry.best].aicc
         seconds = time.process_time() - clock
         above = round(least - criterion, 2) + 0.0  # not -0.00
-        print(f"| {len(start)} | {one.stepwise.aicc:.2f} | {least:.2f} | {above:.2f} | {one.fits} | {seconds:.0f} |")
+        print(
+            f"| {len(start)} | {entry.stepwise.aicc:.2f} | {least:.2f} | {above:.2f} | {entry.fits} | {seconds:.0f} |"
+        )
     good = pooled(found)
     (first, fit), *_ = good.items()
     words = "the published model" if first == best else "not the published model"

@@ -66,7 +66,7 @@ class Search:
         here = self.start
         while True:
             near = [
-                one
+                selected
                 for selected in neighbours(here, swaps=False)
                 if (forward and len(selected) > len(here)) or (backward and len(selected) < len(here))
             ]

@@ -73,7 +73,7 @@ class Errors:
         """Whiten traces (m, T, R, q) to columns (M, q), or (m, T, R) to (M,), in standard deviations."""
         scaled = traces / np.reshape(self.deviations, (-1, *[1] * (traces.ndim - 1)))
         if self.slow:
-            return np.stack([self._with_drift(of, one) for of, one in zip(self.slow, scaled, strict=True)]).reshape(
+            return np.stack([self._with_drift(of, item) for of, item in zip(self.slow, scaled, strict=True)]).reshape(
                 -1, *traces.shape[3:]
             )
         white = scaled.copy()

@@ -51,10 +51,10 @@ def flight_drag(rows: tuple[int, int], typical: float, reynolds: float, wind: fl
     """Drag on a flying body, along its velocity through air that moves along the first axis."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        one, other = x[rows[0]] - wind, x[rows[1]]
-        factor = size * drag_factor(np.hypot(one, other), typical, reynolds)
+        item, other = x[rows[0]] - wind, x[rows[1]]
+        factor = size * drag_factor(np.hypot(item, other), typical, reynolds)
         rates = known.copy()
-        rates[rows[0]] -= factor * one
+        rates[rows[0]] -= factor * item
         rates[rows[1]] -= factor * other
         return rates, z
 
@@ -65,10 +65,10 @@ def creeping_drag(rows: tuple[int, int], typical: float) -> RateChange:
     """Oseen's drag of a small body in a viscous medium: Stokes' with a first correction for inertia."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        one, other = x[rows[0]], x[rows[1]]
-        factor = size * (1.0 + 3.0 / 16.0 * 0.5 * np.hypot(one, other) / typical)
+        item, other = x[rows[0]], x[rows[1]]
+        factor = size * (1.0 + 3.0 / 16.0 * 0.5 * np.hypot(item, other) / typical)
         rates = known.copy()
-        rates[rows[0]] -= factor * one
+        rates[rows[0]] -= factor * item
         rates[rows[1]] -= factor * other
         return rates, z
 

@@ -66,8 +66,8 @@ def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG0
     """The camera is tilted: both axes turn, and gravity has a component along the first."""
 
     def turned(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
-        one, other = values
-        return np.array([np.cos(size) * one + np.sin(size) * other, np.cos(size) * other - np.sin(size) * one])
+        item, other = values
+        return np.array([np.cos(size) * item + np.sin(size) * other, np.cos(size) * other - np.sin(size) * item])
 
     return HiddenTerm("constant_force", "tilted camera", (hidden.rate_of("speed"),), 0.5, outputs=turned)
 

@@ -191,19 +191,19 @@ def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Arr
 def _exchanges(scene: SystemScene) -> list[RivalModel]:
     plant, found = scene.plant, []
     free = [state for state in plant.states if state not in plant.speeds]
-    for one, other in combinations(free, 2):
-        if plant.units[one] != plant.units[other]:
+    for item, other in combinations(free, 2):
+        if plant.units[item] != plant.units[other]:
             continue
-        away = scene.state(other) - scene.state(one)
+        away = scene.state(other) - scene.state(item)
         forcing = np.zeros((len(plant.states), *away.shape, 2))
-        forcing[plant.row(one), ..., 0] = away
+        forcing[plant.row(item), ..., 0] = away
         forcing[plant.row(other), ..., 1] = -away
-        places = (rate_of(one), rate_of(other))
+        places = (rate_of(item), rate_of(other))
         found.append(RivalModel("coupling", places, forcing, None, True))
-        if plant.units[one] == "m/s":
+        if plant.units[item] == "m/s":
             turned = np.zeros((len(plant.states), *away.shape, 1))
-            turned[plant.row(one), ..., 0] = -scene.state(other)
-            turned[plant.row(other), ..., 0] = scene.state(one)
+            turned[plant.row(item), ..., 0] = -scene.state(other)
+            turned[plant.row(other), ..., 0] = scene.state(item)
             found.append(RivalModel("magnus_lift", places, turned, None, False))
     return found
 
@@ -215,8 +215,8 @@ def _lags(scene: SystemScene) -> list[RivalModel]:
     for late in np.moveaxis(lagged_each(measured, step, np.array(SHIFTS) * scene.length), -1, 0):
         behind = (late - measured)[:, :: plant.fine]
         traces = np.zeros((*behind.shape, len(behind)))
-        for k, one in enumerate(behind):
-            traces[k, ..., k] = one
+        for k, item in enumerate(behind):
+            traces[k, ..., k] = item
         found.append(RivalModel("sensor_lag", plant.outputs, None, traces, True))
     return found
 

@@ -15,7 +15,7 @@ from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.forward_mode import forward_jacobian, make_dual
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import combined, gained
+from mkc_torch.effects.courses import apply_basis, outer_product
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
 from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation
@@ -221,9 +221,9 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
 def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | None:
     """Return the effect's change as a function of γ if it is a sum of known courses; otherwise None."""
     if term.effect.has_basis:
-        return partial(combined, term.effect.basis(term.shape, context))
+        return partial(apply_basis, term.effect.basis(term.shape, context))
     if term.effect.has_waveform:
-        return partial(gained, term.effect.waveform(term.shape, context))
+        return partial(outer_product, term.effect.waveform(term.shape, context))
     return None
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch._support.unit_text import quotient
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.runs import first_of_runs, passed_on
+from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -99,6 +99,6 @@ def hysteretic_path(position: Float[Tensor, " N"], yields: float, run: Int[Tenso
         slope = relaxing * travel.abs() / yields
         factor = torch.where(first_of_runs(run), 0.0, torch.exp(-slope))
         gain = torch.where(slope > _SHORT, -torch.expm1(-slope) / slope.clamp(min=_SHORT), 1.0)
-        z = passed_on(factor, travel * gain)
+        z = linear_recurrence(factor, travel * gain)
         relaxing = (travel * z > 0.0).to(travel.dtype)
     return z

@@ -13,7 +13,7 @@ from mkc_torch._support.unit_text import duration, share_of, sized
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.kinds import MOTION, kind_at
-from mkc_torch.effects.runs import first_of_runs, passed_on
+from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -186,6 +186,6 @@ def spring_force(
     pole = torch.complex(-damping * omega, swing)
     turned = pole * step.clamp(min=_MIN_DIVISOR)
     keep = torch.where(first, 0.0, torch.exp(turned))
-    q = passed_on(keep, -gained * (torch.exp(turned) - 1.0) / turned)
+    q = linear_recurrence(keep, -gained * (torch.exp(turned) - 1.0) / turned)
     s = q.imag / swing
     return omega.square() * s + 2.0 * damping * omega * (q.real - damping * omega * s)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import combined, per
+from mkc_torch.effects.courses import apply_basis, per
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -76,7 +76,7 @@ class FieldGradient(Effect):
         return terms(context.drivers, int(shape["degree"])).mT
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return combined(self.basis(shape, context), gamma)
+        return apply_basis(self.basis(shape, context), gamma)
 
 
 _STRENGTH_GRADIENT = ("∂B/∂x", "∂B/∂y", "∂B/∂z")

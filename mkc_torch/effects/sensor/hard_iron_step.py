@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import after
+from mkc_torch.effects.courses import unit_step
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -54,7 +54,7 @@ class HardIronStep(GainEffect):
         return tuple({"onset": first + length * k / count} for k in range(8, count - 7))
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        return after(context.time, shape["onset"])
+        return unit_step(context.time, shape["onset"])
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
         """The change that remains in a later recording of the sensor: the offset at the end."""

@@ -13,7 +13,7 @@ from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import combined
+from mkc_torch.effects.courses import apply_basis
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -97,4 +97,4 @@ class MagneticPole(Effect):
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return combined(self.basis(shape, context), gamma)
+        return apply_basis(self.basis(shape, context), gamma)

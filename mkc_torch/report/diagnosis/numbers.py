@@ -234,11 +234,11 @@ def probability(value: float) -> str:
 
 
 def evidence(value: float | None, surrogates: int) -> str:
-    """A p-value, and whether more surrogates could have made it smaller; None where no noise was drawn.
+    """Format a p-value, with a note if it is the minimum for the number of surrogates; None is unknown.
 
     Example:
         >>> evidence(0.005, 199), evidence(0.02, 199), evidence(None, 0)
-        ('p = 0.005, the smallest that 199 surrogates can show', 'p = 0.02', 'not known: no p-value was computed')
+        ('p = 0.005 (the minimum with 199 surrogates)', 'p = 0.02', 'unknown: no p-value was computed')
     """
     if value is None:
         return term("evidence.no_p_value")

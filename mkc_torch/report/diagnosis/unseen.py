@@ -29,9 +29,9 @@ def better(held_out: HeldOut) -> str:
 
     Example:
         >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.01, (-0.1, 0.1), 1.0, 0.99, "µT"))
-        ('surely better on unseen blocks', 'not shown to be better on unseen blocks')
+        ('surely better on held-out blocks', 'not shown to be better on held-out blocks')
         >>> better(HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "µT"))
-        'not shown to be better on unseen blocks: from block to block the gain differs by more than itself, so it ...'
+        'not shown to be better on held-out blocks: the gain varies between blocks by more than its ...'
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
     text, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)

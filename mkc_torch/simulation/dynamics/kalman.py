@@ -181,7 +181,8 @@ class FilterModels:
     def part(self, rows: slice) -> FilterModels:
         """The models in these rows."""
         arrays = (self.white, self.place, self.size, self.lasting, self.sensor)
-        return FilterModels(*(array[rows] for array in arrays), self.hard_clip)
+        white, place, size, lasting, sensor = (array[rows] for array in arrays)
+        return FilterModels(white, place, size, lasting, sensor, self.hard_clip)
 
 
 @dataclass(frozen=True)

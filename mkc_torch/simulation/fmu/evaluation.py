@@ -106,12 +106,12 @@ class Evaluation:
             found = np.empty((len(new), len(description.outputs if outputs else description.rates)))
             if known is not None and same.any():
                 found[same] = known[same]
-            found[missing] = self._plain(outputs, at.rows(missing), at.parts[3])
+            found[missing] = self._uncached_values(outputs, at.rows(missing), at.parts[3])
             found = found[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
             self._last[outputs] = at, found
             return found
 
-        return self._remembered(("values", outputs), at, computed)
+        return self._cached(("values", outputs), at, computed)
 
     def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
         """Derivatives of rates or outputs by each variable of a group, (S, k, size of the group)."""
@@ -123,9 +123,9 @@ class Evaluation:
             columns = self._columns(outputs, at.rows(new), given, group, base)
             return columns[new.cumsum() - 1]
 
-        return self._remembered(("slopes", outputs, group), at, computed)
+        return self._cached(("slopes", outputs, group), at, computed)
 
-    def _remembered(self, what: Any, at: EvaluationPoints, compute: Any) -> Array:
+    def _cached(self, what: Any, at: EvaluationPoints, compute: Any) -> Array:
         for known, moments, answer in self._known:
             if known == what and moments == at:
                 return answer
@@ -133,7 +133,7 @@ class Evaluation:
         self._known.append((what, at, found))
         return found
 
-    def _plain(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
+    def _uncached_values(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
         if not self.binary.begin(parameters.tolist()):
             description = self.description
             return np.full((len(rows[0]), len(description.outputs if outputs else description.rates)), np.nan)
@@ -157,9 +157,9 @@ class Evaluation:
             if trusted[k]:
                 continue
             if base is not None and self._is_affine(outputs, rows, given, k):
-                found[:, :, k] = self._beyond(outputs, rows, given, k, base, self._step_within(given, k))
+                found[:, :, k] = self._one_sided_difference(outputs, rows, given, k, base, self._step_within(given, k))
             else:
-                found[:, :, k] = self._difference(outputs, rows, given, group, k)
+                found[:, :, k] = self._central_difference(outputs, rows, given, group, k)
         return found
 
     def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
@@ -169,21 +169,23 @@ class Evaluation:
         """
         if (outputs, place) not in self._affine:
             few = _rows(rows, slice(None, None, max(1, len(rows[0]) // 16)))
-            base = self._plain(outputs, few, given)
+            base = self._uncached_values(outputs, few, given)
             step = self._step_within(given, place)
-            near, far = (self._beyond(outputs, few, given, place, base, step * more) for more in (1.0, 30.0))
+            near, far = (
+                self._one_sided_difference(outputs, few, given, place, base, step * more) for more in (1.0, 30.0)
+            )
             rounding = 8.0 * np.finfo(np.float64).eps * np.abs(base).max(initial=0.0) / abs(step)
             close = np.abs(near - far) <= _STRAIGHT * np.abs(far).max(initial=0.0) + rounding
             self._affine[outputs, place] = bool(close.all())
         return self._affine[outputs, place]
 
-    def _beyond(
+    def _one_sided_difference(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int, base: Array, step: float
     ) -> Array:
         """The derivative by a parameter, (S, k), by a one-sided difference."""
         moved = given.copy()
         moved[place] += step
-        return (self._plain(outputs, rows, moved) - base) / (moved[place] - given[place])
+        return (self._uncached_values(outputs, rows, moved) - base) / (moved[place] - given[place])
 
     def _step_within(self, given: Array, place: int) -> float:
         """A step of a parameter within its upper bound."""
@@ -202,7 +204,7 @@ class Evaluation:
         if (outputs, reference) not in self._trusted:
             every = max(1, len(rows[0]) // 4)
             few = _rows(rows, slice(None, None, every))
-            difference = self._difference(outputs, few, given, group, place)
+            difference = self._central_difference(outputs, few, given, group, place)
             self.binary.begin(given.tolist())
             own = self.binary.slopes(outputs, few[0], few[1], few[2], [reference])[:, 0]
             size = np.abs(difference).max(initial=1e-300)
@@ -210,7 +212,7 @@ class Evaluation:
             self._trusted[outputs, reference] = close
         return self._trusted[outputs, reference]
 
-    def _difference(
+    def _central_difference(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
     ) -> Array:
         """The derivative by a variable, (S, k), by a central difference."""
@@ -221,7 +223,7 @@ class Evaluation:
             ends = [given.copy(), given.copy()]
             ends[0][place] = max(given[place] - step, parameter.lower)
             ends[1][place] = min(given[place] + step, parameter.upper)
-            low, high = (self._plain(outputs, rows, end) for end in ends)
+            low, high = (self._uncached_values(outputs, rows, end) for end in ends)
             return (high - low) / (ends[1][place] - ends[0][place])
         table = states if group == "states" else inputs
         step = _step(table[:, place])
@@ -231,7 +233,7 @@ class Evaluation:
             moved[:, place] += sign * step
             places.append(moved[:, place])
             pair = (moved, inputs) if group == "states" else (states, moved)
-            answers.append(self._plain(outputs, (time, *pair), given))
+            answers.append(self._uncached_values(outputs, (time, *pair), given))
         return (answers[1] - answers[0]) / (places[1] - places[0])[:, None]
 
 

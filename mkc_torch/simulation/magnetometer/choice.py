@@ -103,7 +103,7 @@ class _Compared(Generic[V]):
     what: str
     view: V
     length: NormView | None
-    left: float
+    residual: float
     find_fault: Callable[[], Fault | None]
 
     def settled(self) -> V | NormView:
@@ -129,23 +129,23 @@ class _Compared(Generic[V]):
         """Sentences about the fault of the turns; empty if there is no fault."""
         known, unit = self.view if self.length is None else self.length, self.view.unit
         limit = USELESS * known.strength
-        if self.length is not None and self.left < TIMES_THE_LENGTH * _left(self.length):
+        if self.length is not None and self.residual < TIMES_THE_LENGTH * _residual_size(self.length):
             return ""
-        if self.left < (limit if self.length is None else DOUBTFUL * known.strength):
+        if self.residual < (limit if self.length is None else DOUBTFUL * known.strength):
             return ""
         reason = self.find_fault()
-        if reason is None and self.left < limit:
+        if reason is None and self.residual < limit:
             return ""
-        length = "" if self.length is None else f", with the length {_two(_left(self.length))} {unit}"
+        length = "" if self.length is None else f", with the length {_two_digits(_residual_size(self.length))} {unit}"
         return (
-            f"with the {self.what} the residual in each axis is {_two(self.left)} {unit} of the field of "
-            f"{_two(known.strength)} {unit}{length}. {_reason(self.what, reason, unit)}"
+            f"with the {self.what} the residual in each axis is {_two_digits(self.residual)} {unit} of the field of "
+            f"{_two_digits(known.strength)} {unit}{length}. {_reason(self.what, reason, unit)}"
         )
 
 
 def _compared_by_attitude(usable: Recording, view: AttitudeView, length: NormView | None) -> _Compared[AttitudeView]:
     unbent = view.measured @ _matrix(view, length).mT
-    left = min(_left(view), misfit_of_attitude(unbent, view.to_world, stretches(view.time)))
+    left = min(_residual_size(view), misfit_of_attitude(unbent, view.to_world, stretches(view.time)))
 
     def find_fault() -> Fault | None:
         return attitude_fault(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
@@ -155,7 +155,7 @@ def _compared_by_attitude(usable: Recording, view: AttitudeView, length: NormVie
 
 def _compared_by_gyroscope(usable: Recording, view: GyroView, length: NormView | None) -> _Compared[GyroView]:
     unbent = view.measured @ _matrix(view, length).mT
-    left = min(_left(view), misfit_of_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
+    left = min(_residual_size(view), misfit_of_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
 
     def find_fault() -> Fault | None:
         rate = usable.stack(*GYRO)
@@ -171,7 +171,7 @@ def _length(recording: Recording) -> NormView | None:
         return None
 
 
-def _left(view: View) -> float:
+def _residual_size(view: View) -> float:
     return robust_size(view.residual(view.start(), {}))
 
 
@@ -204,9 +204,10 @@ def _reason(what: str, fault: Fault | None, unit: str) -> str:
             f"{_TRIED[what]} nor a shift in time of up to {LAG:g} s corrects it; check that it belongs to this "
             "recording and this sensor."
         )
-    return f"{fault.sentence} Without this fault the residual would be {_two(fault.left)} {unit}; correct it to use it."
+    size = f"{_two_digits(fault.left)} {unit}"
+    return f"{fault.sentence} Without this fault the residual would be {size}; correct it to use it."
 
 
-def _two(value: float) -> str:
+def _two_digits(value: float) -> str:
     """A number to two digits, without an exponent."""
     return f"{float(f'{value:.2g}'):.10g}"

@@ -49,7 +49,7 @@ def test_a_gyroscope_gives_a_heading_where_an_ellipsoid_does_not(drawn, found):
 
 
 @pytest.mark.e2e
-def test_it_tells_by_what_and_its_standard_errors_hold(drawn, found):
+def test_the_aid_is_reported_and_its_standard_errors_hold(drawn, found):
     aid = found.aid
     assert (aid.by, aid.response) == ("gyroscope", "full matrix")
     assert {name for name, value in aid.evidence if value == 0.0} == {"full matrix"}
@@ -61,7 +61,7 @@ def test_it_tells_by_what_and_its_standard_errors_hold(drawn, found):
 
 
 @pytest.mark.slow
-def test_the_gyroscopes_bias_is_told():
+def test_the_gyroscopes_bias_is_estimated():
     draw = example().drawn(2, 8.0, 15.0, seconds=60.0)
     bias = torch.tensor([0.01, -0.02, 0.03]).double()
     rates = {name: draw.recording[name] + b for name, b in zip(GYRO, bias.tolist(), strict=True)}
@@ -82,7 +82,7 @@ def test_json_round_trips_and_old_files_are_read(found):
 
 
 @pytest.mark.e2e
-def test_the_report_says_what_stood_in(drawn, found):
+def test_the_report_names_the_aid(drawn, found):
     page = calibration_report(found, drawn.recording)
     assert "By the gyroscope: offset and full matrix" in page
     assert "Gyroscope's bias" in page.replace("&#39;", "'").replace("’", "'")
@@ -156,7 +156,7 @@ def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
         calibrate(changed(r, **{name: 57.3 * r[name] for name in GYRO}))
 
 
-def test_a_response_that_exchanges_axes_is_told():
+def test_a_response_with_exchanged_axes_is_reported():
     sentence, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope")
     assert "x is z of the magnetometer, y is x of the magnetometer, z is minus y" in sentence
     assert bool((rest.diagonal() > 6.0).all())

@@ -70,12 +70,12 @@ def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
         calibrate(changed(drawn.recording, drop=GYRO))
 
 
-def test_it_says_by_what_and_what_it_takes_for_true(found):
+def test_warnings_state_the_aid_and_its_assumptions(found):
     assert found.aid.by == "place"
     assert any("field of the place replaces the missing turns" in warning for warning in found.warnings)
     assert any("level ground" in warning and "known heading" in warning for warning in found.warnings)
     assert "By the place" in " ".join(aided(found))
-    assert "a constant is not known" in " ".join(aided(found))
+    assert "constant heading offset cannot be observed" in " ".join(aided(found))
     matrix = torch.tensor(found.matrix)
     assert torch.allclose(matrix, matrix.mT, atol=1e-6)
     assert Calibration.from_json(found.to_json()) == found
@@ -139,7 +139,7 @@ def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle
 
 
 @pytest.mark.parametrize("rises", [0.6, -0.6])
-def test_a_turn_without_tilts_is_as_likely_on_either_side(rises):
+def test_a_turn_without_tilts_is_equally_likely_on_either_side(rises):
     """Mirroring everything at the plane of the circle changes nothing: noise of lengths favours neither side."""
     recording = level()
     points, place = recording.magnetometer(), PlaceField(EARTH.strength, EARTH.inclination, 0.5, 0.01)

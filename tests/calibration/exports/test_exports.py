@@ -147,7 +147,7 @@ def test_the_field_of_a_current_goes_into_each_autopilot(fitted, k, mean, most, 
     assert np.abs(formulas.plain_json(numbers, in_tesla, current) - expected).max() < CLOSE
 
 
-def test_ros_knows_no_current_and_says_so():
+def test_a_current_is_left_out_of_a_ros_file_with_a_warning():
     yaml = pytest.importorskip("yaml")
     correction = SensorCorrection("cable", "µT", (1.0, 2.0, 3.0), EYE, "µT", None, CABLE)
     text, warnings = exported("ros-yaml", correction)

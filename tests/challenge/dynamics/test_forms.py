@@ -34,7 +34,7 @@ def straight(form, low, high, row=0, basis=()):
     """Share of a form of one state that a straight line and other columns leave."""
     x = np.linspace(low, high, 200)
     y = np.array([added(form, [v])[row] for v in x])
-    columns = np.stack([np.ones_like(x), *(one(x) for one in basis)], -1)
+    columns = np.stack([np.ones_like(x), *(item(x) for item in basis)], -1)
     left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
     return np.square(left).sum() / np.square(y - y.mean()).sum()
 
@@ -51,7 +51,7 @@ def test_effects_can_be_named_unless_the_scene_does_not_show_them(case):
     system, scene = case
     hidden = [draw(generator(k), scene) for k, draw in enumerate(system.inside)]
     known = names(scene)
-    unseen = {one.effect for one in hidden if not can_be_named(one, known)}
+    unseen = {item.effect for item in hidden if not can_be_named(item, known)}
     assert unseen <= {"coulomb_friction", "stribeck_friction", "load_dependent_friction", "cubic_stiffness",
                       "bouc_wen_hysteresis"}  # fmt: skip
     assert not any(can_be_named(draw(generator(0), scene), known) for draw in system.outside)
@@ -126,10 +126,10 @@ def test_teeth_rub_more_under_load():
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5))
-def test_drag_in_flight_is_along_the_velocity(one, other):
-    pull = added(forces.flight_drag((0, 1), 2.0, 1e4), [one, other])
-    assert pull[0] * other == pytest.approx(pull[1] * one, abs=1e-9)
-    assert pull @ [one, other] <= 0.0
+def test_drag_in_flight_is_along_the_velocity(item, other):
+    pull = added(forces.flight_drag((0, 1), 2.0, 1e4), [item, other])
+    assert pull[0] * other == pytest.approx(pull[1] * item, abs=1e-9)
+    assert pull @ [item, other] <= 0.0
 
 
 @given(st.floats(0.01, 3.0), st.floats(-3, 3))

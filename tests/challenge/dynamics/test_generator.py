@@ -142,8 +142,8 @@ def test_drift_is_autoregressive_and_added_to_white_noise():
 def test_white_and_slow_errors_together_are_whitened(correlation):
     errors = dataclasses.replace(SLOW_ERRORS, correlation=correlation)
     white = errors.whitened(sample(generator(4), errors, 60, 800)).reshape(2, 60, 800)
-    for one in white:
-        found = one @ one.T / one.shape[1]
+    for item in white:
+        found = item @ item.T / item.shape[1]
         np.testing.assert_allclose(found, np.eye(60), atol=0.2)
 
 

@@ -30,7 +30,7 @@ def test_agrees_with_an_adaptive_method(name):
     time = trial.step * np.arange(trial.samples)
 
     def rate(t, x):
-        u = np.array([np.interp(t, time, one[:, 0]) for one in trial.inputs])
+        u = np.array([np.interp(t, time, item[:, 0]) for item in trial.inputs])
         return plant.rate(x[:, None], u[:, None], plant.values)[:, 0]
 
     stated_diagnosis = solve_ivp(rate, (0.0, time[-1]), trial.begin[:, 0], t_eval=time, rtol=1e-9, atol=1e-10,

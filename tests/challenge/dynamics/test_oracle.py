@@ -27,7 +27,7 @@ def scene(request):
 
 
 def errors_of(scene, correlation=0.3):
-    return Errors(tuple(0.01 * one.std() for one in scene.course.outputs), correlation, "gaussian")
+    return Errors(tuple(0.01 * item.std() for item in scene.course.outputs), correlation, "gaussian")
 
 
 def dense(errors, shape):
@@ -123,14 +123,14 @@ def test_linear_forms_are_compared_to_first_order():
     errors = errors_of(scene)
     hidden = HiddenTerm("overflow", "", (rate_of("level_1"),), 1.0, weir(0, 0.7 * scene.largest("level_1"), 1.5))
     judge = Judge(tangents(scene, errors, rivals=True))
-    one, two = (
+    item, two = (
         judge.power(
             errors.whitened(simulate(scene.plant, scene.trial, hidden, s).outputs - scene.course.outputs), hidden
         )
         for s in (1e-4, 2e-4)
     )
-    assert two.z == pytest.approx(2.0 * one.z, rel=0.02)
-    assert two.z_sep == pytest.approx(2.0 * one.z_sep, rel=0.05)
+    assert two.z == pytest.approx(2.0 * item.z, rel=0.02)
+    assert two.z_sep == pytest.approx(2.0 * item.z_sep, rel=0.05)
 
 
 def test_a_cone_explains_no_more_than_its_span():

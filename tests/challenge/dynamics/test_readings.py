@@ -44,7 +44,7 @@ def test_what_is_hidden_at_an_input_or_an_output_reaches_the_angle(scene):
 
 
 def test_forms_are_what_the_effects_of_small_size_do(scene):
-    found = {(one.effect, one.at): one for one in readings(scene)}
+    found = {(item.effect, item.at): item for item in readings(scene)}
     level = found["offset", ("angle",)].outputs
     np.testing.assert_array_equal(level, 1.0)
     sag = found["gravity_sag", ("angle",)].outputs

@@ -23,8 +23,8 @@ def says_nothing(paths, folder):
     assert (output / "simulations.py").is_file()
     for path in paths:
         (folder / path.stem).mkdir()
-        told = {"verdict": "adequate", "p_value": 0.5, "findings": []}
-        (folder / path.stem / "diagnosis.json").write_text(json.dumps(told))
+        reported = {"verdict": "adequate", "p_value": 0.5, "findings": []}
+        (folder / path.stem / "diagnosis.json").write_text(json.dumps(reported))
         (folder / path.stem / "model.json").write_text("{}")
 
 

@@ -54,11 +54,11 @@ def test_scales_with_the_size(scene):
     metric = Metric(scene, noise_of("white"), False)
     trace = CATALOGUE["current_field"](generator(3), scene).trace(scene)
     known = families(scene, {"time": scene.time, "temperature": scene.temperature}, vector=False)
-    one, three = (powers(metric, [Question(size * trace, known)], 0.0)[0] for size in (1.0, 3.0))
-    assert three.z == pytest.approx(3.0 * one.z)
-    assert one.scaled(3.0).z_sep == pytest.approx(three.z_sep)
-    assert one.z_sep <= one.z
-    assert one.rivals[0].z_sep == min(rival.z_sep for rival in one.rivals)
+    item, three = (powers(metric, [Question(size * trace, known)], 0.0)[0] for size in (1.0, 3.0))
+    assert three.z == pytest.approx(3.0 * item.z)
+    assert item.scaled(3.0).z_sep == pytest.approx(three.z_sep)
+    assert item.z_sep <= item.z
+    assert item.rivals[0].z_sep == min(rival.z_sep for rival in item.rivals)
 
 
 def test_coefficients_are_exact_for_a_linear_effect(scene):

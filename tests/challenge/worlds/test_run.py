@@ -39,12 +39,12 @@ FAMILIES = {"dynamics": dynamics_scenarios(), "magnetometer": magnetometer_scena
 @pytest.fixture(scope="module", params=[pytest.param("dynamics", marks=pytest.mark.e2e), "magnetometer"])
 def done(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("scenarios") / "out"
-    told = []
+    reported = []
     result = run_scenarios(
         cheap, FAMILIES[request.param], per_scenario=2, hidden=1, seed=3, output=output,
-        progress=lambda stage, done, total: told.append((stage, done, total)),
+        progress=lambda stage, done, total: reported.append((stage, done, total)),
     )  # fmt: skip
-    return FAMILIES[request.param], result, output, told
+    return FAMILIES[request.param], result, output, reported
 
 
 def test_the_hash_matches_the_key_and_the_key_is_written_last(done):
@@ -53,13 +53,13 @@ def test_the_hash_matches_the_key_and_the_key_is_written_last(done):
 
 
 def test_every_scenario_has_its_recordings(done):
-    scenarios, result, output, told = done
+    scenarios, result, output, reported = done
     assert [w.name for w in result.scenarios] == [w.name for w in scenarios.scenarios]
     assert {w.empty for w in result.scenarios} == {2}
     assert [w.hidden for w in result.scenarios] == [int(w.hides) for w in scenarios.scenarios]
     total = count(scenarios, (), 2, 1)
     assert len(list((output / "recordings").iterdir())) == total == len(result.cases)
-    assert {stage for stage, number, of in told if number == of == total} == {"draw"}
+    assert {stage for stage, number, of in reported if number == of == total} == {"draw"}
     assert sum(sum(w.verdicts.values()) for w in result.scenarios) == 2 * len(scenarios.scenarios)
 
 
@@ -109,14 +109,14 @@ def test_a_larger_run_contains_a_smaller_one(tmp_path):
         run_scenarios(quiet, scenarios, only=["white"], per_scenario=n, hidden=0, seed=3, output=tmp_path / str(n))
         for n in (1, 3)
     )
-    (one,) = small.cases
-    same = next(case for case in large.cases if case.key.index == one.key.index)
-    assert same.key.key.sensor == one.key.key.sensor
-    for run, name in (("1", one.key.name), ("3", same.key.name)):
+    (item,) = small.cases
+    same = next(case for case in large.cases if case.key.index == item.key.index)
+    assert same.key.key.sensor == item.key.key.sensor
+    for run, name in (("1", item.key.name), ("3", same.key.name)):
         assert (tmp_path / run / "recordings" / f"{name}.csv").is_file()
     first, again = (
         (tmp_path / run / "recordings" / f"{name}.csv").read_bytes()
-        for run, name in (("1", one.key.name), ("3", same.key.name))
+        for run, name in (("1", item.key.name), ("3", same.key.name))
     )
     assert first == again
 

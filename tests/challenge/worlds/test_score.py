@@ -38,15 +38,15 @@ def key(name, scenario="white", *, disturbance=0.0, useless="", kind="empty", ef
     plain = dataclasses.replace(
         example(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
     )
-    told = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", disturbance) if disturbance else None
-    return ScenarioKey(scenario, 0, plain, told, useless)
+    reported = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", disturbance) if disturbance else None
+    return ScenarioKey(scenario, 0, plain, reported, useless)
 
 
 def says(verdict, *findings, driven=None):
-    told = {"verdict": verdict, "findings": list(findings)}
+    reported = {"verdict": verdict, "findings": list(findings)}
     if driven:
-        told["noise"] = {"process": {driven: {"size": 1.0, "standard_error": 0.1, "unit": "m/s²"}}}
-    return told
+        reported["noise"] = {"process": {driven: {"size": 1.0, "standard_error": 0.1, "unit": "m/s²"}}}
+    return reported
 
 
 def finding(effect, grade="left_out"):

@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.open_loop import open_loop_evidence
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import refit_open_loop, has_process_noise
+from mkc_torch.diagnosis.model.process_noise import has_process_noise, refit_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag

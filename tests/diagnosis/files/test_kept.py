@@ -35,7 +35,7 @@ def test_a_model_corrects_a_recording_and_is_written_as_it_was():
     expected = matrix @ (torch.full((3,), 30.0).double() - offset - gain)
     field = torch.stack([columns[f"field_{axis}"] for axis in "xyz"])
     torch.testing.assert_close(field, expected.unsqueeze(-1).expand_as(field), rtol=1e-6, atol=2e-2)
-    assert any("bound to the time" in note for note in notes)
+    assert any("depends on the time" in note for note in notes)
 
 
 def test_what_a_corrected_simulation_imports_is_there():

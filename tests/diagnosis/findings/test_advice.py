@@ -42,7 +42,7 @@ def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
     made = make_diagnosis(1, samples=50)
     step = dataclasses.replace(with_evidence(made.findings[0], intermittency.as_result(True)), alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
-    assert only.startswith("Look for something that is switched on and off")
+    assert only.startswith("Look for a cause that is switched on and off")
 
 
 def test_what_a_rival_could_be_instead_is_done_only_once_it_is_told_apart():
@@ -68,14 +68,14 @@ def test_what_is_only_nearest_is_not_built_in(formula, text):
         made.findings[0], effect="thermal_loss", advice="Add radiation with this coefficient.", alternatives=()
     )
     (only,) = advice_of(dataclasses.replace(made, findings=(nearest(heat, formula=formula),)))
-    assert only.startswith("Do not add thermal_loss in: what this recording shows has another form.")
+    assert only.startswith("Do not add thermal_loss to the simulation: the recording shows another shape.")
     assert text in only
     assert "Add radiation" not in only
 
 
 def test_a_simulation_that_does_not_follow_is_mended_first():
     (only,) = make_unfit().advice
-    assert only.startswith("Do not rely on this simulation yet: check what stands under the reasons")
+    assert only.startswith("Do not rely on this simulation yet: check the reasons")
 
 
 def test_a_contradiction_never_says_that_the_simulation_can_be_used():
@@ -88,8 +88,8 @@ def test_a_contradiction_never_says_that_the_simulation_can_be_used():
 
 def test_what_pushes_a_state_is_looked_for_and_counted_on():
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment()).advice
-    assert only.startswith("Look for what drives the rate of `rate`")
-    assert "count on 0.23 rad/s² there" in only
+    assert only.startswith("Look for the cause of the disturbance of the rate of `rate`")
+    assert "use 0.23 rad/s² as the process noise" in only
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))).advice
     assert only.startswith("Find out what moves the sensor of `angle` slowly")
@@ -109,14 +109,14 @@ def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
     current = Alternative("current_field", ("current",), 0.4, False)
     assert advised(1, alternatives=(current,))[0] == (
         "To distinguish hard_iron_step from current_field (current), record again: a step does not come at the same moment "
-        "again; what follows current goes along with it, change at other times."
+        "again; let current change at other times."
     )
 
 
 @pytest.mark.parametrize(
     ("rival", "how"),
     [
-        (Alternative("temperature_offset", ("temperature",), 0.4, False), "change one and hold the other."),
+        (Alternative("temperature_offset", ("temperature",), 0.4, False), "change one column and hold the other."),
         (Alternative("driver_linear", ("current",), 0.4, False), "record again with current over a wider range."),
         (Alternative("linear_drag", (), 0.4, False, "rate of speed"), "change at other times."),
     ],

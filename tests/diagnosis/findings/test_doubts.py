@@ -91,7 +91,7 @@ def test_what_cannot_be_is_not_confirmed_and_says_why():
     assert (made.findings[0].grade, odd.grade) == ("left_out", "unconfirmed")
     diagnosis = dataclasses.replace(made, findings=(odd,))
     assert grade(odd) == "not confirmed: impossible size"
-    assert headline(diagnosis).startswith("Found, but of a size that cannot be right: hard-iron step")
+    assert headline(diagnosis).startswith("Found, but of an impossible size: hard-iron step")
     (only, *_) = advice_of(diagnosis)
     assert only.startswith("Do not correct for hard_iron_step: its share ended at 30")
     assert "unseen" not in only

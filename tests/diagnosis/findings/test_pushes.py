@@ -13,7 +13,7 @@ from mkc_torch.simulation.dynamics.first_fit import strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
-from tests.diagnosis.pushed import NOISE, Pendulum, swung, swung_in_the_world
+from tests.diagnosis.pushed import NOISE, Pendulum, fitted_swing, swung
 
 TRUTH = {"white": Disturbance("rate", True, 0.0, 0.4), "slow": Disturbance("rate", True, 1.0, 0.3)}
 TRUTH["torque"] = Disturbance("rate", True, 0.6, 0.6)  # of the torque's duration, delayed
@@ -135,7 +135,7 @@ def test_a_push_by_itself_is_nought_along_what_it_does_not_depend_on_within_the_
 @pytest.mark.e2e
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
-    world = swung_in_the_world(push)
+    world = fitted_swing(push)
     first = process_noise_of(world.fit.model.prepared, world.noise)[0]
     true = TRUTH[push]
     assert (first.place, first.at_rate, first.unit) == ("rate", True, "rad/s/s")
@@ -147,6 +147,6 @@ def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
 
 
 def test_nothing_pushes_where_nothing_does():
-    world = swung_in_the_world()
+    world = fitted_swing()
     assert not world.has_disturbances
     assert process_noise_of(world.fit.model.prepared, world.noise) == ()

@@ -126,17 +126,17 @@ def _no_trials(monkeypatch):
 @pytest.mark.usefixtures("_no_trials")
 def test_an_end_of_a_range_is_told_with_its_value():
     (text,) = told_of(at(swung(N=N)[0], damping=0.0))
-    assert text.startswith("The fit drives `damping` to the end of its range, 0:")
+    assert text.startswith("`damping` is fitted to its bound, 0:")
 
 
 @pytest.mark.usefixtures("_no_trials")
 @pytest.mark.parametrize(("damping", "words"), [(1e-4, "nearly 0"), (30.0, "at 1e+02 times its start value")])
 def test_a_parameter_that_vanishes_or_runs_away_is_told(damping, words):
     (text,) = told_of(at(swung(N=N)[0], damping=damping))
-    assert text.startswith(f"The free run follows best with `damping` {words}")
+    assert text.startswith(f"The open-loop fit is best with `damping` {words}")
 
 
 @pytest.mark.usefixtures("_no_trials")
 def test_where_nothing_mends_it_that_is_said_with_what_to_compare():
     (text,) = told_of(at(swung(N=N)[0]))
-    assert text.startswith("No other start, sign or delay of an input mends it: compare the recording's columns")
+    assert text.startswith("No other start, sign or delay of an input improves the fit: compare columns")

@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, _wi
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.pushed import Pendulum, at_the_truth, candidates, swung, swung_in_the_world
+from tests.diagnosis.pushed import Pendulum, at_the_truth, candidates, fitted_swing, swung
 
 of_diagnosis = importlib.import_module("mkc_torch.diagnosis.diagnose")
 FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
@@ -32,7 +32,7 @@ def located(fit, draws=39, level=0.05):
 
 @pytest.mark.e2e
 def test_hidden_drag_is_named_and_sized_under_process_noise():
-    base = swung_in_the_world("slow", drag=0.4).fit
+    base = fitted_swing("slow", drag=0.4).fit
     terms, found = candidates(base, DYNAMICS), located(base)
     assert found.p_value == pytest.approx(1.0 / 40.0)
     assert (found.term.effect.id, found.term.port) == ("quadratic_drag", "rate of rate")
@@ -75,7 +75,7 @@ def test_candidates_far_behind_are_not_refitted():
 
 @pytest.mark.e2e
 def test_candidates_without_a_refit_stay_in_the_ranking():
-    base = swung_in_the_world("slow", drag=0.4).fit
+    base = fitted_swing("slow", drag=0.4).fit
     strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))
     found = search_with_process_noise(
         base, candidates(base, DYNAMICS), level=0.05, surrogates=39, generator=torch.Generator().manual_seed(0),

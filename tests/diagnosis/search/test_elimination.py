@@ -11,13 +11,13 @@ from mkc_torch.diagnosis.search.elimination import needless_term, without
 from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
-from tests.diagnosis.pushed import candidates, swung_in_the_world
+from tests.diagnosis.pushed import candidates, fitted_swing
 
 
 @functools.cache
 def with_effects(*names):
     """A pendulum with hidden quadratic drag, fitted with these effects."""
-    base = swung_in_the_world("slow", drag=0.4).fit
+    base = fitted_swing("slow", drag=0.4).fit
     terms = candidates(base, DYNAMICS)
     model, start = base.model, base.parameters
     for name in names:

@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.search.joint_likelihood import joint_likelihood
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
-from tests.diagnosis.pushed import at_the_truth, candidates, swung_in_the_world
+from tests.diagnosis.pushed import at_the_truth, candidates, fitted_swing
 
 DRAWS, LEVEL = 39, 0.05
 SEEDS = tuple(range(1, 5))
@@ -52,7 +52,7 @@ def test_p_values_under_process_noise_alone_are_not_small(noise):
 @functools.cache
 def hidden():
     """Search at the fit of a pendulum with a hidden quadratic drag."""
-    fit = swung_in_the_world("slow", drag=0.4).fit
+    fit = fitted_swing("slow", drag=0.4).fit
     terms = candidates(fit, DYNAMICS)
     tangents = tangents_of(fit.model, fit.parameters, NoiseSettings(), terms)
     parts = fit, terms, tangents, fit.pseudo(NoiseSettings())[1]

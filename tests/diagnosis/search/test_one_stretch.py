@@ -43,7 +43,7 @@ def diagnosis_of(sensor):
 
 
 def burst_warnings(diagnosis):
-    return [warning for warning in diagnosis.warnings if "another burst of outliers" in warning]
+    return [warning for warning in diagnosis.warnings if "counts as a burst of outliers" in warning]
 
 
 @pytest.mark.e2e

@@ -99,7 +99,7 @@ def test_a_log_of_several_instances_is_what_pymavlink_reads(write, ending, tmp_p
     assert topics["MAG[0]"].units == {"TimeUS": "µs", "MagX": "mGauss", "MagY": "mGauss", "MagZ": "mGauss"}
 
 
-def files_beside(package, *folder):
+def files_of_package(package, *folder):
     """The files that a package's own tests read, written by programs of all ages on machines of all kinds."""
     place = Path(pytest.importorskip(package).__file__).parent.joinpath(*folder)
     found = sorted(path for path in place.glob("*") if path.suffix in (".mat", ".h5"))
@@ -109,7 +109,7 @@ def files_beside(package, *folder):
 
 
 def test_files_of_matlab_from_version_4_on_are_read_or_refused():
-    files = files_beside("scipy", "io", "matlab", "tests", "data")
+    files = files_of_package("scipy", "io", "matlab", "tests", "data")
     outcomes = {path.name: rows_or_sentence(path)[0] for path in files}
     assert len(files) >= 100
     for version in ("4.2c_SOL2", "6.1_SOL2", "6.5.1_GLNX86", "7.1_GLNX86", "7.4_GLNX86"):
@@ -121,5 +121,5 @@ def test_files_of_matlab_from_version_4_on_are_read_or_refused():
 
 
 def test_files_of_hdf5_by_others_give_rows_or_a_sentence():
-    read = [rows_or_sentence(path)[0] for path in files_beside("h5py", "tests", "data_files")]
+    read = [rows_or_sentence(path)[0] for path in files_of_package("h5py", "tests", "data_files")]
     assert any(read)

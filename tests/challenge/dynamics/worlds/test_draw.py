@@ -33,15 +33,15 @@ def test_the_scenarios_are_all_there():
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_the_same_address_gives_the_same_case_under_another_number(name):
-    one, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
-    assert (one.key.name[-5:], other.key.name[-5:]) == ("00001", "00007")
-    assert one.simulation == other.simulation
-    assert canonical([one.key]) == canonical([other.key]).replace("_00007", "_00001")
-    for column, values in one.recording.columns.items():
+    item, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
+    assert (item.key.name[-5:], other.key.name[-5:]) == ("00001", "00007")
+    assert item.simulation == other.simulation
+    assert canonical([item.key]) == canonical([other.key]).replace("_00007", "_00001")
+    for column, values in item.recording.columns.items():
         torch.testing.assert_close(other.recording[column], values, rtol=0, atol=0)
     elsewhere = SCENARIOS[name].draw(4, 1, False, 1).recording.columns
     assert not all(
-        torch.equal(values, elsewhere.get(column, values[:0])) for column, values in one.recording.columns.items()
+        torch.equal(values, elsewhere.get(column, values[:0])) for column, values in item.recording.columns.items()
     )
 
 
@@ -83,11 +83,11 @@ def test_a_disturbance_makes_a_hidden_effect_harder_to_detect():
     pushes = (draw_disturbance(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
     disturbance = next(disturbance for disturbance in pushes if disturbance.state == "temperature_1")
     effect = SYSTEMS["thermal"].inside[0](generator(5), scene)  # in the same body
-    alone, beside = (
+    alone, nearby = (
         power(scene.plant, scene.trial, effect, effect.large, noise)
         for noise in (errors, DisturbedErrors(scene, errors, disturbance))
     )
-    assert beside.z < 0.8 * alone.z
+    assert nearby.z < 0.8 * alone.z
 
 
 def integrator():
@@ -151,7 +151,7 @@ def test_a_sensor_drifts_for_one_to_ten_per_cent_of_a_run_without_disturbance(hi
             assert SLOW_TIME[0] * length <= constant <= max(SLOW_TIME[1] * length, LEAST_SLOW * step) * (1 + 1e-9)
         assert bool(key.key.effects) == hidden
         slow = key.key.noise["slow"]
-        assert max(one["over_noise"] for one in slow.values()) == key.disturbance.over_noise
+        assert max(item["over_noise"] for item in slow.values()) == key.disturbance.over_noise
 
 
 def test_runs_are_several_and_throws_have_nothing_to_hold():
@@ -200,8 +200,8 @@ def test_a_useless_simulation_follows_no_output_of_the_recording(index):
 
 
 def test_a_draw_of_which_any_fit_follows_an_output_is_drawn_again(monkeypatch):
-    told = iter([[0.1, 0.9], [0.1, 0.2], [0.26, -3.0], *[[0.2, -5.0]] * 4])
-    monkeypatch.setattr(sys.modules[draw_useless.__module__], "best_shares", lambda *_: next(told))
+    reported = iter([[0.1, 0.9], [0.1, 0.2], [0.26, -3.0], *[[0.2, -5.0]] * 4])
+    monkeypatch.setattr(sys.modules[draw_useless.__module__], "best_shares", lambda *_: next(reported))
     assert draw_useless(3, 0, False, 0).key.follows == 0.2
 
 

@@ -97,7 +97,7 @@ def test_the_residual_of_a_disturbance_in_the_fitted_run_is_that_of_the_key(kind
     scene, errors = scene_of("tanks")
     disturbance = draw_disturbance(generator(5, kind), kind, scene, errors)
     moved = simulate(scene.plant, scene.trial, disturbance=disturbance.rates).outputs - scene.course.outputs
-    free = [np.sqrt(np.square(one / d).mean()) for one, d in zip(moved, errors.deviations, strict=True)]
+    free = [np.sqrt(np.square(item / d).mean()) for item, d in zip(moved, errors.deviations, strict=True)]
     assert OVER_NOISE[0] <= disturbance.over_noise <= OVER_NOISE[1]
     plain = dataclasses.replace(errors, correlation=0.0)
     if errors.correlation == 0.0:

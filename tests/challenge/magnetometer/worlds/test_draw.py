@@ -24,13 +24,13 @@ def test_the_scenarios_are_all_there():
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_the_same_address_gives_the_same_case_under_another_number(name):
-    one, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
-    assert one.key.name == "case_00001"
-    assert canonical([one.key]) == canonical([other.key]).replace("_00007", "_00001")
-    for column, values in one.recording.columns.items():
+    item, other = (SCENARIOS[name].draw(3, 1, False, number) for number in (1, 7))
+    assert item.key.name == "case_00001"
+    assert canonical([item.key]) == canonical([other.key]).replace("_00007", "_00001")
+    for column, values in item.recording.columns.items():
         torch.testing.assert_close(other.recording[column], values, rtol=0, atol=0)
     elsewhere = SCENARIOS[name].draw(4, 1, False, 1).recording
-    assert not torch.equal(elsewhere["mag_x"], one.recording["mag_x"])
+    assert not torch.equal(elsewhere["mag_x"], item.recording["mag_x"])
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -129,8 +129,8 @@ def turned_along(recording, sign):
     field = field - torch.quantile(field, 0.5, dim=0)
     turn = sign * recording.stack("gyro_x", "gyro_y", "gyro_z").unfold(0, 10, 1).sum(-1) / 50.0
     change = field[10:] - field[:-10]
-    told = -torch.linalg.cross(turn[: len(change)], 0.5 * (field[10:] + field[:-10]))
-    return float(torch.nn.functional.cosine_similarity(change, told, dim=-1).median())
+    reported = -torch.linalg.cross(turn[: len(change)], 0.5 * (field[10:] + field[:-10]))
+    return float(torch.nn.functional.cosine_similarity(change, reported, dim=-1).median())
 
 
 def test_a_wrong_or_foreign_gyroscope_does_not_fit():
