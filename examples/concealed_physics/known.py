@@ -38,7 +38,7 @@ class Expected:
         verdicts: accepted verdicts; empty for any.
         sizes: right values of parameters.
         residual: largest accepted RMS residual of the open-loop simulation, by output, in its unit.
-        display_name: phrases of an advice or warning, all of which together are accepted in place of a claim.
+        phrases: phrases of an advice or warning, all of which together are accepted in place of a claim.
     """
 
     names: Sequence[Sequence[str]] = ()
@@ -47,7 +47,7 @@ class Expected:
     verdicts: Sequence[str] = ()
     sizes: Sequence[Size] = ()
     residual: Mapping[str, float] = field(default_factory=dict)
-    display_name: Sequence[str] = ()
+    phrases: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
     overflow = Expected((("overflow", CURVE),), places=("level1",), residual={"level2": 1.2 * 0.41})
     yield _known(folder, "tanks", "fit.csv", "Tanks", overflow)
     air = Expected(
-        ((DRAG,),), sizes=(Size(DRAG, "drag", 0.00047, within=0.32),), display_name=("quadratic_drag", "would explain")
+        ((DRAG,),), sizes=(Size(DRAG, "drag", 0.00047, within=0.32),), phrases=("quadratic_drag", "would explain")
     )
     yield _known(folder, "coastdown", "runs.csv", "Coast", air)
     yield _known(folder, "ball_beam", "run.csv", "Ball", Expected(verdicts=("unfit",)))

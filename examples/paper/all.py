@@ -58,13 +58,13 @@ SCRIPTS = (
     Script("example_2", "example 2 against the oracle", "", "--draws 30 --scipy 1"),
     Script(
         "figure_7",
-        "a magnetometer beside a magnet: Figure 7",
+        "a magnetometer next to a magnet: Figure 7",
         "{disturbed} {undisturbed} --output {out}/figure_7.png",
         "{disturbed} {undisturbed} --output {out}/figure_7.png",
     ),
     Script(
         "table_2",
-        "a magnetometer beside a magnet: Table II",
+        "a magnetometer next to a magnet: Table II",
         "{disturbed} {undisturbed}",
         "{disturbed} {undisturbed}",
     ),

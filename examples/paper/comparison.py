@@ -75,7 +75,7 @@ def library(estimator: LinearEstimator) -> Fit:
 
 
 def ransac(X: Tensor, Y: Tensor) -> Tensor:
-    """Consensus within 2.5 deviations of the noise, which it has to be told."""
+    """Consensus within 2.5 standard deviations of the noise, which has to be known."""
     found = []
     for x, y in zip(X.numpy(), Y.numpy(), strict=True):
         model = RANSACRegressor(

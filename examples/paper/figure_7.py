@@ -151,7 +151,7 @@ def main() -> None:
     console.print(
         f"{100 * disturbed.mean():.1f} % of {len(points)} samples are off by more than {LIMIT:g} µT. Paper: MKC-EM and "
         "LAD fit the normal data very well; in its Table II MKC lies between them and WLS, ridge and lasso. Here MKC, "
-        "from a robust start, is as good as MKC-EM. table_2.py has the errors beside the paper's."
+        "from a robust start, is as good as MKC-EM. table_2.py compares the errors with the paper's."
     )
     if options.output:
         picture(options.output, time, points, disturbed, found)

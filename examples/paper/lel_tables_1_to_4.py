@@ -98,7 +98,7 @@ def vector(theta: Tensor) -> str:
 
 
 def show_case(console: Console, case: int, G: Tensor, y: Tensor) -> None:
-    """The paper's tables of one case beside all draws of it."""
+    """Compare the paper's tables of a case with all draws of it."""
     fit = LeastEntropyLike(starts=torch.tensor(STARTS[case], dtype=torch.float64)).fit(G, y)
     found = torch.cat([LeastSquares().fit(G, y).coef_.unsqueeze(1), fit.minima_], 1)
     middle = medians(G, y, found)
@@ -144,7 +144,7 @@ def repeat(console: Console, G: Tensor, draws: int, generator: torch.Generator) 
     lel, ls = LeastEntropyLike().fit(G, y).coef_, LeastSquares().fit(G, y).coef_
     error, error_ls = (lel - truth).norm(dim=-1), (ls - truth).norm(dim=-1)
     middle = medians(G, y, torch.stack([ls, lel], 1))
-    table = Table(title=f"Case 2 repeated, {draws} draws with θ drawn anew")
+    table = Table(title=f"Case 2 repeated, {draws} draws with θ drawn again")
     for heading in ("", "paper", "here"):
         table.add_column(heading, justify="right" if heading else "left")
     table.add_row("LEL closer to the truth than LS", "100 of 100", f"{int((error < error_ls).sum())} of {draws}")

@@ -1,4 +1,4 @@
-"""Table I of Li et al. (2023): errors and times of WLS, LAD, MKC and MKC-EM in example 2, each beside the paper's.
+"""Table I of Li et al. (2023): errors and times of WLS, LAD, MKC and MKC-EM in example 2, each with the paper's.
 
     python examples/paper/table_1.py
 

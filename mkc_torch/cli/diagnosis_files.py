@@ -202,7 +202,7 @@ def _outcome(
                     surrogates=request.surrogates,
                     seed=request.seed,
                     noise=request.noise,
-                    between=request.input_hold,
+                    input_hold=request.input_hold,
                     quick=request.quick,
                     time_limit=request.time_limit,
                     progress=progress,

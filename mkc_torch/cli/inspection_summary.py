@@ -57,7 +57,7 @@ def _trial(seen: FileSeen, sensor: SensorSeen) -> tuple[list[str], str | None]:
 def as_data(seen: FileSeen) -> dict[str, Any]:
     """Return the content of a file as data for JSON."""
     commands, notes = commands_of(seen)
-    data = asdict(seen) | {"path": str(seen.path), "commands": commands, "told": notes}
+    data = asdict(seen) | {"path": str(seen.path), "commands": commands, "notes": notes}
     for sensor in data["sensors"]:
         sensor["columns"], sensor["units"] = dict(sensor["columns"]), dict(sensor["units"])
     return data

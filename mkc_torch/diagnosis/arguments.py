@@ -98,15 +98,15 @@ def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
     }
 
 
-def checked_between(between: object, inputs: Sequence[str]) -> dict[str, str]:
+def checked_input_hold(input_hold: object, inputs: Sequence[str]) -> dict[str, str]:
     """Return the declared input holds of differential equations, by input.
 
     Example:
-        >>> checked_between({"torque": "held"}, ["torque"])
+        >>> checked_input_hold({"torque": "held"}, ["torque"])
         {'torque': 'held'}
     """
     found = {}
-    for name, hold in _of_known("between", between, inputs, "inputs in the equations", '{"torque": "held"}').items():
+    for name, hold in _of_known("input_hold", input_hold, inputs, "inputs in the equations", '{"torque": "held"}').items():
         if not isinstance(hold, str) or hold not in BETWEEN:
             raise ValueError(
                 f"Expected argument `input_hold` of `{name}` to be one of {', '.join(BETWEEN)} but got {hold!r}."

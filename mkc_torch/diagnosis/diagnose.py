@@ -15,7 +15,7 @@ from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.arguments import (
     check_limits,
     check_numbers,
-    checked_between,
+    checked_input_hold,
     checked_effects,
     checked_noise,
     refuse_no_settings,
@@ -64,7 +64,7 @@ def diagnose(
     seed: int = 0,
     settings: Settings = Settings(),  # noqa: B008
     noise: Mapping[str, float] | None = None,
-    between: Mapping[str, str] | None = None,
+    input_hold: Mapping[str, str] | None = None,
     quick: bool = False,
     time_limit: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
@@ -145,7 +145,7 @@ def diagnose(
         )
     prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
-    fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
+    fixed = checked_input_hold(input_hold, tuple(getattr(prepared, "input_hold", ())))
     options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
     known = PartialResult(simulation, effects, names, options, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit

@@ -422,7 +422,7 @@ def test_demo_finds_what_is_concealed_and_corrects_a_second_recording(calibrated
     assert finding["held_out"]["rmse_after"] < 0.9 * finding["held_out"]["rmse_before"]
     assert "SIMULATED: no sensor recorded this" in (place / "report.html").read_text(encoding="utf-8")
     assert "Left out of the simulation: current field (current)." in result.stdout
-    alone, model = (float(x) for x in re.findall(r"(?:alone|found)   +(\d\.\d\d) µT", result.stdout))
+    alone, model = (float(x) for x in re.findall(r"(?:alone|findings)   +(\d\.\d\d) µT", result.stdout))
     assert model < 0.9 * alone
     again = mkc("apply", place / "model.json", folder / "second.csv", "--output", folder.parent / "again.csv")
     assert again.exit_code == 0

@@ -440,7 +440,7 @@ def test_challenge(tmp_path):
     flat = " ".join(result.stdout.split())
     assert re.search(r"at most 7 % false alarms \d+\.0 % (yes|no) ", flat)
     assert "Empty recordings, at least 400 at level 0.05 1 too few" in flat
-    assert "Too few recordings to tell (1 of at least 400 and" in flat
+    assert "Too few recordings (1 of at least 400 and" in flat
     assert " % |" in (folder / "summary.md").read_text(encoding="utf-8")
     assert "failed none" in " ".join(result.stdout.split())
     record = json.loads((folder / "score.json").read_text(encoding="utf-8"))

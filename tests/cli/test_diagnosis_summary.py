@@ -42,7 +42,8 @@ def test_a_finding_in_a_dozen_lines():
         "where from 41.3 s on; acts on mag_x, mag_y, mag_z",
         "driven by no recorded column",
         "how sure p = 0.005 (the minimum with 199 surrogates)",
-        "held out residual 0.912 → 0.521 µT (43 % less); surely better on held-out blocks; +0.312 nats per sample (95 %: "
+        "held out residual 0.912 → 0.521 µT (43 % less); surely better on held-out blocks; +0.312 nats per "
+        "sample (95 %: "
         "0.281 to 0.350); 0 is no improvement",
         "named hard-iron step: left out of the simulation",
         "unexplained nothing",
@@ -158,7 +159,8 @@ def test_the_four_answers_stand_first():
     assert answers(quiet).startswith(
         "flight_07 against Pendulum The recording shows no missing physics. "
         "fit angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance "
-        "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named nothing unexplained nothing"
+        "noise The residual is the sensor's noise. Input hold: `torque` is constant between samples. named "
+        "nothing unexplained nothing"
     )
 
 

@@ -1,4 +1,4 @@
-"""An interrupt is told in one line, whenever it comes, and the exit code is that of one."""
+"""An interrupt at any time prints one line, and the exit code is 130."""
 
 import os
 import signal

@@ -193,7 +193,7 @@ def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, mon
     second = tmp_path / "again" / "new" / "corrected.py"
     assert "class CorrectedCorrectedTank(CorrectedTank)" in second.read_text(encoding="utf-8")
     assert load_simulation(f"{second}:CorrectedCorrectedTank").parameters["drain"].value == pytest.approx(0.3, abs=0.1)
-    # what is moved alone finds its base class beside it, and without it says what to do
+    # what is moved alone finds its base class next to it, and reports what to do without it
     alone = tmp_path / "alone"
     alone.mkdir()
     (alone / "corrected.py").write_text(text, encoding="utf-8")

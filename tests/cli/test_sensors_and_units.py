@@ -114,7 +114,7 @@ def test_apply_reports_different_units(folder, tmp_path):
     command = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv", "--unit-label", "counts")
     refused(mkc(*command), "is in counts, but the calibrated recording was in µT")
     result = mkc("apply", model, folder / "gauss.csv", "--output", tmp_path / "b.csv")
-    assert "is this one in another unit" in flat(result.stdout)
+    assert "check the unit" in flat(result.stdout)
 
 
 @pytest.mark.parametrize("texts", [["mag=gauss,time=ms"], ["mag=gauss", "time=ms"], ["mag=gauss time=ms"]])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.arguments import checked_between, checked_noise
+from mkc_torch.diagnosis.arguments import checked_input_hold, checked_noise
 from mkc_torch.simulation import Static
 
 
@@ -37,17 +37,17 @@ def test_invalid_noise_raises(noise, error, words):
 )
 def test_invalid_input_holds_raise(between, error, words):
     with pytest.raises(error, match=words):
-        checked_between(between, ("torque",))
+        checked_input_hold(between, ("torque",))
 
 
 def test_input_holds_of_a_simulation_without_inputs_raise():
     with pytest.raises(ValueError, match="got `torque`; it has none"):
-        checked_between({"torque": "held"}, ())
+        checked_input_hold({"torque": "held"}, ())
 
 
 def test_declarations_are_returned_and_optional():
     assert checked_noise({"angle": 1}, ("angle",)) == {"angle": 1.0}
-    assert checked_noise(None, ("angle",)) == checked_between(None, ()) == {}
+    assert checked_noise(None, ("angle",)) == checked_input_hold(None, ()) == {}
 
 
 def test_diagnose_checks_the_declarations():
@@ -59,4 +59,4 @@ def test_diagnose_checks_the_declarations():
         diagnose(line, recording, noise={"temperature": 0.1})
     # a static simulation has no input holds
     with pytest.raises(ValueError, match="inputs in the equations of this simulation but got `temperature`; it has no"):
-        diagnose(line, recording, between={"temperature": "held"})
+        diagnose(line, recording, input_hold={"temperature": "held"})

@@ -230,7 +230,7 @@ def test_autocast_changes_nothing():
 def test_bad_arguments_of_the_loss_are_refused():
     x = torch.ones(3)
     for given, error, match in (
-        ((x, torch.ones(4)), ValueError, "one shape"),
+        ((x, torch.ones(4)), ValueError, "of the same shape"),
         ((x, torch.tensor([1.0, math.nan, 2.0])), ValueError, "finite"),
         ((x.long(), x), TypeError, "floating"),
         ((torch.ones(0), torch.ones(0)), ValueError, "at least one"),

@@ -66,20 +66,37 @@ PAIRS = (
     Pair("[Nn]o missing physics", "[Nn]earest in the catalogue", "report"),
     Pair("[Nn]o missing physics", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
     Pair("[Nn]o missing physics", PUSH, "report"),
-    Pair("[Nn]o missing physics", "[Ss]tructure remains|has structure|smooth trend along|does not fit|unnamed structure", "report"),
+    Pair(
+        "[Nn]o missing physics",
+        "[Ss]tructure remains|has structure|smooth trend along|does not fit|unnamed structure",
+        "report",
+    ),
     Pair("no physics in the catalogue explains it", CLAIM, "report"),
     Pair("No physics is significant", CLAIM, "report"),
     Pair("The strongest candidate is significant", r"named +nothing confirmed", "report"),
     Pair(r"named\W+nothing\b(?! confirmed)", f"{CLAIM}|[Nn]earest in the catalogue", "report"),
-    Pair(r"unexplained\W+nothing\b", f"{PUSH}|[Ss]tructure remains|has structure|smooth trend along", "report", "explained"),
+    Pair(
+        r"unexplained\W+nothing\b",
+        f"{PUSH}|[Ss]tructure remains|has structure|smooth trend along",
+        "report",
+        "explained",
+    ),
     # what is left
     Pair("The residual is the sensor's noise", PUSH, "report"),
-    Pair("The residual is the sensor's noise", "[Ss]tructure remains|has structure|smooth trend along|Look for the cause of the disturbance", "report"),
+    Pair(
+        "The residual is the sensor's noise",
+        "[Ss]tructure remains|has structure|smooth trend along|Look for the cause of the disturbance",
+        "report",
+    ),
     Pair("white", "is not white", "row"),
     Pair(r"correlation time \S+ s", r"is white\.", "row"),
     # what to do
     Pair("The simulation can be used", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
-    Pair("The simulation can be used", "does not fit|[Ss]tructure remains|has structure|smooth trend along|Do not rely", "report"),
+    Pair(
+        "The simulation can be used",
+        "does not fit|[Ss]tructure remains|has structure|smooth trend along|Do not rely",
+        "report",
+    ),
     Pair("The simulation can be used", "The model found here corrects|mkc apply", "report"),
     Pair("Do not rely on this simulation", f"{CLAIM}|mkc apply|The simulation can be used", "report"),
     Pair("does not fit the recording", f"{CLAIM}|[Nn]earest in the catalogue|mkc apply", "report"),
@@ -123,7 +140,9 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
 
 
 def _two_residuals(d: Diagnosis) -> bool:
-    """A page's residuals of the simulation without findings: of held-out blocks in its table, and of the first finding."""
+    """A page's residuals of the simulation without findings: of held-out blocks in its table, and of the first
+    finding.
+    """
     held = d.findings[0].held_out if d.findings else None
     if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
         return False
@@ -157,10 +176,14 @@ RULES: dict[str, Rule] = {
     "explained with a finding that is no claim": lambda d: (
         d.verdict == "explained" and len(_claims(d)) < len(d.findings)
     ),
-    "explained with a push of a rate": lambda d: d.verdict == "explained" and any(p.at_rate for p in d.environment.process_noise),
+    "explained with a push of a rate": lambda d: (
+        d.verdict == "explained" and any(p.at_rate for p in d.environment.process_noise)
+    ),
     "unfit with a finding": lambda d: d.verdict == "unfit" and bool(d.findings),
     "unfit where every output is followed": lambda d: (
-        d.verdict == "unfit" and bool(d.environment.goodness_of_fit) and all(fit.explained > 0.9 for fit in d.environment.goodness_of_fit)
+        d.verdict == "unfit"
+        and bool(d.environment.goodness_of_fit)
+        and all(fit.explained > 0.9 for fit in d.environment.goodness_of_fit)
     ),
     "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.environment.reasons),
     "to be corrected and not to be": _claimed_and_refused,

@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.environment import NoiseEnvironment, ShapeCheck
 from mkc_torch.diagnosis.evidence import held_out_gain
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
-from mkc_torch.diagnosis.result import Alternative, Diagnosis, EffectParameter, HeldOut, ResidualSizes
+from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, EffectParameter, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
 from mkc_torch.recording import demonstration
@@ -29,7 +29,7 @@ from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_r
 
 END = 3.98  # s, of the factory's 200 samples
 LEVEL = 0.05
-LEFT = "In 1 of 25 blocks the free run leaves the recording's range."
+LEFT = (DivergedBlock(3, before=True, after=False),)
 
 sizes = st.sampled_from((1e-3, 0.3, 0.57, 0.9996, 1.0, 1.004, 1.04, 1.3))
 """Residual after over before."""
@@ -45,7 +45,7 @@ def held_outs(draw, unit="rad"):
         outputs["rate"] = ResidualSizes(2.0 * before, 2.0 * draw(sizes) * before, "rad/s")
     return HeldOut(
         gain, (gain - low, gain + high), before, ratio * before, unit,
-        outputs if draw(st.booleans()) else {}, draw(st.sampled_from(("", LEFT))), decides=draw(st.booleans()),
+        outputs if draw(st.booleans()) else {}, draw(st.sampled_from(((), LEFT))), 25, decides=draw(st.booleans()),
     )  # fmt: skip
 
 
@@ -86,7 +86,8 @@ class Case:
 
     def __repr__(self):
         d = self.diagnosis
-        return f"{d.verdict}: {[(f.effect, f.grade, f.held_out) for f in d.findings]}, {d.environment.process_noise}, {d.remaining}"
+        found = [(f.effect, f.grade, f.held_out) for f in d.findings]
+        return f"{d.verdict}: {found}, {d.environment.process_noise}, {d.remaining}"
 
 
 @st.composite

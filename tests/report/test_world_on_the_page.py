@@ -20,10 +20,10 @@ from tests.diagnosis.factory import (
     PUSHED,
     graded,
     make_diagnosis,
+    make_environment,
     make_follows,
     make_forcing,
     make_unfit,
-    make_environment,
     nearest,
     with_evidence,
 )
@@ -32,7 +32,12 @@ from tests.report.test_calibration_report import parsed, text_of
 
 def pushed(**changes):
     return make_diagnosis(
-        0, simulation="Pendulum", samples=200, verdict="unexplained", p_value=0.4, environment=make_environment(**changes)
+        0,
+        simulation="Pendulum",
+        samples=200,
+        verdict="unexplained",
+        p_value=0.4,
+        environment=make_environment(**changes),
     )
 
 
@@ -49,7 +54,9 @@ def box_of(page):
 
 def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
     followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
-    quiet = make_diagnosis(0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=()))
+    quiet = make_diagnosis(
+        0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=())
+    )
     page = diagnosis_report(quiet)
     box = box_of(page)
     assert "The recording shows no missing physics." in box
@@ -68,7 +75,11 @@ def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
 
 def test_of_many_outputs_the_table_has_all():
     many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
-    page = diagnosis_report(make_diagnosis(0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())))
+    page = diagnosis_report(
+        make_diagnosis(
+            0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())
+        )
+    )
     assert "and 3 more outputs; see the table" in box_of(page)
     assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s unknown" in text_of(page)
 
@@ -102,7 +113,10 @@ def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
     box = box_of(page)
     assert box.startswith("Process noise acts on the rate of rate, and no physics in the catalogue explains it.")
     assert "Process noise on the rate of rate: 0.228 ± 0.021 rad/s², correlation time 0.7 s." in box
-    assert "A model without this noise of rate is 311 nats less likely. No physics is significant in addition to it." in box
+    assert (
+        "A model without this noise of rate is 311 nats less likely. No physics is significant in addition to it."
+        in box
+    )
     text = text_of(page)
     assert "It is not white: it is correlated up to 0.7 s. It goes along with none of the inputs, at no lag." in text
     for name in ("Over angle", "Over rate", "Over torque"):
@@ -190,7 +204,10 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
             HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m", decides=False),
             "not shown to be better on held-out blocks: the open-loop",
         ),
-        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not reject it: the open-loop residual is smaller"),
+        (
+            HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False),
+            "do not reject it: the open-loop residual is smaller",
+        ),
     ):
         assert reason in unseen.better(held)
         assert unseen.diverged(held) == ""
@@ -205,7 +222,9 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
         {"angle": ResidualSizes(0.02, 0.0051, "rad"), "rate": ResidualSizes(0.3, 0.1, "rad/s")},
         (DivergedBlock(3, before=True, after=False),), 25,
     )  # fmt: skip
-    made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", environment=make_environment(process_noise=(), disturbance=()))
+    made = make_diagnosis(
+        2, samples=200, channels=2, simulation="Motor", environment=make_environment(process_noise=(), disturbance=())
+    )
     traces = dataclasses.replace(made.traces, channels=("angle", "rate"), unit="")
     made = dataclasses.replace(made, traces=traces, findings=tuple(
         with_evidence(f, held_out_gain.as_result(held, "")) for f in made.findings
@@ -250,10 +269,14 @@ def test_the_statisticians_numbers_are_one_click_below():
 
 
 def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
-    made = make_diagnosis(0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=()))
+    made = make_diagnosis(
+        0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=())
+    )
     page = diagnosis_report(made)
     assert "Dotted: the sensor's noise floor." in text_of(page)
-    without = diagnosis_report(dataclasses.replace(made, environment=make_environment(process_noise=())))  # of no channel
+    without = diagnosis_report(
+        dataclasses.replace(made, environment=make_environment(process_noise=()))
+    )  # of no channel
     assert "Dotted" not in without
     assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
 
@@ -272,7 +295,11 @@ def test_names_of_the_world_are_escaped():
     push = dataclasses.replace(PUSHED, place=bad, unit=bad)
     forcing = dataclasses.replace(make_forcing(50, push), sentences=(bad,))
     hostile = make_environment(
-        goodness_of_fit=(make_follows(bad, bad),), process_noise=(push,), input_hold={bad: "linear"}, disturbance=(forcing,), reasons=(bad,)
+        goodness_of_fit=(make_follows(bad, bad),),
+        process_noise=(push,),
+        input_hold={bad: "linear"},
+        disturbance=(forcing,),
+        reasons=(bad,),
     )
     for verdict in ("unfit", "unexplained"):
         page = diagnosis_report(make_diagnosis(0, samples=100, verdict=verdict, environment=hostile))
@@ -281,6 +308,8 @@ def test_names_of_the_world_are_escaped():
 
 
 def test_a_contradiction_is_not_called_nothing():
-    lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=()))
+    lost = make_diagnosis(
+        0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=())
+    )
     assert top.tone(lost) == "open"
     assert top.headline(lost) == "The simulation does not fit the recording."

@@ -131,7 +131,7 @@ class Calibration:
     def _least_squares(self, theta: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
         """Parameters (B, 1 + k) and sums of squares (B,) by Levenberg-Marquardt within the bounds.
 
-        Converged fits leave the batch. `mkc_torch.nonlinear.minimise` keeps the whole batch until the last fit converges
+        Converged fits leave the batch. `mkc_torch.nonlinear.minimise` keeps the batch until the last fit converges
         and takes ten times as long here.
         """
         damping = torch.full((len(theta),), 1e-2, dtype=torch.float64)

@@ -22,7 +22,7 @@ def between(values: Array, parts: int) -> Array:
     """Interpolate signals (k, T, R) linearly at ``parts`` times an interval: (k, (T - 1) parts + 1, R).
 
     Example:
-        >>> input_hold(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
+        >>> between(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
         [0.0, 0.5, 1.0]
     """
     share = np.arange(parts)[None, None, :, None] / parts

@@ -1,6 +1,7 @@
 """Tests of evidence for findings and of the residual, one test per file.
 
-A new test is a file with ``test(case) -> EvidenceResult`` and a line in :data:`TESTS`. Its result appears in the report, on
+A new test is a file with ``test(case) -> EvidenceResult`` and a line in :data:`TESTS`. Its result appears in the
+report, on
 the terminal and in ``diagnosis.json`` under ``evidence``, by its id. It does not change the verdict or the findings.
 """
 

@@ -66,12 +66,14 @@ def ceiling(model: JointModel, fit: FittedModel, drivers: Sequence[Driver], bloc
     cross-validation does. Two reweighting iterations and a density fit follow.
 
     The score is no evidence of missing physics: a drift longer than a block is smooth in time, and in every column that
-    drifts too, so the ceiling can exceed the simulation. The correction cannot fit jumps, or dependences on the measured
+    drifts too, so the ceiling can exceed the simulation. The correction cannot fit jumps, or dependences on the
+    measured
     signal itself.
 
     Args:
         model: the model to correct, such as the simulation without findings.
-        fit: the most likely model; the residual is linearised at its parameters, and its outliers do not select columns.
+        fit: the most likely model; the residual is linearised at its parameters, and its outliers do not select
+        columns.
         drivers: the columns.
         blocks: held-out blocks.
     """

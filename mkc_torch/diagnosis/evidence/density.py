@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = [
+    "as_result",
     "density_checks",
     "density_warnings",
     "kolmogorov",
-    "as_result",
     "student_cdf",
     "student_fit",
     "test",
@@ -152,7 +152,8 @@ def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
     worst = max(misfit, key=lambda check: check.distance)
     return (
         f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
-        f"Kolmogorov distance is {worst.distance:.2g}, that of a Student-t with {worst.degrees_of_freedom:g} degrees of "
+        f"Kolmogorov distance is {worst.distance:.2g}, that of a Student-t with {worst.degrees_of_freedom:g} degrees "
+        f"of "
         f"freedom {worst.student_distance:.2g}. A misfit of the tail is not evidence of physics.",
     )
 

@@ -22,7 +22,7 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["of_finding", "as_result", "shifted", "test"]
+__all__ = ["as_result", "of_finding", "shifted", "test"]
 
 _COPIES = 19
 """Shifted copies in each direction."""
@@ -55,7 +55,8 @@ def as_result(shift: DriverShift | None, term: Term, settings: EvidenceSettings)
     columns = ", ".join(term.columns)
     sentence = (
         f"{shift.as_good} of {shift.copies} copies of {columns}, shifted by up to {shift.reach:.3g} s, gain as much "
-        f"for {term.effect.id} as the column itself: its timing does not distinguish it from other quantities that change "
+        f"for {term.effect.id} as the column itself: its timing does not distinguish it from other quantities that "
+        f"change "
         "as slowly."
     )
     many = shift.as_good > settings.shift_many * shift.copies

@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Extrapolation
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
-__all__ = ["extrapolated", "of_finding", "as_result", "test"]
+__all__ = ["as_result", "extrapolated", "of_finding", "test"]
 
 _BLOCKS, _FEWEST = 25, 5
 """Blocks of the bootstrap, and the minimum number of blocks with high values."""

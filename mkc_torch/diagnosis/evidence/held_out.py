@@ -36,7 +36,8 @@ class HeldOutBlocks:
 class Evidence:
     """Scores on held-out samples: log-likelihood (N,), residual (N, m), and the density's σ and d (m,).
 
-    ``parameters`` (folds, p) are those of the fits without each fold; ``left_out`` is the mean share of excluded samples.
+    ``parameters`` (folds, p) are those of the fits without each fold; ``left_out`` is the mean share of excluded
+    samples.
     """
 
     log_likelihood: Float[Tensor, " N"]

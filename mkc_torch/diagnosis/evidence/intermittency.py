@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["comes_and_goes", "memory_of", "as_result", "test"]
+__all__ = ["as_result", "comes_and_goes", "memory_of", "test"]
 
 _FREQUENCIES = 4001
 """Number of frequencies of the spectrum."""

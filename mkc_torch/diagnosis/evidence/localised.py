@@ -15,8 +15,10 @@ def test(case: EvidenceContext) -> EvidenceResult:
         return EvidenceResult("one_stretch")
     begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
     sentence = (
-        f"From {begin:.1f} to {end:.1f} s the residual fits {called(located.term)}, but hardly elsewhere. Other intervals "
-        "misfit too and no effect explains them, so this interval counts as a burst of outliers. Record again, for longer."
+        f"From {begin:.1f} to {end:.1f} s the residual fits {called(located.term)}, but hardly elsewhere. Other "
+        f"intervals "
+        "misfit too and no effect explains them, so this interval counts as a burst of outliers. Record again, for "
+        "longer."
     )
     return EvidenceResult("one_stretch", (begin, end), warnings=(sentence,))
 

@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["of_finding", "onset_interval", "as_result", "test"]
+__all__ = ["as_result", "of_finding", "onset_interval", "test"]
 
 _CRITICAL = -2.0 * math.log(1.0 - math.sqrt(0.95))
 """95 % quantile of the likelihood ratio of the onset."""

@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.parallel import run_parallel
-from mkc_torch.diagnosis.model.process_noise import open_loop, refit_open_loop, has_process_noise
+from mkc_torch.diagnosis.model.process_noise import has_process_noise, open_loop, refit_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError

@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
-__all__ = ["nameless", "remaining", "remaining_warning", "as_result", "test", "within_reach"]
+__all__ = ["as_result", "nameless", "remaining", "remaining_warning", "test", "within_reach"]
 
 _RUNS_AWAY = 100.0
 """Residual, in half-widths of the density's domain, beyond which a simulation has diverged."""
@@ -106,6 +106,7 @@ def remaining_warning(columns: Sequence[str]) -> tuple[str, ...]:
     if not columns:
         return ()
     return (
-        f"The residual has a smooth trend along {', '.join(columns)} that no effect of the catalogue explains: a smooth "
+        f"The residual has a smooth trend along {', '.join(columns)} that no effect of the catalogue explains: a "
+        f"smooth "
         "correction by recorded columns is clearly better on held-out blocks.",
     )

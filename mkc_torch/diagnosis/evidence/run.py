@@ -25,7 +25,9 @@ class EvidenceReport:
 
 
 def precompute(case: EvidenceContext, tests: Sequence[EvidenceTest] = TESTS) -> list[Callable[[], Any]]:
-    """Return independent tasks: the ``ahead`` function of each test, and last the final estimate, which takes longest."""
+    """Return independent tasks: the ``ahead`` function of each test, and last the final estimate, which takes
+    longest.
+    """
     return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(_final, case)]
 
 

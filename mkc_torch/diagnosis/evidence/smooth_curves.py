@@ -182,7 +182,8 @@ def smooth_tangents(
 def _promising(
     around: _Around, curves: Mapping[str, Tensor], weights: Float[Tensor, "N m"], blocks: HeldOutBlocks, room: int
 ) -> Bool[Tensor, "folds curves"]:
-    """Return for each fold the columns whose curves correlate most with the training residuals; time is always included.
+    """Return for each fold the columns whose curves correlate most with the training residuals; time is always
+    included.
 
     The number of columns is limited by the union over the folds.
     """
@@ -203,7 +204,9 @@ def _promising(
 def _scores(
     around: _Around, basis: Float[Tensor, "D N degree"], weights: Sequence[Float[Tensor, "N m"]]
 ) -> Float[Tensor, "folds D"]:
-    """Return the squared projection of the residual, after the parameters' fit, on each column's curves, over all ports."""
+    """Return the squared projection of the residual, after the parameters' fit, on each column's curves, over all
+    ports.
+    """
     left = [_left(around, weight) for weight in weights]
     total = basis.new_zeros(len(weights), len(basis))
     for port in around.ports:

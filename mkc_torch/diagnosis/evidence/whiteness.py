@@ -25,7 +25,8 @@ _FARTHEST = 0.25
 
 _TITLE = "Whiteness of the residual"
 _NOTE = (
-    "Autocorrelation of the final model's residual, without rejected samples: the last significant lag, the correlation "
+    "Autocorrelation of the final model's residual, without rejected samples: the last significant lag, the "
+    "correlation "
     "of neighbours, and the p-value of the first {lags} lags together. The level is {level:.2g}."
 )
 

@@ -60,7 +60,8 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
         yield _find_disturbance(rates[0])
     elif d.verdict == "unexplained" and d.environment.process_noise:
         yield (
-            f"Look for a cause of the drift of `{d.environment.process_noise[0].place}`, such as warming up, and record it."
+            f"Look for a cause of the drift of `{d.environment.process_noise[0].place}`, such as warming up, and "
+            f"record it."
         )
     elif any(f.grade == "nearest" for f in d.findings):
         return  # advice on its curve follows
@@ -74,7 +75,8 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
 def _find_disturbance(process: ProcessNoise) -> str:
     size = f"{process.size:.2g} {tidy(process.unit)}".rstrip()
     return (
-        f"Look for the cause of the disturbance of the rate of `{process.place}` in its figure, and record it. Until then, use "
+        f"Look for the cause of the disturbance of the rate of `{process.place}` in its figure, and record it. Until "
+        f"then, use "
         f"{size} as the process noise of that rate, for example in a filter."
     )
 
@@ -120,7 +122,8 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
     f = finding
     if f.grade == "small" and f.held_out is not None:
         return (
-            f"Do not correct for {_called(f, d)}, unless means over many samples matter: it reduces the residual by only "
+            f"Do not correct for {_called(f, d)}, unless means over many samples matter: it reduces the residual by "
+            f"only "
             f"{max(100.0 * change(f.held_out), 0.0):.1f} %."
         )
     if f.cannot_be:
@@ -167,7 +170,9 @@ def _how(finding: Finding, near: Sequence[Alternative]) -> str:
         if len(columns) == 1:
             return f" with {columns[0]} over a wider range"
         return " with independent variation: change one column and hold the other"
-    clauses = list(dict.fromkeys(candidate.recurrence for candidate in every if candidate.recurrence and not candidate.drivers))
+    clauses = list(
+        dict.fromkeys(candidate.recurrence for candidate in every if candidate.recurrence and not candidate.drivers)
+    )
     if columns:
         clauses.append(f"let {', '.join(columns)} change at other times")
     return f": {'; '.join(clauses)}" if clauses else _OTHERWISE.get(finding.kind, " with other inputs and amplitudes")

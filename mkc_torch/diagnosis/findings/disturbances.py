@@ -34,9 +34,17 @@ def process_noise_of(prepared: PreparedDynamics, noise: StateSpaceNoise) -> tupl
     found = noise.selected
     sentences = []
     for disturbance, error, gain in zip(found.disturbances, found.errors, found.gains, strict=True):
-        unit = prepared.ports[f"rate of {disturbance.place}"].unit if disturbance.at_rate else _unit_of(prepared, disturbance.place)
+        unit = (
+            prepared.ports[f"rate of {disturbance.place}"].unit
+            if disturbance.at_rate
+            else _unit_of(prepared, disturbance.place)
+        )
         of_size = disturbance.size * error if math.isfinite(error) else disturbance.size
-        sentences.append(ProcessNoise(disturbance.place, disturbance.at_rate, disturbance.lasting, disturbance.size, of_size, unit, gain))
+        sentences.append(
+            ProcessNoise(
+                disturbance.place, disturbance.at_rate, disturbance.lasting, disturbance.size, of_size, unit, gain
+            )
+        )
     return tuple(sentences)
 
 
@@ -110,7 +118,9 @@ def _sentences(process: ProcessNoise, course: DisturbancePath, prepared: Prepare
     what = f"rate of {process.place}" if process.at_rate else process.place
     step = float(prepared.time.diff().median())
     if process.correlation_time > 0.0:
-        sentences = [f"The disturbance of {what} is not white: its correlation time is about {process.correlation_time:.2g} s."]
+        sentences = [
+            f"The disturbance of {what} is not white: its correlation time is about {process.correlation_time:.2g} s."
+        ]
     else:
         sentences = [f"The disturbance of {what} is white."]
     for name, values in zip(prepared.system.inputs, prepared.inputs_at_rows.unbind(-1), strict=True):

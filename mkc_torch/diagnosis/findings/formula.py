@@ -89,9 +89,8 @@ def _formula(
     _, names, coefficients = best
     off = (_summed(names, columns, coefficients) - value).square().mean().sqrt()
     text = _formula_text(names, coefficients, driver, float(size))
-    return (
-        f"δ({channel}) = {text}{f' {unit}' if unit else ''} (RMS error {100.0 * float(off / size.clamp(min=1e-300)):.0f} %)"
-    )
+    amount = f"{text} {unit}" if unit else text
+    return f"δ({channel}) = {amount} (RMS error {100.0 * float(off / size.clamp(min=1e-300)):.0f} %)"
 
 
 def _fitted(

@@ -92,14 +92,16 @@ def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) ->
     sentences = _of_trials(prepared, fits, follows)
     ends = at_ends(fits[0])
     sentences += [
-        f"`{name}` is fitted to its bound, {_value(fits[0], prepared, name):.4g}: the recording needs a value beyond it, "
+        f"`{name}` is fitted to its bound, {_value(fits[0], prepared, name):.4g}: the recording needs a value beyond "
+        f"it, "
         "often with the other sign."
         for name in ends
     ]
     sentences += _of_sizes(prepared, fits[-1], ends)
     if not sentences:
         sentences = [
-            "No other start, sign or delay of an input improves the fit: compare columns, units and order of the recording "
+            "No other start, sign or delay of an input improves the fit: compare columns, units and order of the "
+            "recording "
             "with those of the simulation, or the simulation is of another system."
         ]
     return tuple(sentences)
@@ -118,9 +120,7 @@ def _of_sizes(prepared: PreparedDynamics, fit: FittedModel, ends: Sequence[str])
         if value < _NOUGHT * begun:
             sentences.append(f"The open-loop fit is best with `{name}` nearly 0, without its term.")
         elif value > _AWAY * begun:
-            sentences.append(
-                f"The open-loop fit is best with `{name}` at {value / begun:.2g} times its start value."
-            )
+            sentences.append(f"The open-loop fit is best with `{name}` at {value / begun:.2g} times its start value.")
     return sentences
 
 

@@ -1,6 +1,7 @@
 """Attribution of a finding's gain to states and runs.
 
-The gain of an effect is the integral of the likelihood's gradient from amplitude 0 to its amplitude, and the gradient is
+The gain of an effect is the integral of the likelihood's gradient from amplitude 0 to its amplitude, and the gradient
+is
 a sum over the times at which the effect acts: integrated gradients (Sundararajan, Taly & Yan, ICML 2017), through the
 simulation. Each term belongs to the states at its time, although the outputs show it later.
 """

@@ -17,7 +17,8 @@ _MOST = 8
 def separability(located: SearchResult) -> Separability:
     """Return the separability of the leading candidates at their best shapes, in the metric of the noise.
 
-    The trace of a candidate is its tangent along the best γ, orthogonal to the simulation's parameters. The share is the
+    The trace of a candidate is its tangent along the best γ, orthogonal to the simulation's parameters. The share is
+    the
     squared norm that remains after projection on the rival, relative to the norm before.
     """
     numbers = [ranked.number for ranked in located.ranking[:_MOST]]

@@ -49,7 +49,9 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     fits = [result for result in found if result is not None]
     if not fits:
         return None
-    best = max(fits, key=lambda curve_fit: curve_fit.log_likelihood - schwarz(curve_fit) * curve_fit.model.sizes[number])
+    best = max(
+        fits, key=lambda curve_fit: curve_fit.log_likelihood - schwarz(curve_fit) * curve_fit.model.sizes[number]
+    )
     gain = best.log_likelihood - fit.log_likelihood
     more = max(
         best.model.sizes[number] - fit.model.sizes[number] - len({*continuous(term), *term.effect.fitted_shape}), 1

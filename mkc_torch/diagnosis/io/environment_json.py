@@ -121,7 +121,9 @@ def remaining_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "largest_lag": max((channel["lag"] for channel in channels), default=None),
         "unit": test.get("unit", ""),
         "channels": coloured,
-        "disturbed_states": list(dict.fromkeys(process.place for process in d.environment.process_noise if process.at_rate)),
+        "disturbed_states": list(
+            dict.fromkeys(process.place for process in d.environment.process_noise if process.at_rate)
+        ),
         "smooth_along": list(d.remaining),
     }
 

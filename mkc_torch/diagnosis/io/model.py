@@ -353,7 +353,8 @@ def refuse_unknown(name: str, simulation: Simulation | None) -> None:
     """
     if simulation is None and name == Paired.name:
         raise ValueError(
-            "the model is of a simulator's output: give what it wrote for this recording with `--simulator-output SIM.csv` "
+            "the model is of a simulator's output: give what it wrote for this recording with `--simulator-output "
+            "SIM.csv` "
             "(in Python `simulation=Paired(...)`)."
         )
     if simulation is None and name != Magnetometer.name:

@@ -53,7 +53,8 @@ def python_source(
     module: str | None = None,
     folder: Path | None = None,
 ) -> str:
-    """Return the source of a module with a class derived from the diagnosed class, see :meth:`DiagnosedModel.to_python`.
+    """Return the source of a module with a class derived from the diagnosed class, see
+    :meth:`DiagnosedModel.to_python`.
 
     Args:
         system: the diagnosed simulation.
@@ -228,7 +229,10 @@ def _signed(expression: str) -> str:
 
 def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Return expressions of the quantities that an effect on a rate uses."""
-    known = {name: parameter if isinstance(parameter, Parameter) else Parameter(parameter) for name, parameter in system.parameters.items()}
+    known = {
+        name: parameter if isinstance(parameter, Parameter) else Parameter(parameter)
+        for name, parameter in system.parameters.items()
+    }
     position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
     zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
     return {

@@ -199,7 +199,8 @@ class DiagnosisPlot:
         return ax
 
     def separability(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
-        """Draw the share of each row's candidate that remains after a refit of the column's candidate: 0 is inseparable.
+        """Draw the share of each row's candidate that remains after a refit of the column's candidate: 0 is
+        inseparable.
 
         Args:
             most: of how many candidates at the most.

@@ -28,7 +28,7 @@ class ConstantForce(RateEffect):
 
     id = "constant_force"
     lower = -math.inf
-    gain = "push"
+    gain = "force"
     plot_axis = ""
     equation = "δẋ = γ"
     explanation = "A constant force acts."

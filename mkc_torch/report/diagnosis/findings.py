@@ -18,12 +18,12 @@ from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
     "acts_on",
-    "references_of",
     "driven_by",
     "finding_name",
     "grade",
     "inseparable",
     "label_name",
+    "references_of",
     "region",
     "rivals",
     "role",
@@ -154,7 +154,9 @@ def where(finding: Finding, clock: TimeFormat) -> str:
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
         >>> where(replace(finding, onset=61.1, event_times=(61.1, 77.8)), clock)
         'at 61.1 s and 77.8 s'
-        >>> switched = replace(finding, intervals=((8.0, 9.0), (34.0, 37.3)), evidence=(EvidenceResult("switched", True),))
+        >>> switched = replace(
+        ...     finding, intervals=((8.0, 9.0), (34.0, 37.3)), evidence=(EvidenceResult("switched", True),)
+        ... )
         >>> where(replace(switched, onset=6.2), clock)
         'first at 6.2 s, then intermittent, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
     """
@@ -220,7 +222,9 @@ def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
     """
     known = runs if len(runs) == len(shares) else [Run(0, "", k + 1) for k in range(len(shares))]
     order = sorted(range(len(shares)), key=lambda k: -shares[k])
-    sentences = [term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]]
+    sentences = [
+        term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]
+    ]
     more = len(shares) - len(sentences)
     each = ", ".join(sentences)
     return term("where.more_runs", runs=each, count=more) if more else each

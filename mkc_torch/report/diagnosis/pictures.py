@@ -74,7 +74,11 @@ def over_time(diagnosis: Diagnosis) -> str:
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the noise floor of each channel that is an output."""
-    return {fit.output: fit.noise_floor for fit in diagnosis.environment.goodness_of_fit if fit.output in diagnosis.traces.channels}
+    return {
+        fit.output: fit.noise_floor
+        for fit in diagnosis.environment.goodness_of_fit
+        if fit.output in diagnosis.traces.channels
+    }
 
 
 def numbered(diagnosis: Diagnosis) -> bool:

@@ -75,7 +75,9 @@ def _process_noise_evidence(diagnosis: Diagnosis) -> Iterator[str]:
     """State the evidence for process noise, and that no physics is significant."""
     known = [process for process in diagnosis.environment.process_noise if math.isfinite(process.log_likelihood_gain)]
     if known:
-        yield term("environment.process_noise_gain", nats=size(known[0].log_likelihood_gain), place=plain(known[0].place))
+        yield term(
+            "environment.process_noise_gain", nats=size(known[0].log_likelihood_gain), place=plain(known[0].place)
+        )
         if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
             yield term("environment.no_physics")
 

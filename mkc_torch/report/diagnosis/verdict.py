@@ -21,17 +21,19 @@ __all__ = [
     "Tone",
     "apply_command",
     "headline",
-    "unexplained_place",
-    "unexplained",
-    "reasons",
     "notices_first",
+    "reasons",
     "to_do",
     "tone",
+    "unexplained",
+    "unexplained_place",
     "warned",
 ]
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed structure."""
+"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
+structure.
+"""
 
 
 def tone(diagnosis: Diagnosis) -> Tone:

@@ -14,9 +14,9 @@ from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
-    "input_hold_sentence",
     "explained",
     "goodness_of_fit_table",
+    "input_hold_sentence",
     "noise_lines",
     "offset_sentences",
     "output_lines",
@@ -29,7 +29,11 @@ _MOST_OUTPUTS = 6
 _STILL = 2.0
 """Variation, in noise floors, up to which an output hardly varies."""
 _MOST_DECIMALS = 4
-_SOURCES = {"declared": "environment.declared", "samples": "environment.samples", "quantisation": "environment.quantisation"}
+_SOURCES = {
+    "declared": "environment.declared",
+    "samples": "environment.samples",
+    "quantisation": "environment.quantisation",
+}
 _BETWEEN = {"held": "environment.held", "linear": "environment.linear", "smooth": "environment.smooth"}
 
 
@@ -149,11 +153,18 @@ def process_noise_table(environment: NoiseEnvironment) -> Table | None:
             term("environment.rate_of", place=plain(process.place)) if process.at_rate else plain(process.place),
             measured(process.size, process.standard_error, tidy(process.unit))[0],
             f"{process.correlation_time:.3g} s" if process.correlation_time > 0.0 else term("unit.sample"),
-            size(process.log_likelihood_gain) if math.isfinite(process.log_likelihood_gain) else term("number.not_known"),
+            size(process.log_likelihood_gain)
+            if math.isfinite(process.log_likelihood_gain)
+            else term("number.not_known"),
         )
         for process in environment.process_noise
     )
-    columns = (term("table.process_noise"), term("table.standard_deviation"), term("table.lasts"), term("table.without"))
+    columns = (
+        term("table.process_noise"),
+        term("table.standard_deviation"),
+        term("table.lasts"),
+        term("table.without"),
+    )
     return Table(term("section.process_noise"), columns, rows, term("environment.process_noise_note"))
 
 

@@ -31,7 +31,9 @@ def difference_sentences(found: Differences) -> list[str]:
 
     Example:
         >>> difference = Difference("offset x", "µT", 12.5, 12.0, 0.25)
-        >>> difference_sentences(Differences("old", (difference,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0].partition(",")
+        >>> difference_sentences(Differences("old", (difference,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0].partition(
+        ...     ","
+        ... )
         ('No significant difference: offset x differs most', ',', ' by +2.0 combined standard errors ...')
     """
     return [
@@ -54,7 +56,10 @@ def _verdict(found: Differences) -> str:
     if not found.beyond:
         largest = max(found.known, key=lambda difference: abs(difference.in_errors))
         return term("comparison.same", what=largest.name, errors=_signed(largest.in_errors), limit=f"{found.limit:.2f}")
-    named = [term("comparison.number", what=difference.name, errors=_signed(difference.in_errors)) for difference in found.beyond[:_NAMED]]
+    named = [
+        term("comparison.number", what=difference.name, errors=_signed(difference.in_errors))
+        for difference in found.beyond[:_NAMED]
+    ]
     if len(found.beyond) > _NAMED:
         named.append(term("comparison.more", count=len(found.beyond) - _NAMED))
     return term("comparison.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=share(LEVEL))
@@ -63,8 +68,8 @@ def _verdict(found: Differences) -> str:
 def _groups(numbers: Sequence[Difference]) -> list[list[Difference]]:
     """Group offset and matrix; each has a common power of ten."""
     groups: dict[str, list[Difference]] = {}
-    for number in numbers:
-        groups.setdefault(number.name.split()[0], []).append(number)
+    for difference in numbers:
+        groups.setdefault(difference.name.split()[0], []).append(difference)
     return list(groups.values())
 
 

@@ -155,7 +155,7 @@ def test_names_of_what_is_hidden():
     assert counts(scored.named_undisturbed) == (0, 4)
     assert counts(scored.wrong) == (1, 6)
     assert counts(scored.nearest) == (1, 6)
-    assert counts(scored.useful_unfit) == (2, 7)  # with z of at least ten, told from its rivals or not
+    assert counts(scored.useful_unfit) == (2, 7)  # with z of at least ten, separable from its rivals or not
     assert scored.false_alarms.total == 0
 
 

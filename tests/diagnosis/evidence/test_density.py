@@ -69,7 +69,7 @@ def test_a_student_t_is_warned_of_with_its_freedom(freedom, seed):
     (sentence,) = warned(student(seed, freedom))
     assert "does not describe the residuals of channel_0" in sentence
     assert f"a Student-t with {freedom:g} degrees of freedom" in sentence
-    assert sentence.endswith("A misfit of the tail must not be read as physics.")
+    assert sentence.endswith("A misfit of the tail is not evidence of physics.")
 
 
 def test_distances_are_told_whether_or_not_there_is_a_warning():

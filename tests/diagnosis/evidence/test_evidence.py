@@ -138,7 +138,9 @@ def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
     random = torch.random.get_rng_state()
     again = run_tests(case, done)
     assert [result.rows for result in everything(again)] == [result.rows for result in everything(answers)]
-    assert [_json(result.keys) for result in everything(again)] == [_json(result.keys) for result in everything(answers)]
+    assert [_json(result.keys) for result in everything(again)] == [
+        _json(result.keys) for result in everything(answers)
+    ]
     assert again.warnings == answers.warnings
     assert torch.equal(torch.random.get_rng_state(), random)
     assert before

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, as_result
+from mkc_torch.diagnosis.evidence.extrapolation import as_result, extrapolated
 from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel

@@ -53,7 +53,7 @@ def beside(fits):
     found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
 
     def without(*evidence):
-        return held_out_gain.beside_the_others(EvidenceContext(none, None, found, evidence, blocks, (), 0, Settings()))
+        return held_out_gain.without_finding(EvidenceContext(none, None, found, evidence, blocks, (), 0, Settings()))
 
     return without, [held_out(fit, blocks) for fit in fits]
 

@@ -30,7 +30,7 @@ def said(term, stretch):
 def test_it_is_named_with_its_times(effect, driver, name):
     text = said(Term(EFFECTS[effect], driver, {}), (20, 40))
     assert text.value == pytest.approx((2.0, 3.9))
-    assert text.warnings[0].startswith(f"From 2.0 to 3.9 s the recording is off as {name} would have it")
+    assert text.warnings[0].startswith(f"From 2.0 to 3.9 s the residual fits {name}")
 
 
 def test_of_what_is_everywhere_and_of_nothing_there_is_no_warning():

@@ -79,7 +79,7 @@ def test_where_the_simulation_alone_loses_the_recording_all_is_told_under_pushes
     as_it_is(open_loop_evidence(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
 
 
-@pytest.mark.parametrize("lost", [("freed", "_from_alone"), ("_judged",)])
+@pytest.mark.parametrize("lost", [("refit_open_loop", "_from_alone"), ("_judged",)])
 def test_where_a_finding_loses_the_recording_or_an_unseen_block_all_is_told_under_pushes(monkeypatch, lost):
     base, one = under_pushes()
     alone, found = refit_open_loop(base), (one,)

@@ -77,7 +77,7 @@ def test_a_diagnosis_tells_it_and_stays_as_it_was():
         for sensor in (0.0 * slow, slow)
     )
     (row,) = (row for said in white.evidence for row in said.rows)
-    assert (row.label, row.text) == ("left over", "white")
+    assert (row.label, row.text) == ("residual", "white")
     (row,) = (row for said in coloured.evidence for row in said.rows)
     assert row.text.startswith("correlated up to 0.")
     assert row.text.endswith(" s")

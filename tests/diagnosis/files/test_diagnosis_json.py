@@ -57,7 +57,8 @@ def test_diagnoses_of_every_size_are_written(findings, channels):
 
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
-        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "goodness_of_fit", "reasons", "noise",
+        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "goodness_of_fit", "reasons",
+        "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
     }  # fmt: skip
     assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
@@ -125,11 +126,11 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     made = make_diagnosis(1)
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     tails = (ChannelTails(31.5, 0.041, 0.006),)
-    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", tails=tails)
-    stored = written(with_evidence(dataclasses.replace(made, noise=noise), density.as_result([check], EvidenceSettings())))[
-        "noise"
-    ]
-    assert (stored["unit"], stored["units"]) == ("µT", {"wander": "µT"})
+    noise = dataclasses.replace(made.noise, units={"drift": "µT"}, unit="µT", tails=tails)
+    stored = written(
+        with_evidence(dataclasses.replace(made, noise=noise), density.as_result([check], EvidenceSettings()))
+    )["noise"]
+    assert (stored["unit"], stored["units"]) == ("µT", {"drift": "µT"})
     assert stored["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
     assert stored["density_check"] == [
         {
@@ -144,7 +145,9 @@ def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order(
         "my_test",
         content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
     )
-    made = with_evidence(with_finding(make_diagnosis(1), said, onset.as_result((1.0, 2.0)), intermittency.as_result(True)), said)
+    made = with_evidence(
+        with_finding(make_diagnosis(1), said, onset.as_result((1.0, 2.0)), intermittency.as_result(True)), said
+    )
     content = written(made)
     held_out = {
         "log_likelihood_gain": 0.1,

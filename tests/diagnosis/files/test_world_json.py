@@ -16,10 +16,10 @@ from tests.diagnosis.factory import (
     PUSHED,
     graded,
     make_diagnosis,
+    make_environment,
     make_follows,
     make_forcing,
     make_unfit,
-    make_environment,
     nearest,
     with_evidence,
 )
@@ -98,7 +98,8 @@ def test_lists_of_a_forcing_go_together():
 def test_what_remains_is_white_or_correlated_up_to_a_lag():
     stored = written(with_evidence(pushed(), WHITENESS))["remaining"]
     assert stored == {
-        "white": False, "largest_lag": 0.7, "unit": "s", "channels": ["angle"], "disturbed_states": ["rate"], "smooth_along": [],
+        "white": False, "largest_lag": 0.7, "unit": "s", "channels": ["angle"], "disturbed_states": ["rate"],
+        "smooth_along": [],
     }  # fmt: skip
 
 
@@ -120,7 +121,8 @@ def test_an_adequate_simulation_lacks_nothing_that_counts():
 
 def test_grades_shapes_and_sizes_of_each_output_are_written():
     held = HeldOut(
-        0.3, (0.2, 0.4), 0.9, 0.5, "", {"angle": ResidualSizes(0.2, 0.1, "rad"), "speed": ResidualSizes(math.inf, 2.0, "rad/s")},
+        0.3, (0.2, 0.4), 0.9, 0.5, "",
+        {"angle": ResidualSizes(0.2, 0.1, "rad"), "speed": ResidualSizes(math.inf, 2.0, "rad/s")},
         (DivergedBlock(7, before=True, after=False),), 25,
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)

@@ -9,7 +9,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
-from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_unfit, make_environment, nearest, with_evidence
+from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_environment, make_unfit, nearest, with_evidence
 
 
 def advised(findings=1, *, alternatives=(), **changes):
@@ -91,15 +91,18 @@ def test_what_pushes_a_state_is_looked_for_and_counted_on():
     assert only.startswith("Look for the cause of the disturbance of the rate of `rate`")
     assert "use 0.23 rad/s² as the process noise" in only
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
-    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))).advice
-    assert only.startswith("Find out what moves the sensor of `angle` slowly")
+    (only,) = make_diagnosis(
+        0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))
+    ).advice
+    assert only.startswith("Look for a cause of the drift of `angle`")
 
 
 def test_a_step_and_a_drift_are_told_apart_by_another_recording():
     drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     sentence = advised(1, alternatives=(drift,))[0]
     assert sentence == (
-        "To distinguish hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
+        "To distinguish hard_iron_step from offset_drift, record again: a step does not come at the same moment "
+        "again; a "
         "warm-up comes again after a cold start."
     )
     assert "hold the other" not in sentence
@@ -108,7 +111,8 @@ def test_a_step_and_a_drift_are_told_apart_by_another_recording():
 def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
     current = Alternative("current_field", ("current",), 0.4, False)
     assert advised(1, alternatives=(current,))[0] == (
-        "To distinguish hard_iron_step from current_field (current), record again: a step does not come at the same moment "
+        "To distinguish hard_iron_step from current_field (current), record again: a step does not come at the same "
+        "moment "
         "again; let current change at other times."
     )
 

@@ -1,4 +1,6 @@
-"""The disturbance of a simulation that nobody recorded: its size, its course with a band, and what it goes along with."""
+"""The disturbance of a simulation that nobody recorded: its size, its course with a band, and what it goes along
+with.
+"""
 
 import functools
 import math
@@ -51,7 +53,13 @@ def test_a_push_of_a_rate_has_its_unit_and_one_of_an_output_that_of_the_output()
     prepared = Pendulum().prepare(swung("white", 1)[0])
     noise = noise_of(TRUTH["slow"], WANDER, errors=(0.2, 0.05), gains=(311.0, 12.0))
     rate, angle = process_noise_of(prepared, noise)
-    assert (rate.place, rate.at_rate, rate.correlation_time, rate.size, rate.log_likelihood_gain) == ("rate", True, 1.0, 0.3, 311.0)
+    assert (rate.place, rate.at_rate, rate.correlation_time, rate.size, rate.log_likelihood_gain) == (
+        "rate",
+        True,
+        1.0,
+        0.3,
+        311.0,
+    )
     assert rate.unit == prepared.ports["rate of rate"].unit == "rad/s/s"
     assert (angle.place, angle.at_rate, angle.unit, angle.log_likelihood_gain) == ("angle", False, "rad", 12.0)
     # errors are of the logarithm

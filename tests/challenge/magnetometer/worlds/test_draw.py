@@ -63,7 +63,7 @@ def test_a_drift_has_its_declared_size():
         still = [process.sample(generator(seed, k), 2000) for k, process in enumerate(walking.walks)]
         reach += [float((path - path.mean()).square().mean().sqrt()) / noise.sigma / far for path in still]
     assert math.sqrt(sum(r * r for r in reach) / len(reach)) == pytest.approx(1.0, abs=0.12)
-    # slow: what it does from sample to sample is small beside the noise
+    # slow: what it does from sample to sample is small compared with the noise
     steps = axis_errors(generator(2), walking, 2000).diff(dim=0)
     plain = axis_errors(generator(2), noise, 2000).diff(dim=0)
     assert float((steps - plain).std()) < 0.5 * float(plain.std())
