@@ -24,7 +24,7 @@ from mkc_torch.nonlinear import NoFitError, fit
 from mkc_torch.simulation import Parameter
 from tests.docs.pages import ROOT
 from tests.recording.test_bad_input import BAD
-from tests.recording.test_strange_files import FIELD, LINES, OTHER, PLAIN, SAME, TIME, TOLD, table
+from tests.recording.test_strange_files import FIELD, LINES, OTHER, PLAIN, REPORTED, SAME, TIME, table
 
 PAGE = ROOT / "docs" / "bad_inputs.md"
 
@@ -51,7 +51,7 @@ class WrongAnswerError(Exception):
 
 
 def mkc(folder: Path, *arguments: str, exit_codes: tuple[int, ...] = (1, 2)) -> str:
-    """What a command says of its arguments, of which those that begin with @ are files of the folder."""
+    """The message of a command for its arguments; those that begin with @ are files of the folder."""
     there = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     given = [str(folder / item[1:]) if item.startswith("@") else item for item in arguments]
     done = CliRunner().invoke(app, given)
@@ -98,7 +98,7 @@ def of_file(name: str, content: bytes | str, *options: str) -> Callable[[Path], 
 
 
 def repaired(kind: str) -> Callable[[Path], str]:
-    """What is told of text that is read all the same."""
+    """The warning for text that is read all the same."""
 
     def said(folder: Path) -> str:
         content = SAME[kind]
@@ -106,7 +106,7 @@ def repaired(kind: str) -> Callable[[Path], str]:
         recording = Recording.read(folder / "rec.csv")
         if not recording.magnetometer().isfinite().all():
             raise WrongAnswerError(f"{kind}: {recording}")
-        return next(sentence for sentence in recording.warnings if TOLD[kind] in sentence)
+        return next(sentence for sentence in recording.warnings if REPORTED[kind] in sentence)
 
     return said
 
@@ -232,8 +232,8 @@ def bad_inputs() -> Iterator[Bad]:
     yield Bad("Text", "eight samples", of_file("rec.csv", "\n".join(LINES[:9])))
     yield Bad("Text", "a sensor that does not turn", of_file("rec.csv", table("mx,my,mz", *([[9.0] * 99] * 3))))
     yield Bad("Text", "an axis that is stuck", of_file("rec.csv", table("mx,my,mz", *FIELD.T[:2], [7.0] * len(TIME))))
-    for kind in TOLD:
-        yield Bad("Text that is read, and what is told", kind, repaired(kind))
+    for kind in REPORTED:
+        yield Bad("Text that is read, and the warning", kind, repaired(kind))
     for ending in LOGS:
         yield Bad("Logs", f"text called `{ending}`", of_file(f"log{ending}", PLAIN))
     yield Bad("Logs", "an empty log", of_file("log.ulg", b""))

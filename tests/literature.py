@@ -2,7 +2,7 @@
 
 Values of R are from robustbase 0.99-6; the others were computed independently in float64 (exhaustive subsets, an exact
 linear program, quadrature in many digits) and agree with R where it prints them. Coefficients: the intercept first.
-They hold to a relative 1e-5 unless a comment says otherwise.
+They hold to a relative 1e-5 unless a comment states another.
 """
 
 from __future__ import annotations

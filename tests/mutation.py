@@ -143,7 +143,7 @@ class Reach(NamedTuple):
 
 
 class _Recorder:
-    """A plugin of pytest that tells coverage which test runs; what a fixture runs, every test of its file may need."""
+    """A pytest plugin that reports the running test to coverage; every test of a file may need what its fixtures run."""
 
     def __init__(self, coverage: Any) -> None:
         self.coverage = coverage
@@ -239,7 +239,7 @@ def _in_a_fork(task: Callable[[], int]) -> int:
 
 
 def go_to_a_copy(package: Path) -> None:
-    """Copy what the tests need, compiled by content: a file changed twice in a second is compiled anew."""
+    """Copy what the tests need, compiled by content: a file changed twice in a second is compiled again."""
     for name in ("mkc_torch", "tests", "pyproject.toml"):
         (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, package / name)
     by_content = py_compile.PycInvalidationMode.CHECKED_HASH

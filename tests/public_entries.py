@@ -34,7 +34,7 @@ class Entry:
         names: what is public of it, by module.
         call: what is asked of it.
         arguments: that fit; those of ``fixed`` stay as they are.
-        passes: arguments of which NaN goes through, as the docstring says, or that the user's own function is given.
+        passes: arguments of which NaN goes through, by the docstring, or that the user's own function is given.
     """
 
     names: tuple[str, ...]
@@ -286,7 +286,7 @@ def contaminated(value: Any) -> Iterator[tuple[str, Any]]:
     yield "text", "contaminated"
     yield "object", object()
     if isinstance(value, Tensor):
-        yield from _spoilt_tensors(value)
+        yield from _corrupted_tensors(value)
     elif isinstance(value, (int, float)):
         whole = isinstance(value, int)
         numbers = (NAN, INF, -INF, -1, 0, 1e308, 1e-308, 10**400, 1j, True)
@@ -294,7 +294,7 @@ def contaminated(value: Any) -> Iterator[tuple[str, Any]]:
         yield "half", value + 0.5 if whole else torch.tensor([[value]] * 3)
 
 
-def _spoilt_tensors(value: Tensor) -> Iterator[tuple[str, Any]]:
+def _corrupted_tensors(value: Tensor) -> Iterator[tuple[str, Any]]:
     yield "None", None
     if not value.is_floating_point():
         yield "negative", -1 - value

@@ -14,7 +14,7 @@ def case():
     return next(strong_cases("gravity_sag", 11, 60))
 
 
-def says(folder, key, *effects):
+def check_score(folder, key, *effects):
     (folder / key.name).mkdir(exist_ok=True)
     findings = [{"effect": effect, "grade": "left_out", "channels": ["angle"]} for effect in effects]
     reported = {"verdict": "explained", "p_value": 0.01, "findings": findings}
@@ -39,9 +39,9 @@ def test_an_effect_that_no_system_hides_has_no_recordings():
 
 def test_its_name_is_right_and_another_is_not(case, tmp_path):
     for effect, right in (("gravity_sag", True), ("backlash", False)):
-        says(tmp_path, case.key, effect)
+        check_score(tmp_path, case.key, effect)
         assert score_case(case.key, tmp_path) == (right, f"explained: {effect} at angle")
-    says(tmp_path, case.key)
+    check_score(tmp_path, case.key)
     assert score_case(case.key, tmp_path) == (False, "explained: no name")
 
 
@@ -50,7 +50,7 @@ def test_the_table_counts_names_and_an_earlier_diagnosis_is_kept(case, tmp_path,
 
     def diagnosed(paths, folder):
         asked.extend(paths)
-        says(folder, case.key, "gravity_sag")
+        check_score(folder, case.key, "gravity_sag")
 
     monkeypatch.setattr(each_effect, "diagnose_dynamics", diagnosed)
     for _ in range(2):

@@ -115,7 +115,7 @@ def test_another_effect_claimed_first_is_wrong():
 
 def test_air_drag_that_would_explain_is_right_and_silence_is_wrong():
     coast = CASES["cases coastdown runs Coast"]
-    stated = "quadratic_drag would explain what is left best, but noise and pushes make as much of it by chance."
+    stated = "quadratic_drag would explain what is left best, but noise makes as much of it by chance."
     assert judged(row(verdict="adequate", sentences=[stated]), coast)["right"]
     assert not judged(row(verdict="adequate", sentences=["Use the simulation as it is."]), coast)["right"]
     assert judged(row(drag(0.0006, 1e-4)), coast)["right"]

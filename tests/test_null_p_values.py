@@ -14,7 +14,7 @@ from tests.gate.null_recordings import KINDS, NOISE, SAMPLES, STEP, Spring, reco
 
 
 def courses(kind, part, count=300):
-    """(T, count) of what the sensor adds (0), or what pushes (1)."""
+    """(T, count) of what the sensor adds (0), or the process noise (1)."""
     return np.stack([KINDS[kind][part](np.random.default_rng([7, k])) for k in range(count)], -1)
 
 
@@ -42,16 +42,16 @@ def test_what_the_sensor_adds_is_of_its_kind():
 
 
 def test_disturbances_are_white_or_correlated():
-    anew, lasting = (courses(kind, 1) for kind in ("process noise, white", "process noise, lasting"))
-    assert abs(alike(anew, 1)) < 0.03
+    white, lasting = (courses(kind, 1) for kind in ("process noise, white", "process noise, lasting"))
+    assert abs(alike(white, 1)) < 0.03
     samples = null_recordings.LASTING_SHARE * SAMPLES
     assert alike(lasting, 40) == pytest.approx(np.exp(-40.0 / samples), abs=0.1)
     assert not courses("white", 1, 2).any()
 
 
-def moved(held, force, push=None):
-    push = np.zeros(SAMPLES) if push is None else push
-    return null_recordings._moved(force, push, held, np.array([0.2, -0.1]))
+def moved(held, force, disturbance=None):
+    disturbance = np.zeros(SAMPLES) if disturbance is None else disturbance
+    return null_recordings._moved(force, disturbance, held, np.array([0.2, -0.1]))
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -68,8 +68,8 @@ def test_the_true_course_is_that_of_scipy(held):
 def test_a_disturbance_exceeds_the_measurement_noise():
     force = np.zeros(SAMPLES)
     for kind in ("process noise, white", "process noise, lasting"):
-        push = KINDS[kind][1](np.random.default_rng(2))
-        assert (moved(False, force, push) - moved(False, force)).std() > 2.0 * NOISE
+        disturbance = KINDS[kind][1](np.random.default_rng(2))
+        assert (moved(False, force, disturbance) - moved(False, force)).std() > 2.0 * NOISE
 
 
 def test_numbers_are_those_of_scipy():
@@ -112,7 +112,7 @@ def test_the_command_writes_table_picture_and_p_values_and_goes_on(tmp_path, mon
 
 @pytest.mark.e2e
 def test_the_p_value_is_that_of_a_diagnosis_that_keeps_what_it_finds():
-    """So that the table says something about `mkc diagnose`."""
+    """The table is then valid for `mkc diagnose`."""
     from mkc_torch import diagnose
 
     empty = recording("white", 5)

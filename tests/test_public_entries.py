@@ -23,7 +23,7 @@ ROOMS = ("covariance", "density", "functional", "linear", "losses", "metrics", "
 
 ELSEWHERE = {
     "functional.KAPPA_MAX": "a number",
-    "functional.energy": "a part of mkc_energy that looks at nothing, as its module says",
+    "functional.energy": "a part of mkc_energy that looks at nothing, by its module",
     "functional.inverse_square": "likewise",
     "functional.log_partition": "likewise, of log_normalizer",
     "linear.NotFittedError": "an error",
@@ -60,13 +60,13 @@ def tensors(value: Any) -> Iterator[Tensor]:
 
 
 def outcome(entry: Entry, argument: str, value: Any) -> str:
-    """What is wrong with a call that has one argument replaced: an error that says too little, or a NaN; else empty."""
+    """What is wrong with a call that has one argument replaced: an error that is too short, or a NaN; else empty."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # our own, of a tail beyond the bound and the like
             answer = entry.call(**{**entry.arguments, argument: value})
     except (ValueError, TypeError, NoFitError) as error:
-        return "" if len(str(error)) >= 30 else f"{error!r} says too little"
+        return "" if len(str(error)) >= 30 else f"{error!r} is too short"
     except Exception as error:
         return f"{error!r} is none of ours"
     return "NaN" if any(tensor.isnan().any() for tensor in tensors(answer)) else ""

@@ -35,6 +35,6 @@ def google(text: str) -> str:
 
 def _each(entry: re.Match[str]) -> str:
     """An entry of several names as one of each, all with its text."""
-    told = entry[2].rstrip("\n")
-    entries = "\n".join(f"    {name}:{told}" for name in entry[1].split(", "))
-    return entries + entry[2][len(told) :]
+    entry_text = entry[2].rstrip("\n")
+    entries = "\n".join(f"    {name}:{entry_text}" for name in entry[1].split(", "))
+    return entries + entry[2][len(entry_text) :]

@@ -40,7 +40,7 @@ def _coast(noise: float) -> ByHand:
 _MODE = {("hidden_mode", "share"): 0.833, ("hidden_mode", "period"): 0.1405, ("hidden_mode", "damping"): 0.0224}
 _LIGHT = ("Baseball", "Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
 _LIGHTER = ("Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2")
-_PUSH = "no physics: an unrecorded force"
+_FORCE = "no physics: an unrecorded force"
 
 BY_HAND: Mapping[str, ByHand] = {
     "real house house_1 House": ByHand("a second thermal mass"),
@@ -77,9 +77,9 @@ BY_HAND: Mapping[str, ByHand] = {
         "free convection", {("power_law", "exponent"): 1.5}, {"loss": 0.05}, {"temp": 0.15}
     ),
     "cases gear_motor runs GearMotor": ByHand("dry friction"),
-    "cases simulated/pushed_slowly run Pendulum": ByHand(_PUSH),
-    "cases simulated/pushed_white run Pendulum": ByHand(_PUSH),
-    "cases simulated/gusts run Pendulum": ByHand(_PUSH),
+    "cases simulated/pushed_slowly run Pendulum": ByHand(_FORCE),
+    "cases simulated/pushed_white run Pendulum": ByHand(_FORCE),
+    "cases simulated/gusts run Pendulum": ByHand(_FORCE),
     "cases simulated/unrelated run Pendulum": ByHand("all: the output is unrelated"),
     "cases simulated/held_input run UpsideDown": ByHand("gravity's sign is wrong"),
     **{f"data falling_balls {name} Ball": ByHand("air drag") for name in (*_LIGHT, *_LIGHTER)},

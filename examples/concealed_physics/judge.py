@@ -34,13 +34,13 @@ def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
         wrong.append(f"the verdict is {stated.verdict}, not {' or '.join(expected.verdicts)}")
     if stated.verdict == "failed":
         wrong = [f"no diagnosis: {row.get('failed') or 'no reason given'}"]
-    elif not (expected.phrases and _says(row, expected.phrases)):
+    elif not (expected.phrases and _contains(row, expected.phrases)):
         wrong += _wrong_names(stated, expected) + _wrong_sizes(row, expected.sizes)
         wrong += _wrong_residuals(row["residual_after"], expected.residual)
     return {"right": not wrong, "wrong": wrong}
 
 
-def _says(row: Mapping[str, Any], words: Sequence[str]) -> bool:
+def _contains(row: Mapping[str, Any], words: Sequence[str]) -> bool:
     return any(all(word in sentence for word in words) for sentence in row["sentences"])
 
 

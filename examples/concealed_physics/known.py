@@ -164,11 +164,11 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
 
 def _simulated(folder: Path) -> Iterator[Known]:
     """Six runs of a driven pendulum: nothing missing, with a disturbance, or not explained by the simulation."""
-    adequate, pushed, unfit = Expected(verdicts=("adequate",)), Expected(verdicts=("unexplained",)), ("unfit",)
+    adequate, disturbed, unfit = Expected(verdicts=("adequate",)), Expected(verdicts=("unexplained",)), ("unfit",)
     for name in ("held_input", "linear_input"):
         yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", adequate)
     for name in ("pushed_slowly", "pushed_white", "gusts"):
-        yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", pushed)
+        yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", disturbed)
     yield _known(folder, "simulated/unrelated", "run.csv", "Pendulum", Expected(verdicts=unfit))
     yield _known(folder, "simulated/held_input", "run.csv", "UpsideDown", Expected(verdicts=unfit))
 

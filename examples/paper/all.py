@@ -7,7 +7,7 @@
 
 Each script runs on its own and what it prints is kept in FOLDER/NAME.txt. ``--small`` takes few draws: tens of minutes
 become a few. The scripts on a magnetometer need the two recordings (BROAD data set, trials 28 and 02, as
-tables); without them they are left out, with a line that says so. The exit code is 1 if a script fails.
+tables); without them they are left out, with a line. The exit code is 1 if a script fails.
 """
 
 from __future__ import annotations

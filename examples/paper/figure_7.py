@@ -1,4 +1,4 @@
-"""Figure 7 of Li et al. (2023) on a public recording: norm, and ellipsoids of six estimators, beside a magnet.
+"""Figure 7 of Li et al. (2023) on a public recording: norm, and ellipsoids of six estimators, near a magnet.
 
     python examples/paper/figure_7.py broad_28_stationary_magnet.csv broad_02_undisturbed.csv --output figure_7.png
 

@@ -111,7 +111,7 @@ def main() -> None:
     lms = LeastMedianOfSquares().fit(X, y).coef_
     r = y - X @ lms
     table.add_row(
-        "LMS, beside it",
+        "LMS, for comparison",
         ", ".join(f"{v:.4f}" for v in lms.tolist()),
         f"{float(r.square().median()):.4f}",
         f"{float(entropy_like(r)):.6f}",

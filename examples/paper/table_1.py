@@ -131,7 +131,7 @@ def show_times(console: Console, Y: dict[int, Tensor], single: int) -> None:
 
 
 def show_case_6(console: Console, draws: int, generator: torch.Generator) -> None:
-    """What case 6 may have been: the outliers it prints move WLS four times as far as its table says."""
+    """What case 6 may have been: the outliers it prints move WLS four times as far as its table has it."""
     first, second = CASES[6]
     tried: dict[str, Case] = {
         "as printed: 40 % on [0, 10], 20 % on [0, 20]": (first, second),

@@ -44,7 +44,7 @@ _speculative_copies: list[Future[dict[int, bytes]]] = []
 
 
 def allow_copies(most: int | None = None) -> None:
-    """Let work be shared by all cores from now on, or by this process and ``most`` forked copies.
+    """Share work among all cores from now on, or among this process and ``most`` forked copies.
 
     Only for commands in which torch uses one thread from the start: torch's threads and a GPU do not survive a fork.
     Nothing is forked on systems other than Linux.

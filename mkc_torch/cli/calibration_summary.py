@@ -13,7 +13,7 @@ from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.differences import Differences
 from mkc_torch.report.words import numbers as w
-from mkc_torch.report.words.beside import difference_rows, difference_sentences
+from mkc_torch.report.words.comparison import difference_rows, difference_sentences
 
 
 def show(

@@ -149,7 +149,7 @@ def _run_scenarios(
     from mkc_torch._parallel.processes import cores, keep_memory, one_thread
     from mkc_torch.challenge.scenarios import run
     from mkc_torch.cli.challenge_jobs import diagnose_in_scenario
-    from mkc_torch.cli.worlds_summary import show_scenarios
+    from mkc_torch.cli.scenarios_summary import show_scenarios
 
     family_scenarios = _scenarios(family, duration)
     per_scenario = run.PER_SCENARIO if per_scenario is None else per_scenario

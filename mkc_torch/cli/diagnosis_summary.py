@@ -12,8 +12,8 @@ from rich.text import Text
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.report.diagnosis import environment, noise, numbers, unseen
 from mkc_torch.report.diagnosis import findings as sentences
-from mkc_torch.report.diagnosis import noise, numbers, unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import rows
 
@@ -54,14 +54,14 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
 def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     """Yield the goodness of fit, the noise, the findings, and the unexplained rest."""
     d = diagnosis
-    for line in world.output_lines(d):
+    for line in environment.output_lines(d):
         yield term("label.follows"), line
     if d.verdict == "unfit":
         for reason in top.reasons(d):
             yield _striking("label.why"), reason
         yield term("label.named"), term("environment.nothing_named")
         return
-    for line in world.noise_lines(d) or [noise.noise_model(d.noise)]:
+    for line in environment.noise_lines(d) or [noise.noise_model(d.noise)]:
         yield term("label.noise"), line
     yield term("label.named"), _named(d.findings)
     yield term("label.unexplained"), top.unexplained_place(d) or term("environment.nothing")
@@ -131,7 +131,7 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if smooth and d.verdict != "unfit":
         yield term("label.compare"), smooth
     if d.verdict != "unfit":
-        if world.noise_lines(d):
+        if environment.noise_lines(d):
             yield term("label.sensor"), noise.noise_model(d.noise)
         yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):

@@ -106,7 +106,9 @@ def checked_input_hold(input_hold: object, inputs: Sequence[str]) -> dict[str, s
         {'torque': 'held'}
     """
     found = {}
-    for name, hold in _of_known("input_hold", input_hold, inputs, "inputs in the equations", '{"torque": "held"}').items():
+    for name, hold in _of_known(
+        "input_hold", input_hold, inputs, "inputs in the equations", '{"torque": "held"}'
+    ).items():
         if not isinstance(hold, str) or hold not in BETWEEN:
             raise ValueError(
                 f"Expected argument `input_hold` of `{name}` to be one of {', '.join(BETWEEN)} but got {hold!r}."

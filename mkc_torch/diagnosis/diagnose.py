@@ -15,8 +15,8 @@ from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.arguments import (
     check_limits,
     check_numbers,
-    checked_input_hold,
     checked_effects,
+    checked_input_hold,
     checked_noise,
     refuse_no_settings,
     refuse_no_simulation,

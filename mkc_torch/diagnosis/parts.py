@@ -182,7 +182,7 @@ class DriverShift:
 class Alternative:
     """Another candidate for a finding: by how many nats it is less likely, and whether the recording separates the two.
 
-    ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` says whether it recurs in
+    ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` states whether it recurs in
     another recording. ``distinguishing_state`` is what to record to distinguish it from the finding, if the recording
     does not.
     """
@@ -230,7 +230,7 @@ class Finding:
     ``experiments`` has each run's share of the gain; empty for a single run.
     ``event_times`` are the times in s at which an effect with several onsets sets in; the first is its onset.
     ``references`` are the reference values of the drivers in the equation.
-    ``advice`` is what to do about the finding; ``recurrence`` says whether it recurs in another recording.
+    ``advice`` is what to do about the finding; ``recurrence`` states whether it recurs in another recording.
     ``location_specific`` effects belong to the place or the attitude of this recording.
     ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
     ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its

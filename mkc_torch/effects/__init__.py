@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from mkc_torch.effects.base import Effect, GainEffect, in_words
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import lagged, played
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.dynamics.rate import beyond
 from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
@@ -23,6 +22,7 @@ from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
 from mkc_torch.effects.share import soft_clip
+from mkc_torch.effects.waveforms import lagged, played
 
 __all__ = [
     "ATTITUDE",

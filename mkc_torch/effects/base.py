@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NoReturn
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import outer_product, per
 from mkc_torch.effects.kinds import kind_at
+from mkc_torch.effects.waveforms import outer_product, per
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -1,5 +1,5 @@
 """The former module of :func:`lagged`, for generated files that import it; it is in :mod:`mkc_torch.effects`."""
 
-from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.waveforms import lagged
 
 __all__ = ["lagged"]

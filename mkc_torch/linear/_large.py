@@ -153,7 +153,7 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
         end is None
         or end.curvature_sums is None
         or _d_is_at_its_least(end, fit_state)
-        or _gaussian_is_likelier(rows, fit_state, end, slopes.grams)
+        or _gaussian_is_more_likely(rows, fit_state, end, slopes.grams)
     ):
         return None
     return _result(rows, fit_state, end, end.curvature_sums, weights)
@@ -296,7 +296,7 @@ def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n
     return found.curvature
 
 
-def _gaussian_is_likelier(rows: Rows, fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
+def _gaussian_is_more_likely(rows: Rows, fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
     if not (fit_state.free_kappa and fit_state.free_d) or not bool((end.place.point.kappa > 0).any()):
         return False

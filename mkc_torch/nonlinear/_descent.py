@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear._alone import descend_single, is_single
 from mkc_torch.nonlinear._problem import NONLINEAR, Descent, Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, model_curvature, objective, positive, quadratic_about
+from mkc_torch.nonlinear._single_problem import descend_single, is_single
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -18,8 +18,8 @@ from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, check
 from mkc_torch.nonlinear._alternate import AlternatingMaximum, alternate, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepare, refuse_out_of_reach
 from mkc_torch.nonlinear._covariance import parameter_covariance
-from mkc_torch.nonlinear._explained import explained
-from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
+from mkc_torch.nonlinear._explained_share import explained
+from mkc_torch.nonlinear._graduated_start import LEAST_SCALE, graduated, residual_scale
 from mkc_torch.nonlinear._problem import Constraint, Problem, ProblemPoint, kernel_weights, shaped_jacobian
 from mkc_torch.nonlinear._starts import draw_starts, most_likely, repeat_problem
 from mkc_torch.nonlinear.prior import GaussianPrior

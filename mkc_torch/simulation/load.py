@@ -92,8 +92,8 @@ def base_class(source: str, file: str) -> type[Any]:
     found = [place for place in places if place.is_file() and place.resolve() != caller]
     if not found:
         raise SimulationFileError(
-            f"{file}: it corrects {name} of {path.name}, which is neither at {path.as_posix()} from there, nor beside "
-            f"it, nor in the folder of the call; put {path.name} beside it."
+            f"{file}: it corrects {name} of {path.name}, which is neither at {path.as_posix()} from there, nor next to "
+            f"it, nor in the folder of the call; put {path.name} next to it."
         )
     module = _module(found[0].resolve())
     kind = getattr(module, name, None)

@@ -7,7 +7,7 @@ import torch
 
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.differences import LEVEL, differences
-from mkc_torch.report.words.beside import difference_rows, difference_sentences
+from mkc_torch.report.words.comparison import difference_rows, difference_sentences
 from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
 
 

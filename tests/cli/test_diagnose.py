@@ -83,7 +83,7 @@ def content_of(folder):
 
 
 def warnings_of(path, output, *more):
-    """What a diagnosis warns of; the terminal says the same."""
+    """What a diagnosis warns of; the terminal shows the same."""
     result = diagnosed(path, "--output", output, *more)
     assert result.exit_code == 0, result.output
     warnings = content_of(output / path.stem)["warnings"]

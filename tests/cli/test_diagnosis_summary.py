@@ -119,12 +119,12 @@ def test_every_width(width):
 
 
 def test_each_test_of_evidence_has_a_line():
-    said = EvidenceResult("my_test", rows=(Row("left over", "white"), Row("in print", "more", in_terminal=False)))
+    said = EvidenceResult("my_test", rows=(Row("remaining", "white"), Row("in print", "more", in_terminal=False)))
     made = make_diagnosis(1)
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
     for diagnosis in (with_evidence(made, said), of_finding):
         text = shown(diagnosis)
-        assert "left over white" in flat(text)
+        assert "remaining white" in flat(text)
         assert "in print" not in text
 
 
@@ -165,13 +165,13 @@ def test_the_four_answers_stand_first():
 
 
 def test_process_noise_is_located_before_any_finding():
-    pushed = make_diagnosis(
+    disturbed = make_diagnosis(
         0, simulation="Pendulum", verdict="unexplained", p_value=0.4, environment=make_environment()
     )
-    told = answers(pushed)
-    assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in told
-    assert "noise Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in told
-    assert "named nothing unexplained the rate of `rate`" in told
+    text = answers(disturbed)
+    assert "Pendulum Process noise acts on the rate of `rate`, and no physics in the catalogue" in text
+    assert "noise Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s" in text
+    assert "named nothing unexplained the rate of `rate`" in text
 
 
 def test_a_simulation_that_does_not_follow_names_nothing():

@@ -197,7 +197,7 @@ def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, mon
     alone = tmp_path / "alone"
     alone.mkdir()
     (alone / "corrected.py").write_text(text, encoding="utf-8")
-    with pytest.raises(SimulationFileError, match=r"nor beside it, nor in the folder of the call; put vessel\.py"):
+    with pytest.raises(SimulationFileError, match=r"nor next to it, nor in the folder of the call; put vessel\.py"):
         load_simulation(f"{alone / 'corrected.py'}:CorrectedTank")
     (alone / "vessel.py").write_text(TANK, encoding="utf-8")
     assert load_simulation(f"{alone / 'corrected.py'}:CorrectedTank").name == "CorrectedTank"

@@ -1,4 +1,4 @@
-"""A run shows on a terminal what it does and for how long, beside forked copies, and little or nothing in a pipe."""
+"""A run shows on a terminal what it does and for how long, with forked copies, and little or nothing in a pipe."""
 
 import os
 import re

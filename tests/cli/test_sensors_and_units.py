@@ -95,7 +95,7 @@ def test_apply_takes_the_sensor_and_needs_its_name(folder, tmp_path):
 
 
 def test_apply_converts_as_calibrate_did(folder, tmp_path):
-    """The same samples in nT by their names, and in gauss as the option says, have one corrected field."""
+    """The same samples in nT by their names, and in gauss by the option, have one corrected field."""
     model = folder / "out" / "one" / "calibration.json"
     assert calibration(model.parent).unit == "µT"
     named = ("apply", model, folder / "one.csv", "--output", tmp_path / "a.csv")

@@ -25,7 +25,7 @@ from mkc_torch.diagnosis.settings import (
 )
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.test_rounds import BLOCKS, NOTHING, evidence, located
+from tests.diagnosis.test_stepwise import BLOCKS, NOTHING, evidence, located
 from tests.simulation.tumbling import tumbling
 
 ROOT = Path(mkc_torch.diagnosis.__file__).parent

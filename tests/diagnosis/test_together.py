@@ -13,8 +13,8 @@ from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.joined import joined, with_own_offsets
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import RecordingError
+from mkc_torch.report.diagnosis.environment import output_lines
 from mkc_torch.report.diagnosis.findings import shares_of_runs
-from mkc_torch.report.diagnosis.world import output_lines
 from mkc_torch.simulation import Dynamics, Magnetometer, Paired, Static
 from tests.simulation.tumbling import tumbling
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mkc_torch.effects import SENSOR
-from mkc_torch.effects.courses import per
 from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
+from mkc_torch.effects.waveforms import per
 from tests.effects.contexts import make_context
 
 # by effect, and for the gradient by number of channels: name, numbers and unit of each quantity

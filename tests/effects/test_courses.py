@@ -8,7 +8,7 @@ import torch
 from numpy.polynomial import legendre
 
 from mkc_torch.effects import SENSOR, Context
-from mkc_torch.effects.courses import unit_step
+from mkc_torch.effects.waveforms import unit_step
 from tests.effects.contexts import make_context
 
 EFFECTS = {effect.id: effect for effect in SENSOR}

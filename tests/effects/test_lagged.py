@@ -6,7 +6,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter, lfiltic
 
-from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.waveforms import lagged
 
 RANDOM = np.random.default_rng(4)
 

@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.factory import PUSHED, make_diagnosis, make_follows
-from tests.diagnosis.pushed import Pendulum, UpsideDown, swung
+from tests.diagnosis.swing import Pendulum, UpsideDown, swung
 from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_rows, terminal_rows
 
 END = 3.98  # s, of the factory's 200 samples
@@ -200,8 +200,10 @@ def test_a_report_that_contradicts_itself_is_caught(name):
     assert contradictions(made, page=False) == []
     of_finding = {k: v for k, v in SPOILT[name].items() if hasattr(finding, k) and k != "advice"}
     of_all = {k: v for k, v in SPOILT[name].items() if k not in of_finding}
-    spoilt = dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], **of_finding),), **of_all)
-    assert any(name in result for result in contradictions(spoilt, page=False)), contradictions(spoilt, page=False)
+    corrupted = dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], **of_finding),), **of_all)
+    assert any(name in result for result in contradictions(corrupted, page=False)), contradictions(
+        corrupted, page=False
+    )
 
 
 @pytest.mark.parametrize(

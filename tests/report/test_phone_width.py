@@ -18,8 +18,8 @@ from mkc_torch.challenge.score import score
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
+from tests.challenge.scenarios import test_score as of_worlds
 from tests.challenge.test_score import NOTHING, finding, key, says
-from tests.challenge.worlds import test_score as of_worlds
 from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

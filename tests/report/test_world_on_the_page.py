@@ -12,7 +12,7 @@ pytest.importorskip("jinja2")
 
 from mkc_torch.diagnosis.evidence import held_out_gain
 from mkc_torch.diagnosis.result import DivergedBlock, HeldOut, ResidualSizes
-from mkc_torch.report.diagnosis import unseen, world
+from mkc_torch.report.diagnosis import environment, unseen
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.diagnosis.factory import (
@@ -69,7 +69,9 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
 
 def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
     still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
-    (line,) = world.output_lines(make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,))))
+    (line,) = environment.output_lines(
+        make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,)))
+    )
     assert line == ("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared); the output hardly varies")
 
 

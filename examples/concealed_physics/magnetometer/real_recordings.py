@@ -66,7 +66,7 @@ CASES = (
 def step_by_attitude(folder: Path, case: Case) -> npt.NDArray[np.float64]:
     """Return the step of the offset when a magnet is taken off, from the true attitude by least squares.
 
-    The model is a constant world field in sensor axes and an offset for each part; only the reader is of this library.
+    The model is a constant field in sensor axes and an offset for each part; only the reader is of this library.
     """
     assert case.taken_off is not None
     whole = Recording.read(folder / f"{case.name}.csv")

@@ -78,7 +78,7 @@ def scenarios_page(score: ScenariosScore, settings: Mapping[str, Any]) -> str:
     )
     environment.filters.update(share=share_text, measured=measured_text, held=held)
     aims = [measured for scenario in _rows(score) for measured in scenario.measured if held(measured) != NOT_MEASURED]
-    return environment.get_template("worlds.html.j2").render(
+    return environment.get_template("scenarios.html.j2").render(
         score=score,
         rows=_rows(score),
         hiding=[scenario for scenario in _rows(score) if scenario.hidden],

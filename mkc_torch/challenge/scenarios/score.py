@@ -36,7 +36,7 @@ LEAST_DISTURBANCE = 2.0
 class ScoredCase:
     """A case and its diagnosis.
 
-    ``state`` is the state reported as disturbed; ``sensor`` says whether a drift of a sensor is reported.
+    ``state`` is the state reported as disturbed; ``sensor`` whether a drift of a sensor is reported.
     """
 
     key: ScenarioKey

@@ -15,7 +15,7 @@ from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.forward_mode import forward_jacobian, make_dual
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import apply_basis, outer_product
+from mkc_torch.effects.waveforms import apply_basis, outer_product
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
 from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation

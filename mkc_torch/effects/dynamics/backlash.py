@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import played
 from mkc_torch.effects.share import ShareEffect
+from mkc_torch.effects.waveforms import played
 
 if TYPE_CHECKING:
     from jaxtyping import Float

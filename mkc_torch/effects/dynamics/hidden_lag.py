@@ -10,9 +10,9 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import duration, share_of
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.kinds import MOTION, kind_at
+from mkc_torch.effects.waveforms import lagged
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import per
 from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
     from jaxtyping import Float

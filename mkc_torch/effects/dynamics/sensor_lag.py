@@ -10,8 +10,8 @@ from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.share import ShareEffect
+from mkc_torch.effects.waveforms import lagged
 
 if TYPE_CHECKING:
     from jaxtyping import Float

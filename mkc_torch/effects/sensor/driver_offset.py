@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.waveforms import lagged
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import apply_basis, per
+from mkc_torch.effects.waveforms import apply_basis, per
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import unit_step
+from mkc_torch.effects.waveforms import unit_step
 
 if TYPE_CHECKING:
     from jaxtyping import Float

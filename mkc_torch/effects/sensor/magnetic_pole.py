@@ -13,7 +13,7 @@ from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import apply_basis
+from mkc_torch.effects.waveforms import apply_basis
 
 if TYPE_CHECKING:
     from jaxtyping import Float

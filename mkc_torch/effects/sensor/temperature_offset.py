@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.courses import per
 from mkc_torch.effects.sensor.driver_offset import DriverOffset
+from mkc_torch.effects.waveforms import per
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -16,7 +16,7 @@ from mkc_torch.calibration.places import numbered, places
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
-from mkc_torch.report.words.beside import difference_rows, difference_sentences
+from mkc_torch.report.words.comparison import difference_rows, difference_sentences
 
 __all__ = ["Comparison", "calibration_report", "refusal_report"]
 

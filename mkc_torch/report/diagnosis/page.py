@@ -14,6 +14,7 @@ from mkc_torch._words.typesetting import several, typeset
 from mkc_torch.diagnosis.plot.curves import CURVE_COLORS
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
+    environment,
     evidence,
     findings,
     forcing_pictures,
@@ -23,7 +24,6 @@ from mkc_torch.report.diagnosis import (
     summary,
     unseen,
     verdict,
-    world,
 )
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
@@ -81,7 +81,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         top=verdict,
         lead=summary.summary(d),
         unseen=unseen,
-        world=world,
+        environment=environment,
         several=several,
         typeset=typeset,
         marked=marked,

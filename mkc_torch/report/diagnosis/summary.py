@@ -9,12 +9,12 @@ from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
+from mkc_torch.report.diagnosis.environment import noise_lines, output_lines
 from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
 from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, probability
 from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all, residuals
 from mkc_torch.report.diagnosis.verdict import reasons
-from mkc_torch.report.diagnosis.world import noise_lines, output_lines
 from mkc_torch.report.words.numbers import size
 
 __all__ = ["Row", "chance", "residual_alone", "summary"]

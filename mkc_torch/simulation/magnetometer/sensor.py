@@ -8,11 +8,11 @@ from typing import Any
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView
-from mkc_torch.simulation.magnetometer.choice import chosen_view, requested_view
 from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import ACCEL, AXES, GYRO, QUATERNION
+from mkc_torch.simulation.magnetometer.view_selection import chosen_view, requested_view
 
 __all__ = ["Magnetometer"]
 

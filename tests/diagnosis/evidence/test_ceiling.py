@@ -158,11 +158,11 @@ def test_a_port_that_is_not_pointwise(count):
 
 
 def test_a_fold_knows_nothing_of_its_own_samples():
-    line, spoilt, blocks = Line(300), Line(300), blocks_of(300, 1, ConfirmationSettings())
+    line, corrupted, blocks = Line(300), Line(300), blocks_of(300, 1, ConfirmationSettings())
     hidden = ~blocks.train[2]
-    spoilt.measured[hidden] += 0.7
+    corrupted.measured[hidden] += 0.7
     first = fitted(JointModel(line), line.start())
-    second = fitted(JointModel(spoilt), first.parameters, first.bound, graduate=False)
+    second = fitted(JointModel(corrupted), first.parameters, first.bound, graduate=False)
     before, after = (ceiling(fit.model, fit, (), blocks).evidence for fit in (first, second))
     seen = blocks.fold == 2
     torch.testing.assert_close(

@@ -98,8 +98,8 @@ def test_only_the_channels_that_are_misfit_are_named():
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_to_one_side_are_no_student_t(seed):
     random = np.random.default_rng(seed)
-    spoilt = random.random(N) < 0.2
-    assert warned(gaussian(seed) + spoilt * (4.0 + 8.0 * random.random(N))) == ()
+    corrupted = random.random(N) < 0.2
+    assert warned(gaussian(seed) + corrupted * (4.0 + 8.0 * random.random(N))) == ()
 
 
 @pytest.mark.parametrize("seed", range(5))

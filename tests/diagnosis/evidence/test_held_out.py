@@ -74,10 +74,10 @@ def test_held_out_residuals_are_those_of_the_fit_to_the_rest(fit):
 
 def test_a_fold_knows_nothing_of_its_own_samples(fit):
     blocks = blocks_of(300, 1, ConfirmationSettings())
-    spoilt = Line(300)
+    corrupted = Line(300)
     hidden = ~blocks.train[2]
-    spoilt.measured[hidden] += 0.7
-    other = fitted(JointModel(spoilt), spoilt.start(), fit.bound)
+    corrupted.measured[hidden] += 0.7
+    other = fitted(JointModel(corrupted), corrupted.start(), fit.bound)
     before, after = held_out(fit, blocks), held_out(other, blocks)
     seen = blocks.fold == 2
     torch.testing.assert_close(

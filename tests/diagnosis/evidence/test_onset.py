@@ -26,11 +26,11 @@ STEP = next(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
 CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
 
 
-def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
+def interval(size, seed, *, corrupted=(0, 0), effect=STEP, shape=None):
     """That of a step found where it is, beside noise of 0.5 µT."""
     random = np.random.default_rng(seed)
     sensor = size * np.array([0.8, -0.6, 0.4]) * (np.arange(N) >= PLACE)[:, None]
-    sensor[slice(*spoilt)] += 4000.0 * random.choice([-1.0, 1.0], (spoilt[1] - spoilt[0], 3))
+    sensor[slice(*corrupted)] += 4000.0 * random.choice([-1.0, 1.0], (corrupted[1] - corrupted[0], 3))
     recording = tumbling(N, noise=0.5, sensor=sensor, seed=seed, attitude=True)
     prepared = Magnetometer("attitude").prepare(recording)
     base = fitted(JointModel(prepared), prepared.start())
@@ -62,7 +62,7 @@ def test_a_larger_step_is_known_better():
 
 
 def test_an_onset_in_a_burst_of_outliers_may_be_anywhere_in_it():
-    low, high = interval(3.0, 0, spoilt=(PLACE - 25, PLACE + 25))
+    low, high = interval(3.0, 0, corrupted=(PLACE - 25, PLACE + 25))
     assert low <= (PLACE - 24) / RATE
     assert high >= (PLACE + 24) / RATE
     assert high - low < 1.5

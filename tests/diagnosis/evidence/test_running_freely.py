@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from tests.diagnosis.line import Line
-from tests.diagnosis.pushed import at_the_truth, candidates
+from tests.diagnosis.swing import at_the_truth, candidates
 
 BLOCKS = blocks_of(500, 1, ConfirmationSettings())
 KEPT = SimpleNamespace()

@@ -11,7 +11,7 @@ KEPT = Path(__file__).parent / "kept" / "model.json"
 
 IMPORTED = """
 from mkc_torch.effects.protocol import lagged
-from mkc_torch.effects.courses import played
+from mkc_torch.effects.waveforms import played
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.share import soft_clip
 from mkc_torch.effects.dynamics.rate import beyond

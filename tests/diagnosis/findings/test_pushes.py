@@ -15,7 +15,7 @@ from mkc_torch.simulation.dynamics.first_fit import strong_observer
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
-from tests.diagnosis.pushed import NOISE, Pendulum, fitted_swing, swung
+from tests.diagnosis.swing import NOISE, Pendulum, fitted_swing, swung
 
 TRUTH = {"white": Disturbance("rate", True, 0.0, 0.4), "slow": Disturbance("rate", True, 1.0, 0.3)}
 TRUTH["torque"] = Disturbance("rate", True, 0.6, 0.6)  # of the torque's duration, delayed

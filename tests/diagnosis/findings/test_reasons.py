@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from tests.diagnosis.factory import make_follows
 from tests.diagnosis.line import Line
-from tests.diagnosis.pushed import NOISE, Pendulum, UpsideDown, swung
+from tests.diagnosis.swing import NOISE, Pendulum, UpsideDown, swung
 
 N = 150
 

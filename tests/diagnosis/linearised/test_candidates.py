@@ -17,7 +17,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
-from tests.diagnosis.search.test_locate import STEPS
+from tests.diagnosis.search.test_run import STEPS
 
 
 @pytest.fixture(scope="module")

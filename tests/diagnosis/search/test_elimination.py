@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.search.elimination import needless_term, without
 from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
-from tests.diagnosis.pushed import candidates, fitted_swing
+from tests.diagnosis.swing import candidates, fitted_swing
 
 
 @functools.cache

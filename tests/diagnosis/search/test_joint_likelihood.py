@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.search.joint_likelihood import joint_likelihood
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
-from tests.diagnosis.pushed import at_the_truth, candidates, fitted_swing
+from tests.diagnosis.swing import at_the_truth, candidates, fitted_swing
 
 DRAWS, LEVEL = 39, 0.05
 SEEDS = tuple(range(1, 5))

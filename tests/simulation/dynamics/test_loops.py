@@ -17,7 +17,7 @@ from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, whitened
 from tests.simulation.dynamics.oscillating import flow
 from tests.simulation.dynamics.test_kalman import BOTH, MODELS, model, together
-from tests.simulation.dynamics.test_side_by_side import recorded
+from tests.simulation.dynamics.test_parallel_filter import recorded
 
 WAYS = {"machine code": machine_code, "Python": lambda loop: loop, "NumPy": lambda _: None}
 

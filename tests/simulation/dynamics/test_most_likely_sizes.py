@@ -6,7 +6,7 @@ import pytest
 from mkc_torch.simulation.dynamics.most_likely_sizes import most_likely_sizes
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.peak import peak
-from tests.simulation.dynamics.test_disturbances import LASTING, NOISE, PROCESS, SLOW, WHITE, noisy_flow
+from tests.simulation.dynamics.test_noise_selection import LASTING, NOISE, PROCESS, SLOW, WHITE, noisy_flow
 
 
 def test_a_narrow_curved_ridge_is_followed_to_its_maximum():

@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, _wi
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.pushed import Pendulum, at_the_truth, candidates, fitted_swing, swung
+from tests.diagnosis.swing import Pendulum, at_the_truth, candidates, fitted_swing, swung
 
 of_diagnosis = importlib.import_module("mkc_torch.diagnosis.diagnose")
 FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
