@@ -24,14 +24,14 @@ from mkc_torch.nonlinear import NoFitError, fit
 from mkc_torch.simulation import Parameter
 from tests.docs.pages import ROOT
 from tests.recording.test_bad_input import BAD
-from tests.recording.test_strange_files import FIELD, LINES, OTHER, PLAIN, REPORTED, SAME, TIME, table
+from tests.recording.test_strange_files import EXPECTED_WARNINGS, FIELD, LINES, OTHER, PLAIN, SAME, TIME, table
 
 PAGE = ROOT / "docs" / "bad_inputs.md"
 
 HEAD = """# Bad inputs, and what is reported
 
-Each row is an input to the command line or to Python, and the message that it gets, as `python -m tests.bad_inputs`
-prints them. No traceback, no NaN, no file changed: `tests/test_bad_inputs.py` gives each input again and checks this.
+Each row is an input to the command line or to Python, and the message that it gets; `tests/bad_inputs.py` prints
+them. No traceback, no NaN, no file changed: `tests/test_bad_inputs.py` gives each input again and checks this.
 
 """
 LOGS = (".parquet", ".ulg", ".bin", ".log", ".mcap", ".bag", ".mat", ".h5", ".mf4")
@@ -106,7 +106,7 @@ def repaired(kind: str) -> Callable[[Path], str]:
         recording = Recording.read(folder / "rec.csv")
         if not recording.magnetometer().isfinite().all():
             raise WrongAnswerError(f"{kind}: {recording}")
-        return next(sentence for sentence in recording.warnings if REPORTED[kind] in sentence)
+        return next(sentence for sentence in recording.warnings if EXPECTED_WARNINGS[kind] in sentence)
 
     return said
 
@@ -232,7 +232,7 @@ def bad_inputs() -> Iterator[Bad]:
     yield Bad("Text", "eight samples", of_file("rec.csv", "\n".join(LINES[:9])))
     yield Bad("Text", "a sensor that does not turn", of_file("rec.csv", table("mx,my,mz", *([[9.0] * 99] * 3))))
     yield Bad("Text", "an axis that is stuck", of_file("rec.csv", table("mx,my,mz", *FIELD.T[:2], [7.0] * len(TIME))))
-    for kind in REPORTED:
+    for kind in EXPECTED_WARNINGS:
         yield Bad("Text that is read, and the warning", kind, repaired(kind))
     for ending in LOGS:
         yield Bad("Logs", f"text called `{ending}`", of_file(f"log{ending}", PLAIN))

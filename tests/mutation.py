@@ -143,7 +143,7 @@ class Reach(NamedTuple):
 
 
 class _Recorder:
-    """A pytest plugin that reports the running test to coverage; every test of a file may need what its fixtures run."""
+    """A pytest plugin that reports the running test to coverage; a fixture's lines count for every test of its file."""
 
     def __init__(self, coverage: Any) -> None:
         self.coverage = coverage

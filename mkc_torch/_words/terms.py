@@ -1,7 +1,6 @@
 """Texts of reports and of the terminal, by key.
 
-Names in braces are arguments of :func:`term`. Keys in square brackets are replaced by their texts, so that a word is
-defined on a single line.
+Names in braces are arguments of :func:`term`. Keys in square brackets are replaced by their texts.
 """
 
 from __future__ import annotations
@@ -58,7 +57,6 @@ TERMS: dict[str, str] = {
     "verdict.calibrated": "Calibrated.",
     "verdict.doubtful": "Calibrated, but read the warnings.",
     "verdict.not_calibrated": "Not calibrated: not identifiable.",
-    "verdict.not_identifiable": "Not identifiable",
     "verdict.no_ellipsoid": "These samples do not determine an ellipsoid, so no calibration was written.",
     "verdict.not_plausible": "Not plausible: {finding}.",
     # grades
@@ -348,7 +346,7 @@ TERMS: dict[str, str] = {
     # titles of pages and sections
     "section.diagnosis_of": "Diagnosis of {recording}",
     "section.calibration_of": "Calibration of {recording}",
-    "section.refusal_of": "[verdict.not_identifiable]: {recording}",
+    "section.refusal_of": "Not identifiable: {recording}",
     "section.over_diagnosis": "Simulation against recording",
     "section.over_calibration": "Magnetometer calibration",
     "section.samples": "{count} samples",
@@ -430,8 +428,7 @@ TERMS: dict[str, str] = {
     "command.no_option_pair": '{option} "{part}" is not a pair; write name=value, such as {example}.',
     "command.no_folder": "{path} is not a valid name for a results folder; rename it.",
     "command.twice": '"{name}" is given twice.',
-    "command.same_folder": "{path} and {other} would write into the same folder, {folder}; rename one, or run two"
-    " commands with different --output.",
+    "command.same_folder": "{path} and {other} would both write into {folder}; rename one, or use two --output.",
 }
 
 

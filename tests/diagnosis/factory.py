@@ -107,7 +107,7 @@ def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, fl
 LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
 """Two outputs with a poor fit."""
 
-PUSHED = ProcessNoise(
+PROCESS_NOISE = ProcessNoise(
     "rate",
     at_rate=True,
     correlation_time=0.7,
@@ -118,13 +118,13 @@ PUSHED = ProcessNoise(
 )
 
 
-def make_forcing(samples=1800, push=PUSHED):
+def make_forcing(samples=1800, noise=PROCESS_NOISE):
     """Return the estimated disturbance of a pendulum's rate."""
     time = torch.arange(samples, dtype=torch.float64) / 20.0
-    value = push.size * (torch.sin(1.1 * time) + 0.6 * torch.sin(3.7 * time + 1.0))
+    value = noise.size * (torch.sin(1.1 * time) + 0.6 * torch.sin(3.7 * time + 1.0))
     x = torch.linspace(-1.0, 1.0, 40, dtype=torch.float64)
     curves = tuple(
-        Curve(name, unit, x, (slope * x).unsqueeze(-1), torch.full((40, 1), 0.05), (push.place,), push.unit)
+        Curve(name, unit, x, (slope * x).unsqueeze(-1), torch.full((40, 1), 0.05), (noise.place,), noise.unit)
         for name, unit, slope in (("angle", "rad", 0.01), ("rate", "rad/s", -0.2), ("torque", "N m", 0.03))
     )
     sentences = (
@@ -132,14 +132,14 @@ def make_forcing(samples=1800, push=PUSHED):
         "It goes along with none of the inputs, at no lag.",
     )
     band = torch.full_like(value, 0.09)
-    return DisturbanceEstimate(push.place, push.at_rate, push.unit, time, value, band, curves, sentences)
+    return DisturbanceEstimate(noise.place, noise.at_rate, noise.unit, time, value, band, curves, sentences)
 
 
 def make_environment(**changes):
     """Return the environment of a pendulum with a good fit, a disturbed rate, and a held torque."""
     environment = NoiseEnvironment(
         goodness_of_fit=(make_follows(),),
-        process_noise=(PUSHED,),
+        process_noise=(PROCESS_NOISE,),
         input_hold={"torque": "held"},
         disturbance=(make_forcing(),),
         starts=12,

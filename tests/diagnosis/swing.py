@@ -52,13 +52,14 @@ def walk(random, n, samples):
 
 
 @functools.cache
-def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
+def swung(disturbance="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
     """Return a recording and the disturbance of its rate; the disturbance is "none", "white", "slow" or "torque".
 
     Args:
-        push: "white" is new at each sample, of 0.4 rad/s²; "slow" has a correlation time of 1 s, of 0.3 rad/s²;
-            "torque" follows the torque.
-        seed, N: of the draws, and number of samples.
+        disturbance: "white" is independent at each sample, of 0.4 rad/s²; "slow" has a correlation time of 1 s, of
+            0.3 rad/s²; "torque" follows the torque.
+        seed: seed of the random draws.
+        N: number of samples.
         drag: hidden quadratic drag, in 1/rad.
         effect: factor of the torque, -1 for the wrong sign.
         late: delay of the torque in samples.
@@ -66,12 +67,12 @@ def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
     random = np.random.default_rng(seed)
     torque = 1.5 * walk(random, N, 12)
     acting = effect * np.concatenate([np.zeros(late), torque])[:N]
-    if push == "white":
+    if disturbance == "white":
         added = 0.4 * random.standard_normal(N)
-    elif push == "slow":
+    elif disturbance == "slow":
         added = 0.3 * walk(random, N, 1.0 / STEP)
     else:
-        added = np.zeros(N) if push == "none" else 0.4 * np.concatenate([np.zeros(6), torque[:-6]])
+        added = np.zeros(N) if disturbance == "none" else 0.4 * np.concatenate([np.zeros(6), torque[:-6]])
     x, h, angle = np.array([0.3, 0.0]), STEP / FINE, np.zeros(N)
 
     def rate(x, k):
@@ -98,19 +99,19 @@ def fitted_under_noise(recording, system=Pendulum):
 
 
 @functools.cache
-def fitted_swing(push="none", seed=0, N=500, drag=0.0):
+def fitted_swing(disturbance="none", seed=0, N=500, drag=0.0):
     """Fit a recording of :func:`swung`."""
-    return fitted_under_noise(swung(push, seed, N, drag)[0])
+    return fitted_under_noise(swung(disturbance, seed, N, drag)[0])
 
 
 @functools.cache
-def at_the_truth(push="white", seed=0):
+def at_the_truth(disturbance="white", seed=0):
     """Return a pendulum of :func:`swung` at its true parameters, under the drawn disturbance."""
-    prepared = Pendulum().prepare(swung(push, seed)[0])
+    prepared = Pendulum().prepare(swung(disturbance, seed)[0])
     theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
     prepared = prepared.observed(strong_observer(prepared, theta, 10.0))
     flow = flow_of(prepared, theta, {}, None)
-    size, correlation_time = (0.4, 0.0) if push == "white" else (0.3, 1.0)
+    size, correlation_time = (0.4, 0.0) if disturbance == "white" else (0.3, 1.0)
     sensor = torch.tensor([NOISE], dtype=torch.float64)
     disturbances = (Disturbance("rate", True, correlation_time, size),)
     observer = observer_of(flow, disturbances, sensor, prepared.disturbable, prepared.channels)

@@ -229,24 +229,24 @@ class Buoy(Dynamics):
     """A float on a spring, driven by a known force; its mass is that of the body without water."""
 
     states = ("heave", "speed")
-    inputs = ("push",)
+    inputs = ("force",)
     parameters = {"drag": Parameter(0.2, lower=0.0)}  # noqa: RUF012
-    units = {"heave": "m", "speed": "m/s", "push": "m/s²"}  # noqa: RUF012
+    units = {"heave": "m", "speed": "m/s", "force": "m/s²"}  # noqa: RUF012
     step = 0.05
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
-        return {"heave": x.speed, "speed": u.push - 4.0 * x.heave - p.drag * x.speed}
+        return {"heave": x.speed, "speed": u.force - 4.0 * x.heave - p.drag * x.speed}
 
 
 @pytest.mark.e2e
 def test_added_mass_is_named_and_sized():
     time = np.arange(400) * 0.05
-    push = np.sin(1.3 * time) + np.sin(2.9 * time)
+    force = np.sin(1.3 * time) + np.sin(2.9 * time)
 
     def rate(t, y):
-        return [y[1], (np.interp(t, time, push) - 4.0 * y[0] - 0.3 * y[1]) / 1.1]
+        return [y[1], (np.interp(t, time, force) - 4.0 * y[0] - 0.3 * y[1]) / 1.1]
 
-    recording = measured(rate, [0.5, 0.0], time, NOISE, seen=("heave",), push=push)
+    recording = measured(rate, [0.5, 0.0], time, NOISE, seen=("heave",), force=force)
     rivals = among("added_mass", "cubic_stiffness")
     finding = explained(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
     share, error = value(finding, "share")
@@ -287,14 +287,14 @@ def test_lift_of_a_spinning_ball_is_named_and_sized():
 def test_buoyancy_leads_the_search_of_all_effects():
     """A sphere, whose displaced volume is not linear in its depth; the refits would be slow."""
     time = np.arange(140) * 0.05
-    push = 1.5 * np.sin(1.3 * time) + np.sin(2.9 * time)
+    force = 1.5 * np.sin(1.3 * time) + np.sin(2.9 * time)
 
     def rate(t, y):
         deep = min(max(0.3 - y[0], 0.0), 0.6)
         lift = 0.4 * deep**2 * (0.9 - deep) / 0.108
-        return [y[1], np.interp(t, time, push) - 4.0 * y[0] - 0.3 * y[1] + lift]
+        return [y[1], np.interp(t, time, force) - 4.0 * y[0] - 0.3 * y[1] + lift]
 
-    recording = measured(rate, [0.8, 0.0], time, NOISE, seen=("heave",), push=push)
+    recording = measured(rate, [0.8, 0.0], time, NOISE, seen=("heave",), force=force)
     simulation = Buoy().prepare(recording)
     base = fitted(JointModel(simulation), simulation.start())
     terms = candidate_terms(simulation, (), DYNAMICS)

@@ -23,7 +23,7 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.factory import PUSHED, make_diagnosis, make_follows
+from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_follows
 from tests.diagnosis.swing import Pendulum, UpsideDown, swung
 from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_rows, terminal_rows
 
@@ -96,7 +96,7 @@ def diagnoses(draw):
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
     found = [item for item in found if not (item.grade == "unconfirmed" and is_zero_within_error(item))]
     white = draw(st.booleans())
-    pushes = () if draw(st.booleans()) else (dataclasses.replace(PUSHED, at_rate=draw(st.booleans())),)
+    pushes = () if draw(st.booleans()) else (dataclasses.replace(PROCESS_NOISE, at_rate=draw(st.booleans())),)
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not pushes else st.floats(1.0, 20.0))
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))

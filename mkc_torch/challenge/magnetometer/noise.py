@@ -32,7 +32,7 @@ class Noise:
     """Errors of a sensor; standard deviations in µT.
 
     ``white`` (three axes) is independent from sample to sample, ``axes`` adds a process to each axis and ``walks`` a
-    random walk, ``ambient`` a process to the length of the field, and ``attitude`` (radians, one process on each axis of
+    random walk, ``ambient`` a process to the length of the field, and ``attitude`` (radians, a process on each axis of
     the world frame) turns the recorded attitude.
     """
 

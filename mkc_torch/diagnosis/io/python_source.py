@@ -85,9 +85,9 @@ def python_source(
         *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
         *_states(system, memories, theta),
-        *_actuated(inputs),
+        *_actuator(inputs),
         *_derivative(memories, rates),
-        *_sensed(outputs),
+        *_sensor(outputs),
     ]
     text = "\n".join(body)
     loaded = None if module else _loaded(kind, folder)
@@ -159,11 +159,11 @@ def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float
     return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 
 
-def _actuated(inputs: list[str]) -> list[str]:
+def _actuator(inputs: list[str]) -> list[str]:
     if not inputs:
         return []
-    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuated(time, acting, p, run)"]
-    return ["", "    def actuated(self, time, u, p, run):", *(f"        {line}" for line in lines)]
+    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuator(time, acting, p, run)"]
+    return ["", "    def actuator(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
 def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
@@ -181,11 +181,11 @@ def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
     ]
 
 
-def _sensed(outputs: list[str]) -> list[str]:
+def _sensor(outputs: list[str]) -> list[str]:
     if not outputs:
         return []
-    lines = ["y = super().sensed(time, y, p, run)", "shown = dict(y)", *outputs, "return shown"]
-    return ["", "    def sensed(self, time, y, p, run):", *(f"        {line}" for line in lines)]
+    lines = ["y = super().sensor(time, y, p, run)", "shown = dict(y)", *outputs, "return shown"]
+    return ["", "    def sensor(self, time, y, p, run):", *(f"        {line}" for line in lines)]
 
 
 def _memories(term: Term) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -73,11 +73,11 @@ class PreparedDynamics(ObservedDynamics):
         self._lay_out(1)
         starts = [f"{state} at the start{label}" for label in self.labels for state in system.states]
         self.parameter_names = (*self.known, *starts)
-        p, n = len(self.known), len(starts)
         low = [parameter.lower for parameter in self.known.values()]
         high = [parameter.upper for parameter in self.known.values()]
-        self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
-        self._p = p
+        any_value = [torch.inf] * len(starts)
+        self.bounds = self.time.new_tensor([*low, *(-x for x in any_value)]), self.time.new_tensor(high + any_value)
+        self._p = len(self.known)
         self.clean = torch.stack([despiked(values, self.time, self.begins) for values in self.measured.unbind(-1)], -1)
         self.counts = self.clean == self.measured
         self._faithful: dict[int, bool] = {}
@@ -184,10 +184,7 @@ class PreparedDynamics(ObservedDynamics):
         def rate(theta: Tensor) -> Callable[[Tensor], Tensor]:
             return self.rate(theta, {})
 
-        def residual(theta: Tensor) -> Tensor:
-            return self.residual(theta, {})
-
-        step = self.grid.step.unsqueeze(-1)
+        residual, step = partial(self.residual, changes={}), self.grid.step.unsqueeze(-1)
         return first_parameters(self.given, self.bounds, self._p, rate, self.guess, step, residual)
 
     @cached_property

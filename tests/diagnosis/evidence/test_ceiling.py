@@ -119,16 +119,16 @@ def test_of_columns_by_the_dozen_the_right_one_is_taken():
     assert tangents.shape[-1] <= 300
 
 
-def test_beside_a_model_it_is_about_what_is_left():
-    """The parameters of the model are refitted with the curves: nothing is left to gain by what it has already."""
+def test_the_ceiling_given_a_model_is_that_of_its_residual():
+    """The model parameters are refitted with the curves, so columns already in the model gain nothing."""
     fit, drivers, blocks = made(along(LOAD), load=LOAD, **walks(2))
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     model = fit.model.with_term(Term(effect, next(d for d in drivers if d.columns == ("load",)), {}))
     corrected = fitted(model, torch.cat([fit.parameters, torch.zeros(3, dtype=torch.float64)]), fit.bound)
     assert ceiling(fit.model, corrected, drivers, blocks).columns == ("load",)
-    beside = ceiling(model, corrected, drivers, blocks)
-    assert beside.columns == ()
-    assert float(beside.evidence.log_likelihood.mean()) == pytest.approx(
+    with_model = ceiling(model, corrected, drivers, blocks)
+    assert with_model.columns == ()
+    assert float(with_model.evidence.log_likelihood.mean()) == pytest.approx(
         float(held_out(corrected, blocks).log_likelihood.mean()), abs=0.003
     )
 
@@ -190,22 +190,22 @@ def test_the_diagnosis_has_it_on_the_same_samples_and_warns_of_what_remains():
 
 
 @pytest.fixture(scope="module", params=range(5))
-def wandering(request):
-    """An offset that wanders, and columns that wander as it does."""
+def drifting(request):
+    """A drifting offset, and columns that drift in the same way but independently of it."""
     random = np.random.default_rng(100 + request.param)
     offset = 2.0 * NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
     fit, drivers, blocks = made(offset, seed=request.param, **walks(5, seed=request.param))
     return fit, drivers, blocks, ceiling(fit.model, fit, drivers, blocks)
 
 
-def test_noise_that_wanders_is_not_told_as_what_remains(wandering):
-    fit, drivers, blocks, alone = wandering
+def test_drifting_noise_is_not_reported_as_remaining(drifting):
+    fit, drivers, blocks, alone = drifting
     corrected = held_out(fit, blocks)
     assert gained(alone.evidence, corrected, blocks) > 0.0
     assert remaining(alone, corrected, fit, drivers, blocks, 0, EvidenceSettings()) == ()
 
 
-def test_a_wandering_column_that_matters_is_told_from_wandering_noise():
+def test_a_drifting_column_that_matters_is_distinguished_from_drifting_noise():
     random = np.random.default_rng(7)
     offset = NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
     fit, drivers, blocks = made(offset + along(LOAD), load=LOAD, **walks(3, seed=7))

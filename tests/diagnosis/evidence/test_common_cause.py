@@ -1,4 +1,4 @@
-"""A wander of a sensor's axes along one direction is a cause that was not recorded; axes apart are noise."""
+"""Drift of all sensor axes along one direction is an unrecorded cause; independent drift of the axes is noise."""
 
 import json
 from types import SimpleNamespace
@@ -75,13 +75,13 @@ def test_channels_apart_have_p_values_that_are_no_smaller_than_uniform(variances
     assert float((p < 0.5).double().mean()) < 0.7
 
 
-def test_nothing_is_asked_of_one_channel_or_of_noise_that_does_not_wander():
+def test_a_single_channel_or_noise_without_drift_has_no_common_cause():
     linearised, slow, _ = searching(np.eye(3), 0)
     assert common_cause(linearised, None) is None
     assert common_cause(SimpleNamespace(has_drift=False), slow) is None
 
 
-def test_the_other_way_to_say_it():
+def test_the_sign_of_the_direction_can_be_flipped():
     linearised, slow, _ = searching(np.outer(DIRECTION, DIRECTION), 1)
     cause = common_cause(linearised, slow)
     other = cause.towards(-cause.direction)
@@ -146,8 +146,8 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("whole", [False, True])
-def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
-    """One that is the cause is not, and neither needs a name that says what it measures."""
+def test_a_column_that_follows_the_cause_only_in_part_is_reported_as_a_proxy(whole):
+    """A column that is the cause is not. Neither column needs a name that states what it measures."""
     column = course() if whole else np.sin(2 * np.pi * TIME / 23.0 + 4)
     recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=column)
     found = diagnose(Magnetometer("norm"), recording)
@@ -159,8 +159,8 @@ def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_axes_that_wander_for_themselves_are_noise(seed):
-    """One draw in two hundred would be one cause, for a tenth of the level; these are none of those."""
+def test_independently_drifting_axes_are_noise(seed):
+    """At a tenth of the level, 1 draw in 200 would be taken for a common cause; these seeds are not."""
     found = diagnose(Magnetometer("norm"), tumbling(N, noise=0.5, sensor=0.8 * walks(seed, 3), seed=seed))
     assert "unknown" not in [finding.effect for finding in found.findings]
 

@@ -72,7 +72,7 @@ def test_a_student_t_is_warned_of_with_its_freedom(freedom, seed):
     assert sentence.endswith("A misfit of the tail is not evidence of physics.")
 
 
-def test_distances_are_told_whether_or_not_there_is_a_warning():
+def test_distances_are_reported_with_and_without_a_warning():
     right, wrong = checked(gaussian(0), student(1))
     assert right.distance < right.allowed
     assert right.student_distance < right.allowed
@@ -123,7 +123,7 @@ def test_the_distribution_function_of_a_student_t(freedom):
 
 
 @pytest.mark.parametrize("freedom", [1.0, 2.0, 4.0])
-def test_the_likeliest_student_t(freedom):
+def test_the_student_t_fit_maximises_the_likelihood(freedom):
     error = student(7, freedom)
     found, scale, likelihood = student_fit(torch.as_tensor(error))
     assert found == freedom

@@ -1,4 +1,4 @@
-"""A driver shifted in time is no driver, unless it changes so slowly that its timing says nothing."""
+"""A driver shifted in time explains nothing, unless it changes so slowly that its timing is uninformative."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def load(N):
 
 
 def found(N, driver, effect="current_field", *, searched=None, **columns):
-    """The shifts of the one effect that is searched, beside a sensor that follows the driver."""
+    """Return the driver shifts of the searched effect, for a sensor that follows the driver."""
     recording = tumbling(N, noise=0.4, sensor=GAIN * driver[:, None], attitude=True, gyro=True, **columns)
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording)

@@ -87,12 +87,12 @@ def test_of_several_columns_what_is_far_from_the_middle_is_high():
     assert found.confidence_interval[0] > 0.0
 
 
-def test_a_switch_says_nothing():
+def test_a_switched_driver_has_no_extrapolation_test():
     switch = np.where(np.quantile(LOAD, 0.8) < LOAD, 1.0, 0.0)
     assert held_beyond(both(switch, load=switch)) is None
 
 
-def test_high_values_all_in_one_place_say_nothing():
+def test_high_values_in_a_single_stretch_have_no_extrapolation_test():
     high = np.where(abs(TIME - 11.0) < 1.0, 4.0, 2.5 * np.minimum(np.sin(TIME), 0.0))
     high += np.where(abs(TIME - 11.0) < 1.0, np.sin(9.0 * TIME), 0.0)
     assert held_beyond(both(high, load=high)) is None

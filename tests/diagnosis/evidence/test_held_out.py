@@ -30,7 +30,7 @@ def test_every_sample_is_held_out_once(N):
 
 @pytest.mark.parametrize("N", [100, 777, 4500])
 @pytest.mark.parametrize("correlation", [1, 5])
-def test_a_gap_lies_beside_held_out_samples(N, correlation):
+def test_a_gap_separates_held_out_from_training_samples(N, correlation):
     blocks = blocks_of(N, correlation, ConfirmationSettings())
     index = torch.arange(N)
     for k in range(5):

@@ -1,4 +1,4 @@
-"""The evidence of a finding that is hidden by one found after it."""
+"""Held-out evidence of a finding that a later, larger finding masks."""
 
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ OFFSET = next(effect for effect in CATALOGUE if effect.id == "driver_offset")
 
 @pytest.fixture(scope="module")
 def fits():
-    """Without an effect, with the small one, and with both."""
+    """Return three fits: without an effect, with the small effect, and with both effects."""
     sensor = np.outer(SMALL, [0.4, -0.3, 0.4]) + np.outer(LARGE, [4.0, 3.0, -5.0])
     recording = tumbling(N, noise=0.3, sensor=sensor, small=SMALL, large=LARGE)
     simulation = Magnetometer("norm")
@@ -46,8 +46,8 @@ def fits():
 
 
 @pytest.fixture
-def beside(fits):
-    """The evidence without the small effect, if that is asked for."""
+def evidence_without_small(fits):
+    """Return a function for the evidence without the small effect, and the held-out evidence of each fit."""
     blocks = blocks_of(N, 1, ConfirmationSettings())
     none, small, both = fits
     found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
@@ -59,8 +59,8 @@ def beside(fits):
 
 
 @pytest.mark.e2e
-def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside):
-    without_small, (none, _, both) = beside
+def test_an_effect_not_confirmed_alone_is_evaluated_given_the_other(fits, evidence_without_small):
+    without_small, (none, _, both) = evidence_without_small
     without = without_small(none, none, both)
     blocks = blocks_of(N, 1, ConfirmationSettings())
     alone = fitted_with_effect(
@@ -70,13 +70,13 @@ def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside
     assert float((both.log_likelihood - without.log_likelihood).mean()) > 0.1
 
 
-def test_what_is_confirmed_by_itself_is_not_judged_again(beside):
-    without_small, (none, _, both) = beside
+def test_an_effect_confirmed_alone_is_not_evaluated_again(evidence_without_small):
+    without_small, (none, _, both) = evidence_without_small
     assert without_small(none, both, both) is None
 
 
 @pytest.mark.e2e
-def test_a_diagnosis_says_so(monkeypatch):
+def test_a_diagnosis_notes_that_a_finding_was_evaluated_given_the_others(monkeypatch):
     monkeypatch.setattr(held_out_gain, "_confirmed", lambda *_: False)
     current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))
     sensor = np.outer(current, [0.6, -0.5, 0.6]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])

@@ -27,7 +27,7 @@ CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity"
 
 
 def interval(size, seed, *, corrupted=(0, 0), effect=STEP, shape=None):
-    """That of a step found where it is, beside noise of 0.5 µT."""
+    """Return the onset interval of a step fitted at its true onset, in noise of 0.5 µT."""
     random = np.random.default_rng(seed)
     sensor = size * np.array([0.8, -0.6, 0.4]) * (np.arange(N) >= PLACE)[:, None]
     sensor[slice(*corrupted)] += 4000.0 * random.choice([-1.0, 1.0], (corrupted[1] - corrupted[0], 3))
@@ -47,7 +47,7 @@ def interval(size, seed, *, corrupted=(0, 0), effect=STEP, shape=None):
 
 
 @pytest.mark.e2e
-def test_the_interval_holds_the_onset_about_as_often_as_it_says():
+def test_the_interval_covers_the_onset_at_about_its_nominal_level():
     found = [interval(0.5, seed) for seed in range(25)]
     assert sum(low <= TRUE <= high for low, high in found) >= 22
     width = np.median([high - low for low, high in found])
@@ -84,7 +84,7 @@ def test_the_critical_value_is_that_of_a_change_point():
 
 
 @pytest.mark.e2e
-def test_a_diagnosis_tells_it():
+def test_a_diagnosis_reports_the_onset_interval():
     sensor = np.array([1.6, -1.2, 0.8]) * (np.arange(2000) >= 900)[:, None]
     diagnosis = diagnose(Magnetometer(), tumbling(2000, noise=0.5, sensor=sensor))
     (finding,) = diagnosis.findings

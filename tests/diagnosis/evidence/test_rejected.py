@@ -1,4 +1,4 @@
-"""Stretches in which most samples were rejected are told of."""
+"""Stretches in which most samples were rejected are reported."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def weights(*stretches):
     return torch.stack([torch.ones_like(TIME), 1.0 - torch.as_tensor(inside).clamp(max=1.0)], -1)
 
 
-def test_the_longest_are_named_in_their_order():
+def test_the_longest_stretches_are_named_in_order_of_time():
     (sentence,) = rejected_warning(
         TIME, weights((5.0, 6.0), (20.0, 23.0), (30.0, 30.8), (40.0, 42.0), (50.0, 50.2)), Settings()
     )
@@ -26,12 +26,12 @@ def test_the_longest_are_named_in_their_order():
 
 
 @pytest.mark.parametrize("stretches", [(), ((5.0, 5.2), (9.0, 9.1))])
-def test_nothing_is_said_of_short_ones(stretches):
+def test_short_stretches_are_not_reported(stretches):
     assert rejected_warning(TIME, weights(*stretches) if stretches else torch.ones(3000, 1), Settings()) == ()
 
 
 @pytest.mark.e2e
-def test_a_magnet_that_passes_is_told_of_by_a_diagnosis():
+def test_a_diagnosis_reports_a_passing_magnet():
     time = np.arange(2000) / 50.0
     away = np.stack([1.0 + 0.0 * time, 0.3 * (time - 21.0), 0.0 * time], -1)
     distance = np.linalg.norm(away, axis=1, keepdims=True)

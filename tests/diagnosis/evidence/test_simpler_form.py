@@ -119,7 +119,7 @@ def test_a_form_that_makes_no_finding_any_more_is_not_taken():
 
 
 @pytest.mark.e2e
-def test_an_earlier_effect_is_simplified_beside_a_later_one():
+def test_an_earlier_effect_is_simplified_in_the_presence_of_a_later_one():
     fit, evidence, blocks = fit_of(recorded((0.3, 0.1), (1.0, 1.0)), OF["sensor_lag"], OF["coupling"], start=0.2)
     simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
     assert simple.model.sizes == (1, 2)

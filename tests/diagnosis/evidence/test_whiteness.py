@@ -1,4 +1,4 @@
-"""Whether what is left over is white, and up to which lag it is not."""
+"""Whether the residual is white, and up to which lag it is correlated."""
 
 import json
 
@@ -50,35 +50,35 @@ def test_a_longer_memory_reaches_farther():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_comes_again_after_a_while_is_seen_at_its_lag(seed):
+def test_an_echo_is_found_at_its_lag(seed):
     noise = draws(seed)
     assert of(noise[300:] + 0.5 * noise[:-300]).lag == 300
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_rejected_samples_are_no_memory(seed):
-    """Neither do they hide one."""
+def test_rejected_samples_do_not_count_as_correlation(seed):
+    """Nor do they hide correlation."""
     counts = (draws(100 + seed) < 0.8).double()
     counts[500:700] = 0.0
     assert of(counts * draws(seed), counts).lag == 0
     assert of(counts * autoregressive(seed, 0.8), counts).neighbours == pytest.approx(0.8, abs=0.06)
 
 
-def test_nothing_left_over_is_white():
+def test_a_zero_residual_is_white():
     assert of(torch.zeros(50, dtype=torch.float64)).lag == 0
     assert of(torch.zeros(50, dtype=torch.float64), torch.zeros(50, dtype=torch.float64)).lag == 0
     assert of(torch.ones(1, dtype=torch.float64)).lag == 0
 
 
-def test_a_diagnosis_tells_it_and_stays_as_it_was():
+def test_a_diagnosis_reports_whiteness_without_a_warning():
     slow = np.outer(autoregressive(3, 0.9).numpy(), [0.3, 0.2, -0.3])
     white, coloured = (
         diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, sensor=sensor), effects=(), surrogates=19)
         for sensor in (0.0 * slow, slow)
     )
-    (row,) = (row for said in white.evidence for row in said.rows)
+    (row,) = (row for result in white.evidence for row in result.rows)
     assert (row.label, row.text) == ("residual", "white")
-    (row,) = (row for said in coloured.evidence for row in said.rows)
+    (row,) = (row for result in coloured.evidence for row in result.rows)
     assert row.text.startswith("correlated up to 0.")
     assert row.text.endswith(" s")
     content = json.loads(diagnosis_to_json(coloured))["evidence"]["whiteness"]

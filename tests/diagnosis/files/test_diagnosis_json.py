@@ -140,7 +140,7 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     ]  # fmt: skip
 
 
-def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order():
+def test_results_of_a_new_test_are_under_its_id_and_the_key_order_is_kept():
     said = EvidenceResult(
         "my_test",
         content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
@@ -180,7 +180,7 @@ def test_components_are_as_many_as_the_numbers():
 
 
 def test_a_region_of_another_kind_is_refused(content):
-    content["findings"][0]["region"] = dataclasses.asdict(Region("level", "cm", "beside", 14.2, 0.91, 0.1))
+    content["findings"][0]["region"] = dataclasses.asdict(Region("level", "cm", "near", 14.2, 0.91, 0.1))
     with pytest.raises(DiagnosisFileError, match=r"findings\.0\.region\.kind"):
         validate(content)
 
@@ -238,7 +238,7 @@ def test_a_quick_look_has_no_p_value():
             validate(bad)
 
 
-def test_a_stopped_search_says_why_and_what_was_not_done():
+def test_a_stopped_search_has_its_reason_and_the_skipped_steps():
     stored = written(make_diagnosis(0, p_value=None, stop=Stop("time limit", 60.2, ("the search for effects",))))
     assert stored["search"]["stopped"] == {
         "reason": "time limit", "seconds": 60.2, "not_done": ["the search for effects"],

@@ -1,4 +1,4 @@
-"""Lines of Python that effects write are what the effects do."""
+"""The exported Python of each effect computes the same as the effect."""
 
 import pytest
 import torch
@@ -54,20 +54,20 @@ def test_what_cannot_be_written_out():
 
 
 class Cart(Dynamics):
-    """What all five effects can act on: pushed and pulled by a known force, and free to move across it."""
+    """A system that every tested effect can act on: driven by a known force, and free to move across it."""
 
     states = ("height", "side", "speed", "drift")
-    inputs = ("push",)
+    inputs = ("force",)
     parameters = {"damping": 0.3}  # noqa: RUF012
-    units = {"height": "m", "side": "m", "speed": "m/s", "drift": "m/s", "push": "m/s²"}  # noqa: RUF012
+    units = {"height": "m", "side": "m", "speed": "m/s", "drift": "m/s", "force": "m/s²"}  # noqa: RUF012
     step = 0.05
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
-        return [x.speed, x.drift, u.push - 4.0 * x.height - p.damping * x.speed, -3.0 * x.side - 0.2 * x.drift]
+        return [x.speed, x.drift, u.force - 4.0 * x.height - p.damping * x.speed, -3.0 * x.side - 0.2 * x.drift]
 
 
 PLACES = {
-    "backlash": ("input push", {"half_gap": 0.3}),
+    "backlash": ("input force", {"half_gap": 0.3}),
     "bouc_wen_hysteresis": ("hysteretic rate of speed", {"yield_deflection": 0.2}),
     "hidden_lag": ("lagged rate of drift", {"time_constant": 0.3}),
     "hidden_mode": ("resonant rate of speed", {"period": 0.8, "damping": 0.05}),
@@ -75,19 +75,19 @@ PLACES = {
     "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
     "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
     "magnus_lift": ("exchange of speed and drift", {}),
-    "input_square": ("input push", {"scale_of_input": 2.5}),
-    "input_delay": ("input push", {"delay": 0.23}),
-    "input_lag": ("input push", {"lag": 0.2}),
+    "input_square": ("input force", {"scale_of_input": 2.5}),
+    "input_delay": ("input force", {"delay": 0.23}),
+    "input_lag": ("input force", {"lag": 0.2}),
     "sensor_lag": ("output", {"lag": 0.17}),
 }
 
 
 def carts():
-    """Two runs on one clock that goes on, the second as if nothing had been before."""
+    """Return a recording of two independent runs on a single continuous clock."""
     time = torch.arange(120, dtype=torch.float64) * 0.05
     half = torch.arange(2).repeat_interleave(60).double()
-    push = torch.where(half == 0, 1.5 + torch.sin(3.0 * time), torch.cos(4.0 * time) - 1.0)
-    columns = {"time": time, "push": push, "height": 0.3 * torch.sin(2.0 * time), "side": 0.2 * torch.cos(time)}
+    force = torch.where(half == 0, 1.5 + torch.sin(3.0 * time), torch.cos(4.0 * time) - 1.0)
+    columns = {"time": time, "force": force, "height": 0.3 * torch.sin(2.0 * time), "side": 0.2 * torch.cos(time)}
     return Recording({**columns, "experiment": half})
 
 

@@ -84,8 +84,8 @@ def test_a_current_in_other_units_is_one_in_amperes():
         assert np.abs(field - applied(model, of)).max() < CLOSE
 
 
-def test_other_effects_are_left_out_and_told():
-    """The offset is then that at the driver's mean, where apply has the same."""
+def test_other_effects_are_left_out_and_reported():
+    """The offset is that at the mean of the driver, where it equals that of apply."""
     model = model_of([CABLE, WARMTH], [(0.3, -0.2, 0.4), (0.5, 0.1, -0.2)])
     correction = sensor_correction(model, "mast")
     assert correction.left_out == (

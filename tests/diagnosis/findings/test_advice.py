@@ -9,7 +9,15 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
-from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_environment, make_unfit, nearest, with_evidence
+from tests.diagnosis.factory import (
+    LOST,
+    PROCESS_NOISE,
+    make_diagnosis,
+    make_environment,
+    make_unfit,
+    nearest,
+    with_evidence,
+)
 
 
 def advised(findings=1, *, alternatives=(), **changes):
@@ -20,7 +28,7 @@ def advised(findings=1, *, alternatives=(), **changes):
     return advice_of(dataclasses.replace(made, findings=(first, *rest)))
 
 
-def test_each_effect_s_own_advice_is_told_and_nothing_against_it():
+def test_the_advice_of_each_effect_is_given():
     step, model = advised(1)
     assert step == "Look for what changed at that time; use the calibration from after the step."
     assert model.startswith("The model found here corrects for hard_iron_step")
@@ -31,21 +39,21 @@ def test_each_effect_s_own_advice_is_told_and_nothing_against_it():
     assert several[1] == "current_field: move the sensor away from the power wires."
 
 
-def test_what_belongs_to_the_place_is_not_for_other_recordings():
+def test_a_location_specific_finding_is_not_for_other_recordings():
     made = make_diagnosis(1, samples=50)
     placed = dataclasses.replace(made.findings[0], location_specific=True, alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(placed,)))
     assert "model found here" not in only
 
 
-def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
+def test_an_intermittent_cause_is_to_be_found_and_not_corrected():
     made = make_diagnosis(1, samples=50)
     step = dataclasses.replace(with_evidence(made.findings[0], intermittency.as_result(True)), alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
     assert only.startswith("Look for a cause that is switched on and off")
 
 
-def test_what_a_rival_could_be_instead_is_done_only_once_it_is_told_apart():
+def test_advice_is_conditional_until_the_rival_is_distinguished():
     drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     apart, do, _model = advised(1, alternatives=(drift,))
     assert apart.startswith("To distinguish hard_iron_step from offset_drift")
@@ -73,12 +81,12 @@ def test_what_is_only_nearest_is_not_built_in(formula, text):
     assert "Add radiation" not in only
 
 
-def test_a_simulation_that_does_not_follow_is_mended_first():
+def test_an_unfit_simulation_is_to_be_corrected_first():
     (only,) = make_unfit().advice
     assert only.startswith("Do not rely on this simulation yet: check the reasons")
 
 
-def test_a_contradiction_never_says_that_the_simulation_can_be_used():
+def test_a_poor_fit_never_advises_using_the_simulation():
     lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=()))
     assert lost.verdict == "adequate"
     assert "Use the simulation as it is" not in " ".join(lost.advice)
@@ -86,18 +94,18 @@ def test_a_contradiction_never_says_that_the_simulation_can_be_used():
     assert followed.advice == ("The simulation can be used within the range of this recording.",)
 
 
-def test_what_pushes_a_state_is_looked_for_and_counted_on():
+def test_a_disturbance_is_to_be_found_and_used_as_process_noise():
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment()).advice
     assert only.startswith("Look for the cause of the disturbance of the rate of `rate`")
     assert "use 0.23 rad/s² as the process noise" in only
-    slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
+    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False)
     (only,) = make_diagnosis(
         0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))
     ).advice
     assert only.startswith("Look for a cause of the drift of `angle`")
 
 
-def test_a_step_and_a_drift_are_told_apart_by_another_recording():
+def test_a_step_and_a_drift_are_distinguished_by_another_recording():
     drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     sentence = advised(1, alternatives=(drift,))[0]
     assert sentence == (
@@ -108,7 +116,7 @@ def test_a_step_and_a_drift_are_told_apart_by_another_recording():
     assert "hold the other" not in sentence
 
 
-def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
+def test_an_event_and_a_column_are_distinguished_by_changing_the_column_at_other_times():
     current = Alternative("current_field", ("current",), 0.4, False)
     assert advised(1, alternatives=(current,))[0] == (
         "To distinguish hard_iron_step from current_field (current), record again: a step does not come at the same "
@@ -125,7 +133,7 @@ def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
         (Alternative("linear_drag", (), 0.4, False, "rate of speed"), "change at other times."),
     ],
 )
-def test_two_columns_are_told_apart_by_changing_one(rival, how):
+def test_two_columns_are_distinguished_by_changing_only_one(rival, how):
     made = make_diagnosis(2, samples=50)
     current = dataclasses.replace(made.findings[1], alternatives=(rival,))
     assert advice_of(dataclasses.replace(made, findings=(current,)))[0].endswith(how)
@@ -139,7 +147,7 @@ def test_two_columns_are_told_apart_by_changing_one(rival, how):
         ("", "with other inputs and amplitudes"),
     ],
 )
-def test_rivals_are_told_apart_by_what_the_kind_of_state_can_do(kind, how):
+def test_rivals_are_distinguished_according_to_the_kind_of_state(kind, how):
     made = make_diagnosis(1, samples=50)
     rival = Alternative("stribeck_friction", (), 0.4, False, "rate of speed")
     first = dataclasses.replace(
@@ -179,7 +187,7 @@ def test_effects_of_the_catalogue_say_what_another_recording_shows():
     assert HardIronStep.recurrence != OffsetDrift.recurrence
 
 
-def test_two_findings_of_one_name_are_told_apart_by_their_place():
+def test_two_findings_of_the_same_effect_are_distinguished_by_their_place():
     made = make_diagnosis(1, samples=50)
     first = dataclasses.replace(made.findings[0], alternatives=(), channels=("rate of speed",))
     second = dataclasses.replace(first, grade="unconfirmed", channels=("rate of climb",))

@@ -45,7 +45,7 @@ def doubted(tank, name, **shape):
     return shape_at_ends(term, tank, term.context(tank, None))
 
 
-def test_a_number_at_the_end_of_its_range_is_told(tank):
+def test_a_parameter_at_its_bound_is_reported(tank):
     largest = tank.ports["rate of level"].sizes["own"].largest
     (text,) = doubted(tank, "overflow", rim=0.98 * largest, exponent=1.7)
     assert text.startswith("overflow: its rim ended at ")
@@ -83,7 +83,7 @@ def test_an_amplitude_at_its_end_or_ten_times_what_is_plausible_cannot_be(tank):
     assert text(Known(), 0.9, "lagged rate of level") == ""
 
 
-def test_what_cannot_be_is_not_confirmed_and_says_why():
+def test_an_impossible_size_is_unconfirmed_with_its_reason():
     made = make_diagnosis(1, samples=50)
     why = "Its share ended at 30, the upper bound: the recording does not limit it."
     odd = dataclasses.replace(made.findings[0], cannot_be=True, plausible=False, plausibility=why, alternatives=())

@@ -28,11 +28,11 @@ def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", uni
         (lambda x: 2.0 * x, (-9.0, -1.0), "2 speed m/s² (RMS error 0 %)"),
     ],
 )
-def test_known_functions_are_told(make, range_, text):
+def test_known_functions_are_found(make, range_, text):
     assert formulas(curve(make, *range_)) == (f"δ(rate of speed) = {text}",)
 
 
-def test_no_more_terms_than_the_band_asks_for():
+def test_no_more_terms_than_the_band_requires():
     slightly_bent = curve(lambda x: x + 0.02 * x**3, band=0.2)
     (text,) = formulas(slightly_bent)
     assert "speed³" not in text
@@ -40,7 +40,7 @@ def test_no_more_terms_than_the_band_asks_for():
     assert "0.02 speed³" in closer
 
 
-def test_what_no_formula_gives_says_how_far_it_is_off():
+def test_a_curve_without_a_formula_has_a_large_rms_error():
     (text,) = formulas(curve(lambda x: torch.sin(6.0 * x), band=1e-3))
     off = int(text.rpartition("(RMS error ")[2].split(" %")[0])
     assert off > 20
@@ -53,5 +53,5 @@ def test_each_channel_has_its_own():
     assert found == ("δ(mag_x) = 0.1 temp µT (RMS error 0 %)", "δ(mag_y) = 1 − 0.2 temp µT (RMS error 0 %)")
 
 
-def test_a_curve_that_is_nothing_is_told():
+def test_a_zero_curve_has_a_formula():
     assert formulas(curve(torch.zeros_like))[0].startswith("δ(rate of speed) = ")

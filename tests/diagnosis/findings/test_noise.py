@@ -1,4 +1,4 @@
-"""The noise that is left, as a user reads it."""
+"""The residual noise as reported to the user."""
 
 import pytest
 import torch
@@ -10,8 +10,8 @@ from mkc_torch.simulation import Magnetometer
 pytestmark = pytest.mark.e2e
 
 
-def told(step, correlation):
-    """The noise that a diagnosis tells of, of a turning sensor whose offset walks by so much a sample."""
+def reported_noise(step, correlation):
+    """Return the noise that a diagnosis reports for a turning sensor whose offset drifts by `step` µT per sample."""
     generator = torch.Generator().manual_seed(4)
     time = 0.02 * torch.arange(2000, dtype=torch.float64)
     turn = torch.stack([torch.sin(0.9 * time), torch.cos(1.3 * time), torch.sin(1.7 * time + 1.0)], -1)
@@ -27,8 +27,8 @@ def told(step, correlation):
     ).noise
 
 
-def test_an_offset_that_wanders_is_told_with_its_unit():
-    noise = text(0.08, 0.0)
+def test_a_drifting_offset_is_reported_with_its_unit():
+    noise = reported_noise(0.08, 0.0)
     assert noise.model == "random_walk"
     size = f"{noise.parameters['wander']:.2g} µT in all"
     assert noise.description.endswith(f"noise around an offset that wanders like a random walk, by {size}")
@@ -36,8 +36,8 @@ def test_an_offset_that_wanders_is_told_with_its_unit():
     assert noise.units["wander"] == noise.unit == "µT"
 
 
-def test_noise_with_a_memory_is_coloured_and_without_one_white():
-    coloured, white = text(0.0, 0.7), text(0.0, 0.0)
+def test_correlated_noise_is_coloured_and_uncorrelated_noise_is_white():
+    coloured, white = reported_noise(0.0, 0.7), reported_noise(0.0, 0.0)
     assert (coloured.model, white.model) == ("ar", "white")
     # the noise is Gaussian, though the fitted σ need not be infinite
     assert (coloured.description, white.description) == ("Gaussian coloured noise", "Gaussian white noise")

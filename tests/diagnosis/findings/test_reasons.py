@@ -1,4 +1,4 @@
-"""Why a simulation does not follow: a sign turned round, an input that is late or idle, an end of a range."""
+"""Reasons for a poor fit: a reversed sign, a delayed or idle input, a parameter at its bound."""
 
 import dataclasses
 
@@ -19,50 +19,53 @@ N = 150
 
 @pytest.fixture(autouse=True)
 def _one_lag(monkeypatch):
-    """Others take their time."""
+    """Try a single lag, to save time."""
     monkeypatch.setattr(reasons, "_LAGS", (5,))
 
 
 def at(recording, stiffness=9.0, damping=0.15, system=Pendulum):
-    """A pendulum with these parameters, fitted to nothing."""
+    """Return a pendulum at these parameters, without fitting."""
     prepared = system().prepare(recording)
     theta = prepared.start().clone()
     theta[:2] = torch.tensor([stiffness, damping], dtype=theta.dtype)
     model = JointModel(prepared)
     residual = model.residual(theta).detach()
-    one = theta.new_ones(1)
-    return FittedModel(model, theta, one, one, 3.0 * one, residual, torch.ones_like(residual), 0.0, True)
+    unit_scale = theta.new_ones(1)
+    return FittedModel(
+        model, theta, unit_scale, unit_scale, 3.0 * unit_scale, residual, torch.ones_like(residual), 0.0, True
+    )
 
 
-def told_of(fit):
-    """Reasons, and the residual that the first of them says is reached."""
+def reasons_for(fit):
+    """Return the reasons for the poor fit of a simulation."""
     known = goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
     return reasons_of([fit], known)
 
 
 def reached(sentence):
+    """Return the residual in rad that a reason states."""
     return float(sentence.split(" it follows angle to ")[1].removesuffix(" rad."))
 
 
 @pytest.mark.e2e
-def test_an_input_of_the_other_sign_is_told():
-    text = told_of(at(swung(effect=-1.0, N=N)[0]))
+def test_an_input_of_the_other_sign_is_reported():
+    text = reasons_for(at(swung(effect=-1.0, N=N)[0]))
     assert text[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
     assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
-    # with its sign turned round it matters
+    # with its sign reversed it matters
     assert not any("does not matter" in item for item in text)
 
 
 @pytest.mark.e2e
-def test_an_input_that_acts_late_is_told_with_its_delay():
-    text = told_of(at(swung(late=5, N=N)[0]))
+def test_a_delayed_input_is_reported_with_its_delay():
+    text = reasons_for(at(swung(late=5, N=N)[0]))
     assert text[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
     assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
 
 
 @pytest.mark.e2e
-def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
-    text = told_of(at(swung(N=N)[0], system=UpsideDown))
+def test_a_parameter_of_the_other_sign_is_reported_even_outside_its_range():
+    text = reasons_for(at(swung(N=N)[0], system=UpsideDown))
     assert text[0].startswith("With `stiffness` = -")
     assert ", which its range forbids, it follows angle to 0.00" in text[0]
     value = float(text[0].split("`stiffness` = ")[1].split(",")[0])
@@ -72,14 +75,14 @@ def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
 @pytest.mark.e2e
 def test_an_input_that_does_nothing_does_not_matter():
     recording, _ = swung(effect=0.0, N=N)
-    text = told_of(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
+    text = reasons_for(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
     assert "`torque` does not matter: held at its mean the simulation follows angle as well." in text
 
 
 @pytest.mark.e2e
 def test_an_input_that_acts_matters():
     """With a fifth of the stiffness missing."""
-    text = told_of(at(swung(N=N)[0], stiffness=7.0))
+    text = reasons_for(at(swung(N=N)[0], stiffness=7.0))
     assert not any("does not matter" in item for item in text)
 
 
@@ -110,7 +113,7 @@ def test_a_parameter_at_the_greatest_value_of_its_range_is_named():
     assert at_ends(fit) == ("stiffness",)
 
 
-def test_what_is_no_differential_equation_has_no_range_to_end_at_and_is_told_to_be_looked_over():
+def test_a_simulation_without_differential_equations_gets_general_advice():
     line = Line(100)
     fit = fitted(JointModel(line), line.start())
     assert at_ends(fit) == ()
@@ -124,19 +127,19 @@ def _no_trials(monkeypatch):
 
 
 @pytest.mark.usefixtures("_no_trials")
-def test_an_end_of_a_range_is_told_with_its_value():
-    (text,) = told_of(at(swung(N=N)[0], damping=0.0))
+def test_a_parameter_at_its_bound_is_reported_with_its_value():
+    (text,) = reasons_for(at(swung(N=N)[0], damping=0.0))
     assert text.startswith("`damping` is fitted to its bound, 0:")
 
 
 @pytest.mark.usefixtures("_no_trials")
 @pytest.mark.parametrize(("damping", "words"), [(1e-4, "nearly 0"), (30.0, "at 1e+02 times its start value")])
-def test_a_parameter_that_vanishes_or_runs_away_is_told(damping, words):
-    (text,) = told_of(at(swung(N=N)[0], damping=damping))
+def test_a_parameter_that_vanishes_or_diverges_is_reported(damping, words):
+    (text,) = reasons_for(at(swung(N=N)[0], damping=damping))
     assert text.startswith(f"The open-loop fit is best with `damping` {words}")
 
 
 @pytest.mark.usefixtures("_no_trials")
-def test_where_nothing_mends_it_that_is_said_with_what_to_compare():
-    (text,) = told_of(at(swung(N=N)[0]))
+def test_without_a_remedy_the_advice_is_to_compare_columns():
+    (text,) = reasons_for(at(swung(N=N)[0]))
     assert text.startswith("No other start, sign or delay of an input improves the fit: compare columns")

@@ -25,7 +25,7 @@ STEP, N, NOISE = 0.1, 300, 0.01
 
 
 class Boat(Dynamics):
-    """A boat that is pushed to and fro, in water that holds nothing."""
+    """A boat driven by an alternating thrust, without drag."""
 
     states = ("speed",)
     inputs = ("thrust",)
@@ -120,7 +120,7 @@ def curve_of(values, low=-2.0, driver="speed", band=0.01):
 
 @pytest.mark.parametrize("power", [0.5, 1.5, 1.7, 2.0, 3.0])
 @pytest.mark.parametrize("low", [-2.0, 0.1])
-def test_a_power_law_is_read_off_exactly_beside_a_straight_line(power, low):
+def test_a_power_law_is_found_exactly_in_addition_to_a_straight_line(power, low):
     drawn = curve_of(lambda x: -0.7 * x.abs() ** power * x.sign() + 0.4 * x - 1.2, low)
     assert nearest_power(drawn) == f"-0.7 |speed|^{power:.2g} sign(speed) plus a straight line"
 
@@ -134,5 +134,5 @@ def test_where_a_curve_is_hardly_known_it_hardly_counts():
     assert nearest_power(doubted) == nearest_power(drawn)
 
 
-def test_no_power_is_told_of_a_curve_without_a_value():
+def test_a_curve_of_nan_has_no_power():
     assert nearest_power(curve_of(lambda x: torch.full_like(x, torch.nan))) == ""

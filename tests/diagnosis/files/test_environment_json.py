@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.evidence import held_out_gain
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, validate
 from mkc_torch.diagnosis.result import DivergedBlock, EvidenceResult, HeldOut, ResidualSizes
 from tests.diagnosis.factory import (
-    PUSHED,
+    PROCESS_NOISE,
     graded,
     make_diagnosis,
     make_environment,
@@ -40,11 +40,11 @@ def written(diagnosis):
     return json.loads(diagnosis_to_json(diagnosis))
 
 
-def pushed(**changes):
+def disturbed(**changes):
     return make_diagnosis(0, verdict="unexplained", samples=200, environment=make_environment(**changes))
 
 
-def test_a_diagnosis_that_knows_nothing_of_the_world_is_written():
+def test_a_diagnosis_without_an_environment_is_written():
     content = written(make_diagnosis(1, environment=NoiseEnvironment()))
     assert content["goodness_of_fit"] == {}
     assert content["disturbance"] == content["reasons"] == []
@@ -57,9 +57,9 @@ def test_a_diagnosis_that_knows_nothing_of_the_world_is_written():
     }  # fmt: skip
 
 
-def test_how_each_output_is_followed_is_written_in_its_own_unit():
+def test_goodness_of_fit_is_written_in_the_unit_of_each_output():
     unknown = make_follows("rate", "rad/s", rmse_of_last_value=math.nan, floor_source="quantisation")
-    content = written(pushed(goodness_of_fit=(make_follows(), unknown)))
+    content = written(disturbed(goodness_of_fit=(make_follows(), unknown)))
     assert content["goodness_of_fit"]["angle"] == {
         "unit": "rad", "residual": 0.0049, "variation": 0.35, "explained": pytest.approx(0.9998, abs=1e-4),
         "noise_floor": 0.005, "floor_source": "declared", "rmse_of_mean": 0.35, "rmse_of_last_value": 0.021,
@@ -67,10 +67,10 @@ def test_how_each_output_is_followed_is_written_in_its_own_unit():
     assert content["goodness_of_fit"]["rate"]["rmse_of_last_value"] is None
 
 
-def test_pushes_and_what_inputs_do_are_written():
-    slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad")
-    weak = dataclasses.replace(PUSHED, correlation_time=0.0, size=0.05, standard_error=math.inf)
-    noise = written(pushed(process_noise=(PUSHED, slow, weak)))["noise"]
+def test_process_noise_and_input_hold_are_written():
+    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad")
+    weak = dataclasses.replace(PROCESS_NOISE, correlation_time=0.0, size=0.05, standard_error=math.inf)
+    noise = written(disturbed(process_noise=(PROCESS_NOISE, slow, weak)))["noise"]
     assert noise["process"]["rate"]["size"] == 0.2284
     assert noise["process"]["rate"]["unit"] == "rad/s²"
     assert [item["size"] for item in noise["process"]["rate"]["weaker"]] == [0.05]
@@ -80,23 +80,23 @@ def test_pushes_and_what_inputs_do_are_written():
 
 
 @pytest.mark.parametrize(("samples", "points"), [(300, 300), (500, 500), (501, 251), (40_000, 500)])
-def test_a_forcing_of_any_length_is_written_briefly(samples, points):
-    (forcing,) = written(pushed(disturbance=(make_forcing(samples),)))["disturbance"]
+def test_a_long_disturbance_is_decimated(samples, points):
+    (forcing,) = written(disturbed(disturbance=(make_forcing(samples),)))["disturbance"]
     assert len(forcing["time"]) == len(forcing["value"]) == len(forcing["band"]) == points
     assert forcing["state"] == "rate"
     assert forcing["time"][:3] == [0.0, *forcing["time"][1:3]]
     assert max(len(f"{v:.12g}".lstrip("-0.").replace(".", "")) for v in forcing["value"]) <= 6
 
 
-def test_lists_of_a_forcing_go_together():
-    content = written(pushed())
+def test_lists_of_a_disturbance_have_equal_lengths():
+    content = written(disturbed())
     content["disturbance"][0]["band"].pop()
     with pytest.raises(DiagnosisFileError, match=r"disturbance\.0` has lists of different lengths"):
         validate(content)
 
 
-def test_what_remains_is_white_or_correlated_up_to_a_lag():
-    stored = written(with_evidence(pushed(), WHITENESS))["remaining"]
+def test_whiteness_of_the_residual_is_written():
+    stored = written(with_evidence(disturbed(), WHITENESS))["remaining"]
     assert stored == {
         "white": False, "largest_lag": 0.7, "unit": "s", "channels": ["angle"], "disturbed_states": ["rate"],
         "smooth_along": [],
@@ -111,7 +111,7 @@ def test_an_unfit_simulation_has_reasons_and_names_no_physics():
         diagnosis_to_json(make_diagnosis(1, verdict="unfit"))
 
 
-def test_an_adequate_simulation_lacks_nothing_that_counts():
+def test_an_adequate_simulation_has_only_unconfirmed_findings():
     made = make_diagnosis(1, samples=200, verdict="adequate")
     weak = dataclasses.replace(made, findings=(graded(made.findings[0], "unconfirmed"),))
     assert written(weak)["findings"][0]["grade"] == "unconfirmed"

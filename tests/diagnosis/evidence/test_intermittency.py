@@ -14,7 +14,7 @@ TIME = torch.arange(N, dtype=torch.float64)
 
 
 def gain_of(course, size, phi=0.0, seed=0):
-    """Of a step of this size after the onset, in noise of one with this memory that is taken for white."""
+    """Return the gain, assuming white noise, of a step of this size in unit AR(1) noise with coefficient `phi`."""
     generator = torch.Generator().manual_seed(seed)
     white = torch.randn(N, generator=generator, dtype=torch.float64) * (1.0 - phi**2) ** 0.5
     noise = white.clone()
@@ -36,7 +36,7 @@ def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (1.0, 0.0), (3.0, 0.9)])
-def test_what_is_switched_comes_and_goes(size, phi, seed):
+def test_a_switched_offset_comes_and_goes(size, phi, seed):
     switched = (TIME >= ONSET).double() * (torch.sin((TIME - ONSET) / 100.0) >= -0.3).double()
     gain = gain_of(switched, size, phi, seed)
     assert comes_and_goes(
@@ -46,7 +46,7 @@ def test_what_is_switched_comes_and_goes(size, phi, seed):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("lasts", [True, False])
-def test_a_diagnosis_says_which_of_the_two_its_step_is(lasts):
+def test_a_diagnosis_distinguishes_lasting_from_intermittent_steps(lasts):
     generator = torch.Generator().manual_seed(2)
     time = 0.02 * torch.arange(2000, dtype=torch.float64)
     turn = torch.stack([torch.sin(0.9 * time), torch.cos(1.3 * time), torch.sin(1.7 * time + 1.0)], -1)

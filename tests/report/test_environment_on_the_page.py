@@ -17,7 +17,7 @@ from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.diagnosis.factory import (
     LOST,
-    PUSHED,
+    PROCESS_NOISE,
     graded,
     make_diagnosis,
     make_environment,
@@ -146,7 +146,7 @@ def test_runs_are_not_joined_by_a_line():
 
 
 def test_something_slow_in_a_sensor_is_told_as_such():
-    slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
+    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
     text = text_of(diagnosis_report(pushed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
     assert "angle drift in addition to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
@@ -262,7 +262,7 @@ def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
 
 
 def test_the_statisticians_numbers_are_one_click_below():
-    page = diagnosis_report(pushed(process_noise=(PUSHED,)))
+    page = diagnosis_report(pushed(process_noise=(PROCESS_NOISE,)))
     closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
     assert closed[:4] == [
         "Goodness of fit", "Process noise and drift", "Scores on held-out data",
@@ -294,7 +294,7 @@ def test_nats_are_explained_once_where_they_are_met():
 
 def test_names_of_the_world_are_escaped():
     bad = "<b>x</b> & $a$"
-    push = dataclasses.replace(PUSHED, place=bad, unit=bad)
+    push = dataclasses.replace(PROCESS_NOISE, place=bad, unit=bad)
     forcing = dataclasses.replace(make_forcing(50, push), sentences=(bad,))
     hostile = make_environment(
         goodness_of_fit=(make_follows(bad, bad),),

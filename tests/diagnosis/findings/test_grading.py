@@ -1,4 +1,4 @@
-"""What a finding is worth."""
+"""The grade of a finding."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A candidate that is there in one stretch alone is told of with its times."""
+"""A candidate confined to one stretch is reported with its times."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ PREPARED = SimpleNamespace(time=torch.arange(100) / 10.0)
 CASE = EvidenceContext(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0, Settings())
 
 
-def said(term, stretch):
+def evidence_for(term, stretch):
     return localised.test(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
 
 
@@ -27,12 +27,12 @@ def said(term, stretch):
     ("effect", "driver", "name"),
     [("offset_drift", None, "offset_drift"), ("current_field", LOAD, "current_field by load")],
 )
-def test_it_is_named_with_its_times(effect, driver, name):
-    text = said(Term(EFFECTS[effect], driver, {}), (20, 40))
+def test_a_localised_candidate_is_named_with_its_times(effect, driver, name):
+    text = evidence_for(Term(EFFECTS[effect], driver, {}), (20, 40))
     assert text.value == pytest.approx((2.0, 3.9))
     assert text.warnings[0].startswith(f"From 2.0 to 3.9 s the residual fits {name}")
 
 
-def test_of_what_is_everywhere_and_of_nothing_there_is_no_warning():
-    assert said(Term(EFFECTS["offset_drift"], None, {}), None).warnings == ()
+def test_a_candidate_without_a_stretch_or_no_candidate_has_no_warning():
+    assert evidence_for(Term(EFFECTS["offset_drift"], None, {}), None).warnings == ()
     assert localised.test(CASE).warnings == ()

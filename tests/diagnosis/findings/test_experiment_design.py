@@ -1,4 +1,4 @@
-"""What to record to tell two effects apart, by the tangents of a recording in which they go along with one another."""
+"""Which experiment distinguishes two effects, from the tangents of a recording in which they are collinear."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ EFFECTS = [effect for effect in CATALOGUE if effect.id in ("current_field", "tem
 
 
 def diagnosed(temperature, current=CURRENT):
-    """The field of a current that the temperature goes along with; and its rival."""
+    """Return the diagnosis of a current field whose temperature is correlated with the current, and the rival."""
     sensor = np.outer(current, [0.15, -0.12, 0.12])
     recording = tumbling(N, noise=0.4, sensor=sensor, current=current, temperature=20.0 + temperature)
     result = diagnose(Magnetometer("norm"), recording, effects=EFFECTS, surrogates=19, max_findings=1)
@@ -31,8 +31,8 @@ def more(text):
     return float(text.split(" times as many samples")[0].split()[-1])
 
 
-def test_the_state_in_which_they_part_is_told():
-    """The temperature follows the current but for its highest values, which are short."""
+def test_the_distinguishing_state_is_reported():
+    """The temperature follows the current except for its highest values, which are brief."""
     current = 1.5 * np.sin(2.0 * np.pi * TIME / 9.0) ** 3
     result, rival = diagnosed(np.minimum(current, 1.1), current)
     assert not rival.separable
@@ -42,20 +42,20 @@ def test_the_state_in_which_they_part_is_told():
     assert any(rival.distinguishing_state in sentence for sentence in advice_of(result))
 
 
-def test_what_goes_the_same_way_cannot_be_told_by_more_of_it():
+def test_collinear_effects_cannot_be_distinguished_by_more_samples():
     result, rival = diagnosed(2.0 * CURRENT)
     assert (rival.separable, rival.distinguishing_state) == (False, SAME)
     assert any(SAME in sentence for sentence in result.advice)
 
 
-def test_the_less_they_part_the_more_it_takes():
+def test_more_samples_are_needed_the_more_collinear_the_effects_are():
     far, near = (diagnosed(CURRENT + apart * np.sin(2.0 * np.pi * TIME / 4.3))[1] for apart in (0.25, 0.1))
     assert not far.separable
     assert not near.separable
-    # what tells them apart goes with the square of how far they part
+    # the information that distinguishes them grows with the square of their difference
     assert more(near.distinguishing_state) / more(far.distinguishing_state) == pytest.approx(6.25, rel=0.35)
 
 
-def test_of_what_is_told_apart_nothing_is_to_be_recorded():
+def test_separable_effects_need_no_further_recording():
     _, rival = diagnosed(CURRENT + 0.6 * np.sin(2.0 * np.pi * TIME / 4.3))
     assert (rival.separable, rival.distinguishing_state) == (True, "")

@@ -1,4 +1,4 @@
-"""What was found under pushes is told by its free run; where one is lost, all stays as it is."""
+"""Findings under process noise are evaluated by their open-loop fits; if any of these fails, nothing changes."""
 
 import dataclasses
 import functools
@@ -21,25 +21,27 @@ from tests.diagnosis.swing import at_the_truth, candidates
 
 BLOCKS = blocks_of(500, 1, ConfirmationSettings())
 KEPT = SimpleNamespace()
-"""Evidence that only has to be the same."""
+"""Placeholder evidence, compared by identity."""
 
 
 def located(fit):
-    """Of a search, its fit alone."""
+    """Return a search result that holds this fit."""
     return SearchResult(fit.model.terms[-1] if fit.model.terms else None, fit, 0.01, 9.0, (), None, None, None)
 
 
 @functools.cache
-def under_pushes():
-    """A simulation alone and with a drag, both under pushes."""
+def under_process_noise():
+    """Return fits without and with a drag, both under process noise."""
     base = at_the_truth("white", 1)
     (term,) = [candidate for candidate in candidates(base, (QuadraticDrag(),)) if candidate.port == "rate of rate"]
     model = base.model.with_term(term)
-    one = dataclasses.replace(base, model=model, parameters=torch.cat([base.parameters, base.parameters.new_zeros(1)]))
-    return base, located(one)
+    with_drag = dataclasses.replace(
+        base, model=model, parameters=torch.cat([base.parameters, base.parameters.new_zeros(1)])
+    )
+    return base, located(with_drag)
 
 
-def test_what_runs_freely_already_stays_the_same():
+def test_an_open_loop_fit_stays_unchanged():
     line = Line(500)
     base = fitted(JointModel(line), line.start())
     found = (located(base),)
@@ -50,16 +52,16 @@ def test_what_runs_freely_already_stays_the_same():
 
 
 @pytest.mark.e2e
-def test_fits_under_pushes_are_fitted_to_their_free_runs_and_judged_by_these():
-    base, one = under_pushes()
+def test_fits_under_process_noise_are_refitted_and_evaluated_open_loop():
+    base, finding = under_process_noise()
     alone = refit_open_loop(base)
-    again = open_loop_evidence(base, alone, (one,), (KEPT, KEPT), BLOCKS)
+    again = open_loop_evidence(base, alone, (finding,), (KEPT, KEPT), BLOCKS)
     assert again.base is alone
     (found,) = again.found
-    assert has_process_noise(one.fit)
+    assert has_process_noise(finding.fit)
     assert not has_process_noise(found.fit)
-    # all else that is known of it is kept
-    assert (found.term, found.p_value, found.beyond) == (one.term, one.p_value, one.beyond)
+    # the other fields of the search result are kept
+    assert (found.term, found.p_value, found.beyond) == (finding.term, finding.p_value, finding.beyond)
     assert found.fit.log_likelihood >= alone.log_likelihood - 1.0
     before, after = again.held_out
     assert torch.equal(before.residual, held_out(alone, BLOCKS).residual)
@@ -67,22 +69,22 @@ def test_fits_under_pushes_are_fitted_to_their_free_runs_and_judged_by_these():
     assert not torch.equal(after.residual, before.residual)
 
 
-def as_it_is(again, base, found):
+def assert_unchanged(again, base, found):
     assert again.base is base
     assert again.found is found
     assert again.held_out == (KEPT, KEPT)
 
 
-def test_where_the_simulation_alone_loses_the_recording_all_is_told_under_pushes():
-    base, one = under_pushes()
-    found = (one,)
-    as_it_is(open_loop_evidence(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
+def test_process_noise_is_kept_if_the_simulation_alone_diverges_open_loop():
+    base, finding = under_process_noise()
+    found = (finding,)
+    assert_unchanged(open_loop_evidence(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
 
 
 @pytest.mark.parametrize("lost", [("refit_open_loop", "_from_alone"), ("_judged",)])
-def test_where_a_finding_loses_the_recording_or_an_unseen_block_all_is_told_under_pushes(monkeypatch, lost):
-    base, one = under_pushes()
-    alone, found = refit_open_loop(base), (one,)
+def test_process_noise_is_kept_if_a_finding_diverges_open_loop_or_on_a_held_out_block(monkeypatch, lost):
+    base, finding = under_process_noise()
+    alone, found = refit_open_loop(base), (finding,)
     for name in lost:
         monkeypatch.setattr(module, name, lambda *_: None)
-    as_it_is(open_loop_evidence(base, alone, found, (KEPT, KEPT), BLOCKS), base, found)
+    assert_unchanged(open_loop_evidence(base, alone, found, (KEPT, KEPT), BLOCKS), base, found)
