@@ -83,6 +83,6 @@ def test_a_diagnosis_notes_that_a_finding_was_evaluated_given_the_others(monkeyp
     effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]
     recording = tumbling(N, noise=0.3, sensor=sensor, current=current)
     first, last = diagnose(Magnetometer("norm"), recording, effects=effects, surrogates=19, max_findings=2).findings
-    assert first.held_out_note.startswith("Judged beside the other findings")
+    assert first.held_out_note.startswith("Scored given the other findings")
     assert first.held_out.rmse_after == last.held_out.rmse_after < first.held_out.rmse_before
     assert last.held_out_note == ""

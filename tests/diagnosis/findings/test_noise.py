@@ -30,10 +30,10 @@ def reported_noise(step, correlation):
 def test_a_drifting_offset_is_reported_with_its_unit():
     noise = reported_noise(0.08, 0.0)
     assert noise.model == "random_walk"
-    size = f"{noise.parameters['wander']:.2g} µT in all"
-    assert noise.description.endswith(f"noise around an offset that wanders like a random walk, by {size}")
-    assert 1.0 < noise.parameters["wander"] < 8.0  # 0.08 √2000 is 3.6
-    assert noise.units["wander"] == noise.unit == "µT"
+    size = f"{noise.parameters['drift']:.2g} µT"
+    assert noise.description.endswith(f"noise around an offset with a random walk of standard deviation {size}")
+    assert 1.0 < noise.parameters["drift"] < 8.0  # 0.08 √2000 is 3.6
+    assert noise.units["drift"] == noise.unit == "µT"
 
 
 def test_correlated_noise_is_coloured_and_uncorrelated_noise_is_white():
