@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = ROOT / "tests" / "language" / "words.txt"
 FOLDERS = ("mkc_torch", "docs", "examples", "tests")
-KINDS = {".py", ".md", ".html", ".toml", ".yml", ".cff", ".csv"}
+KINDS = {".py", ".md", ".html", ".j2", ".toml", ".yml", ".cff", ".csv"}
 OWN = {WORDS, Path(__file__).resolve()}
 """Files that quote the words."""
 

@@ -18,15 +18,15 @@ DURATION = 10.0
 
 
 def diagnose(paths, folder):
-    """Says of every second recording that it is adequate, and breaks on the others; looks for the key."""
+    """Report every second recording as adequate, fail at the end, and check that the key is hidden."""
     output = folder.parent
     assert (output / "key_hash.txt").is_file()
     assert not (output / "key.json").exists()
     for path in paths:
         if int(path.stem[-1]) % 2:
             (folder / path.stem).mkdir()
-            said = {"verdict": "adequate", "p_value": 0.5, "findings": []}
-            (folder / path.stem / "diagnosis.json").write_text(json.dumps(said))
+            reported = {"verdict": "adequate", "p_value": 0.5, "findings": []}
+            (folder / path.stem / "diagnosis.json").write_text(json.dumps(reported))
             (folder / path.stem / "model.json").write_text("{}")
     raise RuntimeError("no more")
 

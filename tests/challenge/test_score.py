@@ -24,11 +24,11 @@ def finding(effect, drivers=(), onset=None, parameters=(), alternatives=()):
             "alternatives": list(alternatives)}  # fmt: skip
 
 
-def says(*findings, verdict="explained", p_value=0.01):
+def answer(*findings, verdict="explained", p_value=0.01):
     return {"verdict": verdict, "p_value": p_value, "findings": list(findings)}
 
 
-NOTHING = says(verdict="adequate", p_value=0.5)
+NOTHING = answer(verdict="adequate", p_value=0.5)
 
 
 def measured(result, name):
@@ -39,10 +39,10 @@ def test_false_alarms_are_claims_that_physics_is_missing():
     keys = [key(name, "empty") for name in "abcdef"]
     answers = {
         "a": NOTHING,
-        "b": says(verdict="unexplained"),
-        "c": says(finding("offset_drift")),
+        "b": answer(verdict="unexplained"),
+        "c": answer(finding("offset_drift")),
         "d": NOTHING,
-        "f": says(verdict="unfit"),
+        "f": answer(verdict="unfit"),
     }
     result = score(keys, answers)
     assert (result.false_alarms.count, result.false_alarms.total) == (1, 5)
@@ -55,7 +55,7 @@ def test_false_alarms_are_claims_that_physics_is_missing():
 @pytest.mark.parametrize(("grade", "claimed"), [("left_out", 1), ("small", 1), (None, 1), ("unconfirmed", 0),
                                                 ("nearest", 0)])  # fmt: skip
 def test_the_grade_decides_whether_a_finding_is_a_claim(grade, claimed):
-    reported = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
+    reported = answer(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
     result = score([key("a"), key("b", "empty")], {"a": reported, "b": reported})
     assert result.named.count == result.false_alarms.count == claimed
     assert result.confusion["nothing"] == {"hard_iron_step" if claimed else "unknown": 1}
@@ -70,9 +70,9 @@ def test_named_and_driver_right_among_the_strong():
         key("weak", effect="current_field", drivers=("current",), z_sep=4.0),
     ]
     answers = {
-        "right": says(finding("current_field", ["current"])),
-        "driver": says(finding("current_field", ["aux_1"])),
-        "wrong": says(finding("offset_drift")),
+        "right": answer(finding("current_field", ["current"])),
+        "driver": answer(finding("current_field", ["aux_1"])),
+        "wrong": answer(finding("offset_drift")),
         "weak": NOTHING,
     }
     result = score(keys, answers)
@@ -83,7 +83,7 @@ def test_named_and_driver_right_among_the_strong():
 
 def test_an_inseparable_rival_is_right_and_a_separable_one_wrong():
     keys = [key("below", z_sep=5.0), key("above", z_sep=9.0)]
-    answers = {name: says(finding("driver_offset", ["aux_1"])) for name in ("below", "above")}
+    answers = {name: answer(finding("driver_offset", ["aux_1"])) for name in ("below", "above")}
     bins = {(b.low, b.high): b.named.count for b in score(keys, answers).power_z_sep}
     assert bins[5.0, 7.0] == 1
     assert bins[7.0, 10.0] == 0
@@ -92,27 +92,27 @@ def test_an_inseparable_rival_is_right_and_a_separable_one_wrong():
 @pytest.mark.parametrize(("named", "right"), [("offset_drift", 1), ("hard_iron_step", 1), ("unknown", 1),
                                               ("current_field", 0), ("cubic_nonlinearity", 0)])  # fmt: skip
 def test_a_withheld_driver_is_named_by_its_time_course(named, right):
-    result = score([key("a", effect="current_field", withheld="current")], {"a": says(finding(named))})
+    result = score([key("a", effect="current_field", withheld="current")], {"a": answer(finding(named))})
     assert result.withheld_named.count == right
     assert list(result.confusion) == ["current_field, driver withheld"]
 
 
 def test_position_drives_a_gradient_in_any_part():
     hidden = key("a", effect="field_gradient", drivers=("position_x", "position_y", "position_z"))
-    assert score([hidden], {"a": says(finding("field_gradient", ["position_x"]))}).driver.count == 1
-    assert score([hidden], {"a": says(finding("field_gradient", []))}).driver.count == 0
+    assert score([hidden], {"a": answer(finding("field_gradient", ["position_x"]))}).driver.count == 1
+    assert score([hidden], {"a": answer(finding("field_gradient", []))}).driver.count == 0
 
 
 def test_time_and_field_are_no_drivers():
-    assert score([key("a")], {"a": says(finding("hard_iron_step", ["time"]))}).driver.count == 1
+    assert score([key("a")], {"a": answer(finding("hard_iron_step", ["time"]))}).driver.count == 1
 
 
 def test_candidates_and_separable_share():
     other = {"effect": "offset_drift", "drivers": [], "separable": False}
     ruled_out = other | {"separable": True}
     answers = {
-        "a": says(finding("hard_iron_step", alternatives=[ruled_out])),
-        "b": says(finding("hard_iron_step", alternatives=[other, ruled_out])),
+        "a": answer(finding("hard_iron_step", alternatives=[ruled_out])),
+        "b": answer(finding("hard_iron_step", alternatives=[other, ruled_out])),
     }
     result = score([key("a"), key("b")], answers)
     assert result.separable.value == 0.5
@@ -121,7 +121,7 @@ def test_candidates_and_separable_share():
 
 def test_onset_errors():
     keys = [key("a", onset=10.0), key("b", onset=10.0)]
-    result = score(keys, {"a": says(finding("hard_iron_step", onset=10.4)), "b": says(finding("hard_iron_step"))})
+    result = score(keys, {"a": answer(finding("hard_iron_step", onset=10.4)), "b": answer(finding("hard_iron_step"))})
     assert result.onset_errors == pytest.approx((0.4, math.inf))
     assert measured(result, "step_within").value == 0.5
 
@@ -129,10 +129,10 @@ def test_onset_errors():
 def test_onsets_lie_in_their_intervals_or_not():
     keys = [key(name, onset=10.0) for name in "abcd"]
     answers = {
-        "a": says(finding("hard_iron_step", onset=10.4) | {"onset_interval": [9.9, 10.6]}),
-        "b": says(finding("hard_iron_step", onset=10.4) | {"onset_interval": [10.1, 10.6]}),
-        "c": says(finding("hard_iron_step", onset=10.4)),
-        "d": says(finding("offset_drift")),
+        "a": answer(finding("hard_iron_step", onset=10.4) | {"onset_interval": [9.9, 10.6]}),
+        "b": answer(finding("hard_iron_step", onset=10.4) | {"onset_interval": [10.1, 10.6]}),
+        "c": answer(finding("hard_iron_step", onset=10.4)),
+        "d": answer(finding("offset_drift")),
     }
     result = score(keys, answers)
     assert (result.onset_covered.count, result.onset_covered.total) == (1, 3)
@@ -143,8 +143,8 @@ def test_intervals_of_ninety_per_cent():
     stated = {"name": "step", "value": [1.0, 2.16, 3.17], "standard_error": [0.1, 0.1, 0.1], "unit": "µT"}
     keys = [key("a", parameters=truth), key("b", parameters=truth)]
     answers = {
-        "a": says(finding("hard_iron_step", parameters=[{**stated, "unit": "s"}, stated])),
-        "b": says(finding("hard_iron_step")),
+        "a": answer(finding("hard_iron_step", parameters=[{**stated, "unit": "s"}, stated])),
+        "b": answer(finding("hard_iron_step")),
     }
     result = score(keys, answers)
     assert (result.coverage.count, result.coverage.total) == (2, 3)
@@ -154,7 +154,7 @@ def test_intervals_of_ninety_per_cent():
 def test_parameters_that_are_not_scored_do_not_count():
     truth = (KeyParameter("offset_change", [1.0, 2.0, 3.0], "µT", False),)
     stated = {"name": "step", "value": [0.0] * 3, "standard_error": [0.1] * 3, "unit": "µT"}
-    result = score([key("a", parameters=truth)], {"a": says(finding("hard_iron_step", parameters=[stated]))})
+    result = score([key("a", parameters=truth)], {"a": answer(finding("hard_iron_step", parameters=[stated]))})
     assert result.coverage.total == 0
     assert not measured(result, "coverage").holds
 
@@ -162,7 +162,7 @@ def test_parameters_that_are_not_scored_do_not_count():
 def test_power_over_bins():
     keys = [key(str(z), z=z, z_sep=z) for z in (2.0, 4.0, 12.0, 14.0, 100.0)]
     answers = dict.fromkeys(("2.0", "4.0", "12.0"), NOTHING)
-    answers |= {name: says(finding("hard_iron_step")) for name in ("14.0", "100.0")}
+    answers |= {name: answer(finding("hard_iron_step")) for name in ("14.0", "100.0")}
     bins = [(b.named.count, b.named.total) for b in score(keys, answers).power_z]
     assert bins == [(0, 1), (0, 1), (0, 0), (0, 0), (1, 2), (0, 0), (1, 1)]
 
@@ -171,8 +171,8 @@ def test_two_at_once_are_counted_once_each():
     second = key("x", effect="offset_drift").effects
     keys = [key(name, "double", others=second) for name in "abc"]
     answers = {
-        "a": says(finding("offset_drift"), finding("hard_iron_step")),
-        "b": says(finding("hard_iron_step"), finding("hard_iron_step")),
+        "a": answer(finding("offset_drift"), finding("hard_iron_step")),
+        "b": answer(finding("hard_iron_step"), finding("hard_iron_step")),
         "c": NOTHING,
     }
     assert score(keys, answers).doubles == {0: 1, 1: 1, 2: 1}
@@ -187,10 +187,10 @@ def at(places, effect="coulomb_friction", **more):
 def test_located_right_counts_effects_with_several_ports():
     reported = finding("coulomb_friction") | {"channels": ["rate of speed"]}
     right, wrong = at(["rate of speed", "rate of turn"]), at(["rate of turn"])
-    assert score([right], {"a": says(reported)}).located.count == 1
-    assert score([wrong], {"a": says(reported)}).located.count == 0
-    assert score([wrong], {"a": says(reported)}).driver.total == 0
-    assert score([key("a")], {"a": says(finding("hard_iron_step"))}).located.total == 0
+    assert score([right], {"a": answer(reported)}).located.count == 1
+    assert score([wrong], {"a": answer(reported)}).located.count == 0
+    assert score([wrong], {"a": answer(reported)}).driver.total == 0
+    assert score([key("a")], {"a": answer(finding("hard_iron_step"))}).located.total == 0
 
 
 def test_an_inseparable_rival_is_right_at_its_own_place():
@@ -198,14 +198,14 @@ def test_an_inseparable_rival_is_right_at_its_own_place():
     hidden = at(["rate of turn"])
     hidden = dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], inseparable=(rival,)),))
     for place, right in (("rate of speed", 1), ("rate of lift", 0)):
-        result = score([hidden], {"a": says(finding("linear_drag") | {"channels": [place]})})
+        result = score([hidden], {"a": answer(finding("linear_drag") | {"channels": [place]})})
         assert (result.named.count, result.located.count) == (right, right)
 
 
 def test_other_thresholds_can_be_given():
-    asked = (Threshold("located_right", 0.5, 1.0, "somewhere"),)
+    thresholds = (Threshold("located_right", 0.5, 1.0, "somewhere"),)
     reported = finding("coulomb_friction") | {"channels": ["rate of turn"]}
-    (found,) = score([at(["rate of turn"])], {"a": says(reported)}, thresholds=asked).measured
+    (found,) = score([at(["rate of turn"])], {"a": answer(reported)}, thresholds=thresholds).measured
     assert found.holds
 
 

@@ -146,8 +146,8 @@ def test_the_new_calibration_is_compared_with_the_old(done, tmp_path):
     reported = " ".join(result.stdout.split())
     shown = (tmp_path / "out" / "other" / "report.html").read_text(encoding="utf-8")
     for text in (reported, shown):
-        assert "Beside the calibration mast" in text
-        assert "It differs: offset y by +" in text
+        assert "Comparison with the calibration mast" in text
+        assert "Significant difference: offset y by +" in text
         assert "matrix yz" in text
         assert "Over the directions of the" in text
     assert old.read_bytes() == before

@@ -170,4 +170,4 @@ def test_a_diagnosis_reports_its_stages():
     diagnose(Magnetometer(), concealed_recording(), surrogates=19, progress=reported.append)
     assert reported[:2] == ["reading the recording", "fitting the simulation alone"]
     assert re.fullmatch(r"trying \d+ effects", reported[2])
-    assert re.fullmatch(r"trying \d+ effects beside 1 found", reported[3])
+    assert re.fullmatch(r"trying \d+ effects in addition to 1 found", reported[3])

@@ -70,12 +70,12 @@ def test_the_number_of_the_run_is_no_output(loaded):
 
 
 @pytest.mark.slow
-def test_of_the_heaters_what_is_left_is_located(loaded):
-    """What is unrecorded there pushes both temperatures; beside pushes as slow as these only a delay is claimed."""
+def test_the_process_noise_of_the_heaters_is_located(loaded):
+    """An unrecorded cause disturbs both temperatures; given disturbances this slow only a delay is claimed."""
     shared_data("dynamics/heaters/run_1s.csv")
     case = loaded("systems").heaters(shared_data("dynamics"))
     (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=2)
     assert proof.diagnosis.verdict == "unexplained"
-    assert {push.place for push in proof.diagnosis.environment.process_noise} == {"temperature_1", "temperature_2"}
+    assert {noise.place for noise in proof.diagnosis.environment.process_noise} == {"temperature_1", "temperature_2"}
     claimed = [item.effect for item in proof.diagnosis.findings if item.grade != "unconfirmed"]
     assert claimed in ([], ["input_delay"])

@@ -26,7 +26,7 @@ def test_mm_covers_under_outliers_that_least_squares_follows(example, capsys):
     assert 90.0 <= rows["MM"][0] <= 98.0
     assert 90.0 <= rows["MM"][1] <= 98.0
     assert rows["least squares"][0] > 90.0 > 80.0 > rows["least squares"][1]
-    # outliers far out in X are no part of the design
+    # outliers far out in X do not belong to the design
     assert rows["MM, homoscedastic"][1] < 90.0
 
 

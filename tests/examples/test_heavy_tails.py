@@ -20,7 +20,7 @@ def example():
     return module
 
 
-def test_several_kernels_are_likelier_on_held_out_delays_and_claims_than_one_and_than_a_student_t(example):
+def test_several_kernels_fit_held_out_delays_and_claims_better_than_a_single_kernel_and_a_student_t(example):
     for name, values in example.samples(3000):
         if name in ("departure delays", "fire claims"):
             found = [example.held_out(values, seed) for seed in range(2)]

@@ -24,7 +24,7 @@ def loaded(name):
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
-        # a script finds what lies beside it; dataclasses look their module up
+        # a script imports modules of its own folder; dataclasses look their module up
         patch.setattr(sys, "path", [str(FOLDER), *sys.path])
         patch.setitem(sys.modules, name, module)
         spec.loader.exec_module(module)

@@ -24,7 +24,7 @@ def normal(seed: int, *shape: int) -> Tensor:
 
 
 def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tuple[Tensor, Tensor]:
-    """y = X 1 + noise, the first rows with an outlier of 15: sorted, so that no part of the rows represents all."""
+    """y = X 1 + noise, the first rows with an outlier of 15: sorted, so that no block of rows is representative."""
     X = normal(seed, rows, n)
     X[:, 0] = 1.0
     y = X.sum(-1) + normal(seed + 1, rows)
@@ -411,7 +411,7 @@ def test_an_exact_fit_is_left_to_the_alternation(piloted):
     assert bool(fit.exact_fit_)
 
 
-def test_a_likelier_gaussian_is_left_to_the_alternation(piloted, monkeypatch):
+def test_a_more_likely_gaussian_is_left_to_the_alternation(piloted, monkeypatch):
     X, y = sample(share=0.0)
     X[: N // 5, 1:] = 8.0 + 0.1 * normal(4, N // 5, 4)
     y[: N // 5] = X[: N // 5].sum(-1) - 40.0

@@ -30,13 +30,13 @@ REASON = "|".join(
 """Why likelihood and residual disagree."""
 
 CLAIM = r"[Ll]eft out of the simulation"
-PUSH = r"Process noise (?:acts |remains )?on the rate|in addition to (?:its white|the sensor's) noise"
+DISTURBANCE = r"Process noise (?:acts |remains )?on the rate|in addition to (?:its white|the sensor's) noise"
 NUMBER = r"\d[\d.]*(?: × 10\S+)?"
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two patterns that may not both be in a row, what is said of a finding, or a report, unless a third is there."""
+    """Two patterns that may not both be in a row, in the text on a finding, or in a report, unless a third is there."""
 
     first: str
     second: str
@@ -65,7 +65,7 @@ PAIRS = (
     Pair("[Nn]o missing physics", CLAIM, "report"),
     Pair("[Nn]o missing physics", "[Nn]earest in the catalogue", "report"),
     Pair("[Nn]o missing physics", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
-    Pair("[Nn]o missing physics", PUSH, "report"),
+    Pair("[Nn]o missing physics", DISTURBANCE, "report"),
     Pair(
         "[Nn]o missing physics",
         "[Ss]tructure remains|has structure|smooth trend along|does not fit|unnamed structure",
@@ -77,12 +77,12 @@ PAIRS = (
     Pair(r"named\W+nothing\b(?! confirmed)", f"{CLAIM}|[Nn]earest in the catalogue", "report"),
     Pair(
         r"unexplained\W+nothing\b",
-        f"{PUSH}|[Ss]tructure remains|has structure|smooth trend along",
+        f"{DISTURBANCE}|[Ss]tructure remains|has structure|smooth trend along",
         "report",
         "explained",
     ),
     # what is left
-    Pair("The residual is the sensor's noise", PUSH, "report"),
+    Pair("The residual is the sensor's noise", DISTURBANCE, "report"),
     Pair(
         "The residual is the sensor's noise",
         "[Ss]tructure remains|has structure|smooth trend along|Look for the cause of the disturbance",
@@ -91,7 +91,7 @@ PAIRS = (
     Pair("white", "is not white", "row"),
     Pair(r"correlation time \S+ s", r"is white\.", "row"),
     # what to do
-    Pair("The simulation can be used", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
+    Pair("The simulation can be used", f"{CLAIM}|{DISTURBANCE}|[Nn]earest in the catalogue", "report"),
     Pair(
         "The simulation can be used",
         "does not fit|[Ss]tructure remains|has structure|smooth trend along|Do not rely",
@@ -131,7 +131,7 @@ def _advised(d: Diagnosis, start: str) -> list[str]:
 
 
 def _claimed_and_refused(d: Diagnosis) -> bool:
-    """The same name is to be corrected for and not to be."""
+    """The advice is to correct for an effect and not to correct for it."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
     corrected = set(re.split(", | for ", use)[1:])
     refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
@@ -140,9 +140,7 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
 
 
 def _two_residuals(d: Diagnosis) -> bool:
-    """A page's residuals of the simulation without findings: of held-out blocks in its table, and of the first
-    finding.
-    """
+    """The table of held-out blocks and the first finding give different residuals of the baseline."""
     held = d.findings[0].held_out if d.findings else None
     if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
         return False
@@ -165,18 +163,21 @@ RULES: dict[str, Rule] = {
         f.shape is not None and f.shape.curve is not None for f in _claims(d)
     ),
     "adequate with a finding": lambda d: d.verdict == "adequate" and bool(d.findings),
-    "adequate with a push": lambda d: d.verdict == "adequate" and bool(d.environment.process_noise),
-    "adequate with a forcing": lambda d: d.verdict == "adequate" and bool(d.environment.disturbance),
+    "adequate with process noise": lambda d: d.verdict == "adequate" and bool(d.environment.process_noise),
+    "adequate with an estimated disturbance": lambda d: d.verdict == "adequate" and bool(d.environment.disturbance),
     "adequate with what remains": lambda d: d.verdict == "adequate" and bool(d.remaining),
     "adequate with a warning of a disturbance": lambda d: (
         d.verdict == "adequate"
-        and any(re.search("pushes|is driven|disturbs|something smooth remains|more structure", w) for w in d.warnings)
+        and any(
+            re.search("acts on the rate|is driven|disturbs|smooth trend along|more structure", w)
+            for w in d.warnings
+        )
     ),
     "explained without a claim": lambda d: d.verdict == "explained" and not _claims(d),
     "explained with a finding that is no claim": lambda d: (
         d.verdict == "explained" and len(_claims(d)) < len(d.findings)
     ),
-    "explained with a push of a rate": lambda d: (
+    "explained with process noise of a rate": lambda d: (
         d.verdict == "explained" and any(p.at_rate for p in d.environment.process_noise)
     ),
     "unfit with a finding": lambda d: d.verdict == "unfit" and bool(d.findings),
@@ -191,7 +192,7 @@ RULES: dict[str, Rule] = {
         bool(_advised(d, "The model found here")) and not any(transfers(f) for f in d.findings)
     ),
     "not plausible, and to be corrected": lambda d: any(transfers(f) and not f.plausible for f in d.findings),
-    "not to be told apart from itself": lambda d: any(
+    "indistinguishable from itself": lambda d: any(
         (a.effect, a.drivers, a.port) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
     ),
     "two residuals of the simulation without findings": _two_residuals,
@@ -214,7 +215,7 @@ RULES: dict[str, Rule] = {
 
 
 def contradictions(diagnosis: Diagnosis, *, page: bool = True) -> list[str]:
-    """What contradicts itself in a diagnosis, its summary on the terminal, and its page.
+    """Return the contradictions in a diagnosis, its summary on the terminal, and its page.
 
     Args:
         diagnosis: the result.
@@ -245,7 +246,7 @@ def _in_text(rows: Sequence[str], d: Diagnosis) -> Iterator[str]:
 
 
 def _sections(rows: Sequence[str]) -> list[str]:
-    """What is said of each of several findings, which begin with a number."""
+    """The text on each of several findings, which begins with a number."""
     end = next((k for k, row in enumerate(rows) if re.match("[Tt]ogether", row)), None)
     rows = [*rows[:end], *([] if end is None else rows[end + 1 :])]
     begins = [k for k, row in enumerate(rows) if re.match(r"\d+( ·|  )", row)]
@@ -253,7 +254,7 @@ def _sections(rows: Sequence[str]) -> list[str]:
 
 
 def terminal_rows(diagnosis: Diagnosis) -> list[str]:
-    """The summary on a wide terminal, a row a label; lines that go on with a label belong to its row."""
+    """The summary on a wide terminal, one row per label; continuation lines belong to their label's row."""
     out = io.StringIO()
     show(Console(file=out, width=4000, color_system=None), diagnosis, [])
     rows: list[str] = []
@@ -298,7 +299,7 @@ class _Rows(HTMLParser):
 
 
 def page_rows(page: str) -> list[str]:
-    """The text of a page, a row of a table, a paragraph or a heading at a time."""
+    """The text of a page, one item per table row, paragraph or heading."""
     parser = _Rows()
     parser.feed(page)
     return [text for row in parser.rows if (text := " ".join(row.replace("\u00a0", " ").split()))]

@@ -103,7 +103,7 @@ def test_page_begins_with_the_result_in_plain_words(page):
 
 
 @pytest.mark.e2e
-def test_doubtful_results_say_so_in_the_headline():
+def test_the_headline_marks_doubtful_results():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     doubtful = recorded(points)
@@ -213,20 +213,20 @@ def test_numbers_of_any_size_are_written_in_a_power_of_ten(recording):
     assert "Calibration matrix, 10⁶ µT per T" in text_of(calibration_report(strong, tiny))
 
 
-def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
+def test_the_noise_is_in_the_units_of_the_recording(calibration, page):
     assert wording.noise(calibration).startswith("0.47")
     assert f"The noise is {wording.noise(calibration)}." in text_of(page)
 
 
 @pytest.mark.e2e
-def test_the_noise_is_gaussian_where_the_test_for_heavy_tails_says_so_whatever_sigma_is(calibration, recording):
+def test_the_heavy_tail_test_alone_decides_whether_the_noise_is_called_gaussian(calibration, recording):
     heavy = dataclasses.replace(calibration, tails=ChannelTails(31.5, 0.041, 0.006))
     share = "heavy-tailed: 4.1 ± 0.6 % of the residuals beyond three times that (0.27 % if Gaussian)"
     assert wording.noise(heavy).endswith(share)
     gaussian = dataclasses.replace(calibration, sigma=4.35, tails=ChannelTails(1.3, 0.0027, 0.001))
     assert wording.noise(gaussian).endswith("along the field, Gaussian")
     assert "no heavier than chance makes that of Gaussian noise" in text_of(calibration_report(gaussian, recording))
-    # a file of before has no test
+    # a calibration without the test states sigma
     assert wording.noise(dataclasses.replace(calibration, sigma=4.35, tails=None)).endswith("field, σ = 4.35")
 
 
@@ -239,7 +239,7 @@ def test_backticks_are_set_as_code(calibration, recording):
 
 
 @pytest.mark.e2e
-def test_what_is_said_of_the_file_is_no_doubt_about_the_result(recording):
+def test_warnings_about_the_file_do_not_make_the_result_doubtful(recording):
     time = recording["time"].clone()
     time[2000:] += 30.0
     gap = Recording(dict(recording.columns) | {"time": time})
@@ -256,7 +256,7 @@ def test_many_rejected_samples_lead_to_the_diagnosis():
     assert "mkc diagnose RECORDING.csv" in text_of(calibration_report(calibrate(doubtful), doubtful))
 
 
-def test_a_refusal_tells_what_was_left_out():
+def test_a_refusal_reports_the_value_that_was_left_out():
     points = noisy_ellipsoid(600)
     cap = points[points[:, 2] < -10.0]
     cap[3, 0] = 1e9

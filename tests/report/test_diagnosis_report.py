@@ -105,7 +105,7 @@ def test_few_samples_have_a_page(samples, findings):
     assert "samples" in text_of(page_of(findings, samples=samples))
 
 
-def test_adequate_says_so_with_its_noise():
+def test_an_adequate_diagnosis_describes_its_noise():
     text = text_of(page_of(0))
     assert "The recording shows no missing physics." in text
     assert "p = 0.37, corrected for 64 candidates (level 0.05)" in text
@@ -129,7 +129,7 @@ def test_explained_answers_what_where_how_sure_and_how_much_better():
     assert "offset drift 41.2 yes" in text
 
 
-def test_rivals_that_cannot_be_told_apart_stand_in_the_headline():
+def test_inseparable_rivals_are_in_the_headline():
     text = text_of(page_of(1))
     assert "hard-iron step or current field (current), which this recording cannot distinguish." in text
     assert "current field (current) 1.30 no" in text
@@ -137,7 +137,7 @@ def test_rivals_that_cannot_be_told_apart_stand_in_the_headline():
     assert "Left out of the simulation: hard-iron step, or a rival; current field (current)." in text_of(page_of(3))
 
 
-def test_unexplained_says_so():
+def test_an_unexplained_diagnosis_reports_the_remaining_structure():
     text = text_of(page_of(0, verdict="unexplained", p_value=0.005))
     assert "The residual has structure that no effect in the catalogue explains." in text
     assert "Record again, for longer, with more columns" in text
@@ -145,7 +145,7 @@ def test_unexplained_says_so():
     assert "Structure remains that no effect in the catalogue explains." in both
 
 
-def test_findings_that_are_not_plausible_or_not_held_out_say_so(three):
+def test_findings_that_are_not_plausible_or_not_held_out_are_marked(three):
     text = text_of(three)
     assert "Not plausible: an effect outside the catalogue (temperature). A curve has no size to compare." in text
     assert "not measured: The event has no second occurrence to be held out." in text
@@ -229,7 +229,7 @@ SMOOTH = "with a smooth correction by all recorded columns"
 
 
 @pytest.mark.parametrize("findings", [0, 2])
-def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(findings):
+def test_a_better_smooth_correction_is_listed_with_the_models_compared(findings):
     diagnosis = make_diagnosis(findings, samples=300, channels=2)
     rows = dict(noise.held_out_rows(diagnosis))
     assert list(rows)[-1] == SMOOTH
@@ -241,7 +241,7 @@ def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(fi
     assert noise.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
 
 
-def test_a_smooth_correction_that_findings_beat_is_not_told_of():
+def test_a_smooth_correction_worse_than_the_findings_is_not_reported():
     diagnosis = make_diagnosis(2, samples=300)
     worse = dataclasses.replace(diagnosis.ceiling, rmse=1.2 * diagnosis.corrected.rmse)
     beaten = with_evidence(diagnosis, remaining.as_result(SmoothCorrection(worse, ())))
@@ -250,20 +250,20 @@ def test_a_smooth_correction_that_findings_beat_is_not_told_of():
     text = text_of(diagnosis_report(beaten))
     assert "smooth correction" not in text
     assert "no bound" not in text
-    # where nothing was found it is no judgement on anything
+    # without findings it is reported in any case
     adequate = make_diagnosis(0, samples=300, ceiling=worse)
     assert "smooth correction" in text_of(diagnosis_report(adequate))
 
 
 def graded(gain, interval, before, after):
-    """A step whose held-out evidence this is, and what the page says first."""
+    """Headline, tone and advice on a step with this held-out evidence, and its diagnosis."""
     held_out = HeldOut(gain, interval, before, after, "µT")
     diagnosis = first_changed(make_diagnosis(1, samples=240), held_out_gain.as_result(held_out, ""), alternatives=())
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
     return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
 
 
-def test_a_finding_that_unseen_blocks_do_not_confirm_is_not_to_be_used():
+def test_a_finding_not_confirmed_on_held_out_blocks_is_not_to_be_used():
     headline, tone, doing, diagnosis = graded(0.134, (-0.019, 0.276), 1.74, 1.73)
     assert headline == (
         "Found, but not confirmed on held-out blocks and too small to be worth correcting: hard-iron step."
@@ -298,7 +298,7 @@ def test_a_finding_that_is_clear_is_left_out_of_the_simulation():
     assert "surely better on held-out blocks" in text_of(diagnosis_report(diagnosis))
 
 
-def test_structure_without_a_finding_is_not_called_nothing():
+def test_structure_without_a_finding_is_not_called_adequate():
     quiet = make_diagnosis(0, samples=240)
     assert top.tone(quiet) == "good"
     rare = make_diagnosis(0, samples=240, p_value=0.04)
@@ -310,8 +310,8 @@ def test_structure_without_a_finding_is_not_called_nothing():
         text = text_of(diagnosis_report(diagnosis))
         assert "no missing physics" not in text
         assert "The simulation can be used" not in text
-    beside = make_diagnosis(1, samples=240, remaining=("load",))
-    assert top.headline(beside).endswith("A smooth trend along load remains that no effect in the catalogue explains.")
+    found = make_diagnosis(1, samples=240, remaining=("load",))
+    assert top.headline(found).endswith("A smooth trend along load remains that no effect in the catalogue explains.")
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_the_command_is_that_of_the_simulation(simulation, command):
     assert top.apply_command(placed) == ""
 
 
-def test_moments_and_what_each_number_is_are_told():
+def test_event_times_and_the_label_of_each_number_are_shown():
     jumps = EffectParameter(
         "heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c")
     )
@@ -345,7 +345,7 @@ def test_moments_and_what_each_number_is_are_told():
     assert "jump at 61.1 s: 11.2 ± 4.4 ° at 77.8 s: 5.8 ± 3.9 ° c: −1.2 ± 0.6 °" in text
 
 
-def test_a_step_that_comes_and_goes_says_so():
+def test_an_intermittent_step_is_reported_as_intermittent():
     intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
     diagnosis = first_changed(
         make_diagnosis(1, samples=4500), onset.as_result((5.9, 6.3)), intermittency.as_result(True),
@@ -362,11 +362,11 @@ def test_a_step_that_comes_and_goes_says_so():
     assert "use the calibration from after the step" not in text
 
 
-def test_what_an_equation_counts_from_stands_with_it():
+def test_the_reference_value_is_shown_with_the_equation():
     assert "δB = k (I − Ī) Ī: the mean of current over this recording, 15.0 A." in text_of(page_of(2))
 
 
-def test_numbers_without_an_error_say_so():
+def test_numbers_without_a_standard_error_are_marked():
     lag = (EffectParameter("lag", 1.5, None, "s"),)
     text = text_of(diagnosis_report(first_changed(make_diagnosis(1, samples=240), parameters=lag)))
     assert "lag 1.50 s, standard error not estimated" in text
@@ -433,14 +433,14 @@ def test_channels_of_a_compared_vector_are_explained():
     assert "across_1 and across_2: the two perpendicular residuals" in text
 
 
-def test_figures_above_are_told_of_only_where_they_are():
+def test_numbers_at_the_top_are_explained_only_where_there_are_any():
     assert "Numbers at the top" in text_of(page_of(2, samples=4500))
     bare = make_diagnosis(2, samples=240)
     findings = tuple(dataclasses.replace(f, onset=None, intervals=()) for f in bare.findings)
     assert "Numbers at the top" not in text_of(diagnosis_report(dataclasses.replace(bare, findings=findings)))
 
 
-def test_a_long_name_is_whole_where_there_is_room():
+def test_a_long_name_is_not_cut_where_there_is_room():
     made = make_diagnosis(1, samples=240)
     curve = dataclasses.replace(made.findings[0].curve, driver="position along its longest direction", unit="m")
     names = ("position_x", "position_y")
@@ -451,20 +451,24 @@ def test_a_long_name_is_whole_where_there_is_room():
 
 
 @pytest.mark.e2e
-def test_whether_a_finding_extrapolates_is_said():
+def test_extrapolation_of_a_finding_is_reported():
     diagnosis = make_diagnosis(2, samples=300)
     assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
     for gain, interval, label in (
-        (0.31, (0.28, 0.35), "it predicts where that is high: +0.310 nats per sample (95 %: 0.280 to 0.350)"),
-        (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
-        (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
+        (
+            0.31,
+            (0.28, 0.35),
+            "it improves the prediction at high values: +0.310 nats per sample (95 %: 0.280 to 0.350)",
+        ),
+        (-0.02, (-0.12, 0.09), "it is not significant at high values: −0.020"),
+        (-0.3, (-0.4, -0.2), "it degrades the prediction at high values: −0.300"),
     ):
-        said = extrapolation.as_result(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
-        text = text_of(diagnosis_report(first_changed(diagnosis, said)))
-        assert f"beyond its range fitted where its driver is low, {label}" in text
+        result = extrapolation.as_result(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
+        text = text_of(diagnosis_report(first_changed(diagnosis, result)))
+        assert f"beyond its range fitted at low values of its driver, {label}" in text
 
 
-def test_what_shifted_copies_of_the_driver_gain_is_said():
+def test_the_gain_of_shifted_copies_of_the_driver_is_reported():
     for as_good, text in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
             make_diagnosis(1, samples=240),
@@ -475,7 +479,7 @@ def test_what_shifted_copies_of_the_driver_gain_is_said():
         assert f"driven by load; {text} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
 
 
-def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
+def test_the_region_of_the_states_and_the_share_of_each_run_are_shown():
     edges = tuple(torch.linspace(-1.0, 1.0, 5, dtype=torch.float64) for _ in range(2))
     nats = torch.arange(-3.0, 13.0, dtype=torch.float64).reshape(4, 4)
     nats[0, 0] = torch.nan
@@ -495,18 +499,18 @@ def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
     assert "Gain of finding 1 over the states" in page
 
 
-def test_what_any_test_of_evidence_says_is_shown():
-    said = EvidenceResult(
+def test_rows_and_table_of_any_evidence_test_are_shown():
+    result = EvidenceResult(
         "my_test",
-        rows=(Row("left over", "correlated up to -0.4 s"), Row("in print", "more", in_terminal=False)),
+        rows=(Row("residual", "correlated up to -0.4 s"), Row("in print", "more", in_terminal=False)),
         table=Table("By channel", ("channel", "lag"), (("norm", "0.4 s"),), "As far as -2 errors."),
     )
     made = make_diagnosis(1, samples=240)
-    for changed in (with_evidence(made, said), first_changed(made, said)):
+    for changed in (with_evidence(made, result), first_changed(made, result)):
         text = text_of(diagnosis_report(changed))
-        assert "left over correlated up to −0.4 s in print more" in text
+        assert "residual correlated up to −0.4 s in print more" in text
         assert "By channel channel lag norm 0.4 s As far as −2 errors." in text
-    assert "Further evidence" in text_of(diagnosis_report(with_evidence(made, said)))
+    assert "Further evidence" in text_of(diagnosis_report(with_evidence(made, result)))
     assert "Further evidence" not in text_of(diagnosis_report(made))
 
 

@@ -1,4 +1,4 @@
-"""How a page tells whether a simulation follows, what pushes it, and whether a name's shape is the recording's."""
+"""How a page reports the goodness of fit, the process noise, and whether an effect's shape fits the recording."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ from tests.diagnosis.factory import (
 from tests.report.test_calibration_report import parsed, text_of
 
 
-def pushed(**changes):
+def disturbed(**changes):
     return make_diagnosis(
         0,
         simulation="Pendulum",
@@ -47,12 +47,12 @@ def with_first(diagnosis, change):
 
 
 def box_of(page):
-    """What stands in the box at the top."""
+    """The text of the box at the top."""
     text = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
     return re.sub(" ([.,:])", r"\1", text)  # after code
 
 
-def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
+def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
     followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
     quiet = make_diagnosis(
         0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=())
@@ -67,7 +67,7 @@ def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
     assert '<h1 class="good">' in page
 
 
-def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
+def test_an_output_that_hardly_varies_has_no_explained_share():
     still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
     (line,) = environment.output_lines(
         make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,)))
@@ -75,7 +75,7 @@ def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
     assert line == ("angle: residual 0.00510 rad; noise floor 0.00500 rad (declared); the output hardly varies")
 
 
-def test_of_many_outputs_the_table_has_all():
+def test_the_table_has_all_of_many_outputs():
     many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
     page = diagnosis_report(
         make_diagnosis(
@@ -86,7 +86,7 @@ def test_of_many_outputs_the_table_has_all():
     assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s unknown" in text_of(page)
 
 
-def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
+def test_a_simulation_that_does_not_fit_is_reported_first():
     page = diagnosis_report(make_unfit())
     box = box_of(page)
     assert box.startswith("The simulation does not fit the recording.")
@@ -97,19 +97,19 @@ def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
     assert "Why Another start reaches 0.006 rad: gravity = −9.81 with the other sign. damping ends at its bound" in box
     assert '<h1 class="bad">' in page
     text = text_of(page)
-    for words in ("The simulation can be used", "no missing physics", "The candidates", "hard-iron", "tell apart"):
+    for words in ("The simulation can be used", "no missing physics", "The candidates", "hard-iron", "distinguish"):
         assert words not in text
 
 
 def test_one_colour_for_adequate_another_for_unfit_and_unexplained():
     quiet = make_diagnosis(0, samples=50, environment=make_environment(process_noise=(), disturbance=()))
-    assert [top.tone(d) for d in (quiet, make_unfit(), pushed(), make_diagnosis(1, samples=50))] == [
+    assert [top.tone(d) for d in (quiet, make_unfit(), disturbed(), make_diagnosis(1, samples=50))] == [
         "good", "open", "open", "found",
     ]  # fmt: skip
 
 
-def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
-    page = diagnosis_report(pushed())
+def test_the_disturbance_is_the_first_picture_and_is_described_in_plain_words():
+    page = diagnosis_report(disturbed())
     parsed(page)
     assert page.index("Disturbance over time, and") < page.index("Residual over time before and after")
     box = box_of(page)
@@ -132,7 +132,7 @@ def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
 def test_a_forcing_of_any_length_with_any_number_of_curves(samples, curves):
     forcing = make_forcing(samples)
     forcing = dataclasses.replace(forcing, curves=tuple(forcing.curves[i % 3] for i in range(curves)))
-    page = diagnosis_report(pushed(disturbance=(forcing,)))
+    page = diagnosis_report(disturbed(disturbance=(forcing,)))
     assert page.count("<svg ") == 2
     assert len(page) < 500_000
 
@@ -145,15 +145,17 @@ def test_runs_are_not_joined_by_a_line():
     assert len(_joined(time, time)) == 11
 
 
-def test_something_slow_in_a_sensor_is_told_as_such():
-    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
-    text = text_of(diagnosis_report(pushed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
+def test_drift_of_a_sensor_is_reported_as_drift():
+    slow = dataclasses.replace(
+        PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002
+    )
+    text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
     assert "angle drift in addition to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
 
 
-def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
+def test_an_effect_of_the_wrong_shape_is_only_nearest_and_its_curve_is_drawn():
     made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), nearest)
     page = diagnosis_report(made)
     assert top.headline(made) == (
@@ -182,12 +184,12 @@ def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
         ("unconfirmed", "Found, but not confirmed on held-out blocks: hard-iron step"),
     ],
 )
-def test_the_headline_is_by_grade_alone(grade, text):
+def test_the_grade_alone_decides_the_headline(grade, text):
     made = with_first(make_diagnosis(1, samples=50), lambda f: graded(f, grade))
     assert top.headline(made).startswith(text)
 
 
-def test_what_is_small_beside_an_adequate_simulation_is_said():
+def test_small_findings_of_an_adequate_simulation_are_in_the_headline():
     small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "small"))
     assert top.headline(small).startswith("No missing physics is worth correcting. Real, but small")
     weak = with_first(small, lambda f: graded(f, "unconfirmed"))
@@ -218,7 +220,7 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
     assert unseen.better(HeldOut(0.001, (-0.4, 0.4), 1.0, 0.99, "m")) == "not shown to be better on held-out blocks"
 
 
-def test_each_output_has_its_own_sizes_beside_its_floor():
+def test_each_output_has_its_own_residual_sizes_and_noise_floor():
     held = HeldOut(
         0.3, (0.2, 0.4), 15671.0, 0.661, "",
         {"angle": ResidualSizes(0.02, 0.0051, "rad"), "rate": ResidualSizes(0.3, 0.1, "rad/s")},
@@ -237,7 +239,7 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
         assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
         assert "15671" not in text
         assert "n 1 of 25 blocks without the finding" in text
-    # what is not told for each output has no number of all together
+    # without sizes of each output there is no size of all outputs together
     bare = dataclasses.replace(made, findings=tuple(dataclasses.replace(f, evidence=()) for f in made.findings))
     assert unseen.residual_of_all(bare) == []
 
@@ -262,7 +264,7 @@ def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
 
 
 def test_the_statisticians_numbers_are_one_click_below():
-    page = diagnosis_report(pushed(process_noise=(PROCESS_NOISE,)))
+    page = diagnosis_report(disturbed(process_noise=(PROCESS_NOISE,)))
     closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
     assert closed[:4] == [
         "Goodness of fit", "Process noise and drift", "Scores on held-out data",
@@ -270,7 +272,7 @@ def test_the_statisticians_numbers_are_one_click_below():
     ]  # fmt: skip
 
 
-def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
+def test_the_noise_floor_is_drawn_with_the_residual():
     made = make_diagnosis(
         0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=())
     )
@@ -283,22 +285,22 @@ def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
     assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
 
 
-def test_nats_are_explained_once_where_they_are_met():
+def test_nats_are_explained_once_before_they_are_used():
     text = "Log-likelihood gains are in nats"
-    for made in (make_diagnosis(3, samples=100, channels=2), pushed()):
+    for made in (make_diagnosis(3, samples=100, channels=2), disturbed()):
         page = diagnosis_report(made)
         assert page.count(text) == 1
         assert page.index(text) < page.index("<h2>")
     assert text not in diagnosis_report(make_unfit())
 
 
-def test_names_of_the_world_are_escaped():
+def test_names_in_the_environment_are_escaped():
     bad = "<b>x</b> & $a$"
-    push = dataclasses.replace(PROCESS_NOISE, place=bad, unit=bad)
-    forcing = dataclasses.replace(make_forcing(50, push), sentences=(bad,))
+    noise = dataclasses.replace(PROCESS_NOISE, place=bad, unit=bad)
+    forcing = dataclasses.replace(make_forcing(50, noise), sentences=(bad,))
     hostile = make_environment(
         goodness_of_fit=(make_follows(bad, bad),),
-        process_noise=(push,),
+        process_noise=(noise,),
         input_hold={bad: "linear"},
         disturbance=(forcing,),
         reasons=(bad,),
@@ -309,7 +311,7 @@ def test_names_of_the_world_are_escaped():
         parsed(page)
 
 
-def test_a_contradiction_is_not_called_nothing():
+def test_a_lost_fit_is_not_called_adequate():
     lost = make_diagnosis(
         0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=())
     )

@@ -80,7 +80,7 @@ def findings(draw, place):
 
 @dataclasses.dataclass
 class Case:
-    """A diagnosis that is told in few words where a test fails."""
+    """A diagnosis with a short repr for failing tests."""
 
     diagnosis: Diagnosis
 
@@ -92,16 +92,16 @@ class Case:
 
 @st.composite
 def diagnoses(draw):
-    """A diagnosis put together as ``assembled`` does it: grades, verdict and advice are the project's own."""
+    """A diagnosis built as `mkc_torch.diagnosis.build` does it, with its grades, verdict and advice."""
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
     found = [item for item in found if not (item.grade == "unconfirmed" and is_zero_within_error(item))]
     white = draw(st.booleans())
-    pushes = () if draw(st.booleans()) else (dataclasses.replace(PROCESS_NOISE, at_rate=draw(st.booleans())),)
-    noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not pushes else st.floats(1.0, 20.0))
+    process_noise = () if draw(st.booleans()) else (dataclasses.replace(PROCESS_NOISE, at_rate=draw(st.booleans())),)
+    noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not process_noise else st.floats(1.0, 20.0))
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))
-    one = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
-    known = FitAssessment((one,), (), SimpleNamespace(selected=SimpleNamespace(disturbances=pushes)), lost=lost)
+    fit = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
+    known = FitAssessment((fit,), (), SimpleNamespace(selected=SimpleNamespace(disturbances=process_noise)), lost=lost)
     if lost:
         found = []
     p_value = found[0].p_value if found else draw(st.floats(0.001, 1.0))
@@ -109,10 +109,10 @@ def diagnoses(draw):
     structure = (p_value <= LEVEL and not found) or bool(remaining)
     verdict = verdict_of(known, found, structure=structure, white=white, settings=EvidenceSettings())
     reasons = ("Another start reaches 0.006 rad.",) if verdict == "unfit" else ()
-    world = NoiseEnvironment((one,), reasons, pushes, {"torque": "held"})
+    environment = NoiseEnvironment((fit,), reasons, process_noise, {"torque": "held"})
     made = make_diagnosis(
-        0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, environment=world, remaining=remaining,
-        warnings=(),
+        0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, environment=environment,
+        remaining=remaining, warnings=(),
     )  # fmt: skip
     made = dataclasses.replace(made, findings=tuple(found))
     held = [f.held_out for f in found if f.held_out is not None]
@@ -141,7 +141,7 @@ def test_no_page_of_any_diagnosis_contradicts_itself(case):
 REAL = {
     "nothing hidden": lambda: diagnose(Pendulum(), swung("none", N=300)[0], surrogates=39),
     "drag hidden": lambda: diagnose(Pendulum(), swung("none", N=300, drag=0.3)[0], surrogates=39),
-    "pushed slowly": lambda: diagnose(Pendulum(), swung("slow", N=300)[0], surrogates=39),
+    "slow process noise": lambda: diagnose(Pendulum(), swung("slow", N=300)[0], surrogates=39),
     "gravity of the wrong sign": lambda: diagnose(UpsideDown(), swung("none", N=300)[0], surrogates=39),
     "loudspeaker": lambda: diagnose(Magnetometer(), demonstration.simulated_recording()[0], surrogates=39),
 }
@@ -168,7 +168,7 @@ def test_a_pair_excludes_something_and_allows_either_alone(pair):
     assert re.compile(pair.unless)
 
 
-SPOILT = {
+CORRUPTED = {
     "adequate with a finding": {"verdict": "adequate"},
     "unfit with a finding": {"verdict": "unfit"},
     "not confirmed": {"grade": "unconfirmed"},
@@ -187,7 +187,7 @@ SPOILT = {
 }
 
 
-@pytest.mark.parametrize("name", SPOILT)
+@pytest.mark.parametrize("name", CORRUPTED)
 def test_a_report_that_contradicts_itself_is_caught(name):
     made = make_diagnosis(1, samples=200)
     (finding,) = made.findings
@@ -198,8 +198,8 @@ def test_a_report_that_contradicts_itself_is_caught(name):
         baseline=dataclasses.replace(made.baseline, rmse=held.rmse_before),
     )
     assert contradictions(made, page=False) == []
-    of_finding = {k: v for k, v in SPOILT[name].items() if hasattr(finding, k) and k != "advice"}
-    of_all = {k: v for k, v in SPOILT[name].items() if k not in of_finding}
+    of_finding = {k: v for k, v in CORRUPTED[name].items() if hasattr(finding, k) and k != "advice"}
+    of_all = {k: v for k, v in CORRUPTED[name].items() if k not in of_finding}
     corrupted = dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], **of_finding),), **of_all)
     assert any(name in result for result in contradictions(corrupted, page=False)), contradictions(
         corrupted, page=False
@@ -221,7 +221,7 @@ def test_each_kind_of_pair_is_found_in_a_text(row):
     assert list(_in_text([row], make_diagnosis(1, samples=20)))
 
 
-def test_what_is_said_of_one_finding_is_not_held_against_another():
+def test_texts_on_different_findings_are_not_compared():
     pair = Pair("surely better", "[Nn]ot confirmed", "finding")
     assert pair in PAIRS
     rows = ["1 · Drag", "surely better on held-out blocks", "2 · Friction", "not confirmed on held-out blocks"]

@@ -1,4 +1,4 @@
-"""Pages on a telephone: nothing lies beyond the right edge, measured in a browser."""
+"""Pages on a telephone: no content beyond the right edge, measured in a browser."""
 
 import dataclasses
 import re
@@ -18,8 +18,8 @@ from mkc_torch.challenge.score import score
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
-from tests.challenge.scenarios import test_score as of_worlds
-from tests.challenge.test_score import NOTHING, finding, key, says
+from tests.challenge.scenarios import test_score as scenario_score
+from tests.challenge.test_score import NOTHING, answer, finding, key
 from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -35,16 +35,16 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this ma
 
 # a window of a headless browser cannot be as narrow as a telephone, a frame in it can
 FRAME = """<!doctype html><body style="margin:0"><iframe id="phone" src="page.html"
-style="width:{width}px;height:900px;border:0"></iframe><p id="told"></p><script>
+style="width:{width}px;height:900px;border:0"></iframe><p id="result"></p><script>
 document.getElementById("phone").onload = (event) => {{
   const inside = event.target.contentDocument;
-  if ({open}) for (const one of inside.querySelectorAll("details")) one.open = true;
-  document.getElementById("told").textContent = "width " + inside.documentElement.scrollWidth + " end";
+  if ({open}) for (const item of inside.querySelectorAll("details")) item.open = true;
+  document.getElementById("result").textContent = "width " + inside.documentElement.scrollWidth + " end";
 }};</script>"""
 
 
 def dumped(folder):
-    """The frame in a folder as the browser has it in the end."""
+    """The frame of a folder as the browser dumps it after its scripts have run."""
     command = [
         CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--allow-file-access-from-files",
         "--virtual-time-budget=5000", "--dump-dom", (folder / "frame.html").as_uri(),
@@ -53,7 +53,7 @@ def dumped(folder):
 
 
 def width_of(page, folder, *, opened):
-    """The width that a page needs where it has that of a telephone, its details open or not."""
+    """The width in pixels that a page needs on a telephone, with its details open or closed."""
     (folder / "page.html").write_text(page, encoding="utf-8")
     (folder / "frame.html").write_text(FRAME.format(width=WIDTH, open=str(opened).lower()), encoding="utf-8")
     result = dumped(folder)
@@ -62,16 +62,16 @@ def width_of(page, folder, *, opened):
     return int(found[1])
 
 
-MANY = """<!doctype html><body style="margin:0">{frames}<p id="told"></p><script>
+MANY = """<!doctype html><body style="margin:0">{frames}<p id="result"></p><script>
 window.onload = () => {{
-  const told = [...document.querySelectorAll("iframe")].map((one) =>
-    one.id + " " + one.contentDocument.documentElement.scrollWidth);
-  document.getElementById("told").textContent = "widths " + told.join(", ") + " end";
+  const widths = [...document.querySelectorAll("iframe")].map((frame) =>
+    frame.id + " " + frame.contentDocument.documentElement.scrollWidth);
+  document.getElementById("result").textContent = "widths " + widths.join(", ") + " end";
 }};</script>"""
 
 
 def widths_of(places, folder):
-    """The widths that pages of several places need, measured by one browser."""
+    """The widths in pixels that several pages need, measured by one browser."""
     frames = "".join(
         f'<iframe id="{name}" src="{place}" style="width:{WIDTH}px;height:900px;border:0"></iframe>'
         for name, place in places.items()
@@ -84,11 +84,13 @@ def widths_of(places, folder):
 
 
 def long_names():
-    """A page on which whatever comes from a file is too long."""
+    """A diagnosis in which every text from a file is too long."""
     made = make_diagnosis(3, samples=200, channels=4, recording=LONG, simulation=LONG, warnings=(LONG,))
     findings = tuple(dataclasses.replace(f, drivers=(LONG,), equation=LONG, explanation=LONG) for f in made.findings)
-    world = make_environment(goodness_of_fit=(make_follows(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"})
-    return dataclasses.replace(made, findings=findings, advice=(LONG,), environment=world)
+    environment = make_environment(
+        goodness_of_fit=(make_follows(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"}
+    )
+    return dataclasses.replace(made, findings=findings, advice=(LONG,), environment=environment)
 
 
 def first_nearest():
@@ -100,14 +102,14 @@ def first_nearest():
 PAGES = {
     "adequate": lambda: make_diagnosis(0, samples=200, environment=make_environment(process_noise=(), disturbance=())),
     "unfit": make_unfit,
-    "pushed": lambda: make_diagnosis(0, samples=200, verdict="unexplained", environment=make_environment()),
+    "process noise": lambda: make_diagnosis(0, samples=200, verdict="unexplained", environment=make_environment()),
     "nearest": first_nearest,
     "long names": long_names,
 }
 
 
 def others():
-    """The pages beside the diagnosis: of a calibration, a refusal and the blind proofs, names too long in each."""
+    """Pages of a calibration, a refusal and the blind proofs, with names that are too long."""
     recording, _ = simulated_recording()
     named = type(recording)(recording.columns, name=LONG, warnings=(LONG,))
     row = Comparison(LONG, (12.0, -7.5, 21.0), (45.0, 48.5, 51.5))
@@ -119,12 +121,12 @@ def others():
     yield "refusal", refusal_report(flat, refused.value)
     keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
     settings = {"seed": 1, "key_sha256": "0" * 64, "hidden": 3, "empty": 1, LONG: LONG}
-    result = score(keys, {"a": says(finding("hard_iron_step")), "b": NOTHING, "c": says(finding("offset_drift"))})
+    result = score(keys, {"a": answer(finding("hard_iron_step")), "b": NOTHING, "c": answer(finding("offset_drift"))})
     yield "challenge", challenge_page(result, {LONG: result}, keys, settings)
-    yield "worlds", scenarios_page(of_worlds.all_kinds(), of_worlds.SETTINGS | {LONG: LONG})
+    yield "scenarios", scenarios_page(scenario_score.all_kinds(), scenario_score.SETTINGS | {LONG: LONG})
 
 
-def test_no_other_page_needs_more_than_a_telephone_has(tmp_path):
+def test_no_other_page_is_wider_than_a_telephone(tmp_path):
     places = {}
     for name, page in others():
         places[name] = f"{name}.html"
@@ -134,10 +136,10 @@ def test_no_other_page_needs_more_than_a_telephone_has(tmp_path):
 
 @pytest.mark.parametrize("opened", [False, True])
 @pytest.mark.parametrize("kind", PAGES)
-def test_nothing_lies_beyond_the_edge_of_a_telephone(kind, opened, tmp_path):
+def test_a_diagnosis_page_is_no_wider_than_a_telephone(kind, opened, tmp_path):
     assert width_of(diagnosis_report(PAGES[kind]()), tmp_path, opened=opened) == WIDTH
 
 
-def test_what_is_too_wide_is_measured(tmp_path):
+def test_a_page_that_is_too_wide_is_detected(tmp_path):
     page = diagnosis_report(make_unfit()).replace("</main>", '<div style="width:700px">x</div></main>')
     assert width_of(page, tmp_path, opened=False) > WIDTH

@@ -1,4 +1,4 @@
-"""A second store and a mass on a spring take up what the state gives off, and begin with it."""
+"""A second store and a mass on a spring take up what the state loses, and start in equilibrium with it."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_nothing_moves_that_begins_at_rest(hidden):
 
 @pytest.mark.parametrize("hidden", [store(), mass(damping=0.3)])
 def test_what_goes_in_is_shared_in_the_end(hidden):
-    """A push at the beginning, and then none: both move alike, by the push over one and the share."""
+    """After a force at the beginning both end alike, at the impulse divided by 1 plus the share."""
     force = np.where(np.arange(600) < 20, 1.0, 0.0)
     alone = simulate(free(), trial(force)).outputs[0, -1, 0]
     together = simulate(free(), trial(force), hidden, 0.5).outputs[0, -1, 0]

@@ -16,7 +16,7 @@ from mkc_torch.challenge.scenarios.run import count
 
 
 def cheap(paths, folder):
-    """Says of every third that it is adequate, of the next that it is unfit, and breaks on the last; seeks the key."""
+    """Report adequate, unfit and a failure in turn, and check that the key is hidden."""
     output = folder.parent
     assert (output / "key_hash.txt").is_file()
     assert not (output / "key.json").exists()
@@ -27,8 +27,8 @@ def cheap(paths, folder):
             broken = path.stem
             continue
         (folder / path.stem).mkdir()
-        said = {"verdict": ("adequate", "unfit")[number % 3], "findings": []}
-        (folder / path.stem / "diagnosis.json").write_text(json.dumps(said))
+        reported = {"verdict": ("adequate", "unfit")[number % 3], "findings": []}
+        (folder / path.stem / "diagnosis.json").write_text(json.dumps(reported))
     if broken:
         (folder / f"{broken}.error.txt").write_text("too few samples: record more\n")
 
@@ -100,7 +100,7 @@ def test_a_failed_recording_has_its_reason_and_is_not_an_alarm(done):
 
 
 def quiet(paths, folder):
-    """Writes nothing."""
+    """Write no diagnosis."""
 
 
 def test_a_larger_run_contains_a_smaller_one(tmp_path):

@@ -42,7 +42,7 @@ def key(name, scenario="white", *, disturbance=0.0, useless="", kind="empty", ef
     return ScenarioKey(scenario, 0, plain, reported, useless)
 
 
-def says(verdict, *findings, driven=None):
+def answer(verdict, *findings, driven=None):
     reported = {"verdict": verdict, "findings": list(findings)}
     if driven:
         reported["noise"] = {"process": {driven: {"size": 1.0, "standard_error": 0.1, "unit": "m/s²"}}}
@@ -67,12 +67,12 @@ def aim(scored, measure):
 
 def test_empty_recordings_of_an_ordinary_scenario():
     answers = {
-        "quiet": says("adequate"),
-        "wandering": says("unexplained", finding("input_delay", "unconfirmed")),
-        "alarm": says("explained", finding("input_delay")),
-        "small": says("explained", finding("sensor_lag", "small")),
-        "old": says("explained", {"effect": "backlash"}),
-        "unfit": says("unfit"),
+        "quiet": answer("adequate"),
+        "unconfirmed": answer("unexplained", finding("input_delay", "unconfirmed")),
+        "alarm": answer("explained", finding("input_delay")),
+        "small": answer("explained", finding("sensor_lag", "small")),
+        "old": answer("explained", {"effect": "backlash"}),
+        "unfit": answer("unfit"),
     }
     scored = scenario(score_scenarios(SCENARIOS, [key(name) for name in (*answers, "refused")], answers), "white")
     assert scored.empty == 7
@@ -89,13 +89,13 @@ def test_empty_recordings_of_an_ordinary_scenario():
 
 def test_disturbed_states_are_located_by_process_noise_or_a_finding():
     answers = {
-        "noise": says("unexplained", driven="speed"),
-        "forcing": says("unexplained") | {"disturbance": [{"state": "speed"}]},
-        "finding": says("unexplained", finding("unknown", "unconfirmed") | {"channels": ["rate of speed"]}),
-        "wrong": says("unexplained", driven="angle"),
-        "adequate": says("adequate", driven="speed"),
-        "nowhere": says("unexplained"),
-        "weak": says("adequate"),
+        "noise": answer("unexplained", driven="speed"),
+        "forcing": answer("unexplained") | {"disturbance": [{"state": "speed"}]},
+        "finding": answer("unexplained", finding("unknown", "unconfirmed") | {"channels": ["rate of speed"]}),
+        "wrong": answer("unexplained", driven="angle"),
+        "adequate": answer("adequate", driven="speed"),
+        "nowhere": answer("unexplained"),
+        "weak": answer("adequate"),
     }
     keys = [
         key(name, "pushed_white", disturbance=LEAST_DISTURBANCE - 0.1 if name == "weak" else 3.0) for name in answers
@@ -114,13 +114,13 @@ def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
     disturbed = dataclasses.replace(
         key("a", "pushed_white"), disturbance=KeyDisturbance("wander", "sensor", 1.0, "µT", 4.0)
     )
-    scored = scenario(score_scenarios(SCENARIOS, [disturbed], {"a": says("unexplained")}), "pushed_white")
+    scored = scenario(score_scenarios(SCENARIOS, [disturbed], {"a": answer("unexplained")}), "pushed_white")
     assert scored.unexplained_located.total == 0
 
 
 def test_useless_simulations_have_to_be_unfit_and_never_adequate():
     keys = [key(name, "useless", useless="wrong sign" if name < "c" else "another system") for name in "abcd"]
-    answers = {"a": says("unfit"), "b": says("adequate"), "c": says("unfit"), "d": None}
+    answers = {"a": answer("unfit"), "b": answer("adequate"), "c": answer("unfit"), "d": None}
     result = score_scenarios(SCENARIOS, keys, answers)
     scored = scenario(result, "useless")
     assert counts(scored.unfit) == (2, 4)
@@ -128,20 +128,20 @@ def test_useless_simulations_have_to_be_unfit_and_never_adequate():
     assert scored.reasons["another system"]["failed"] == 1
     assert [m.holds for m in scored.measured if m.threshold.measure in ("unfit", "adequate")] == [False, False]
     assert result.total.empty == 0  # none of them is of use
-    good = score_scenarios(SCENARIOS, keys, dict.fromkeys("abcd", says("unfit")))
+    good = score_scenarios(SCENARIOS, keys, dict.fromkeys("abcd", answer("unfit")))
     assert all(m.holds for m in scenario(good, "useless").measured if m.threshold.measure != "empty")
 
 
 def test_names_of_what_is_hidden():
     answers = {
-        "right": says("explained", finding("backlash")),
-        "wrong": says("explained", finding("dead_zone")),
-        "nearest": says("unexplained", finding("backlash", "nearest")),
-        "unsure": says("unexplained", finding("backlash", "unconfirmed")),
-        "unnamed": says("explained", finding("unknown")),
-        "weak": says("adequate"),
-        "unfit": says("unfit"),
-        "close": says("unfit"),
+        "right": answer("explained", finding("backlash")),
+        "wrong": answer("explained", finding("dead_zone")),
+        "nearest": answer("unexplained", finding("backlash", "nearest")),
+        "unsure": answer("unexplained", finding("backlash", "unconfirmed")),
+        "unnamed": answer("explained", finding("unknown")),
+        "weak": answer("adequate"),
+        "unfit": answer("unfit"),
+        "close": answer("unfit"),
     }
     sizes = {"weak": {"z": 5.0, "z_sep": 5.0}, "close": {"z_sep": 3.0}}
     keys = [
@@ -161,12 +161,12 @@ def test_names_of_what_is_hidden():
 
 def test_outside_the_catalogue_only_a_wrong_name_is_wrong():
     answers = {
-        "claimed": says("explained", finding("dead_zone")),
-        "own": says("explained", finding("vibration")),
-        "unknown": says("explained", finding("unknown")),
-        "nearest": says("unexplained", finding("dead_zone", "nearest")),
-        "unseen": says("adequate"),
-        "weak": says("explained", finding("dead_zone")),
+        "claimed": answer("explained", finding("dead_zone")),
+        "own": answer("explained", finding("vibration")),
+        "unknown": answer("explained", finding("unknown")),
+        "nearest": answer("unexplained", finding("dead_zone", "nearest")),
+        "unseen": answer("adequate"),
+        "weak": answer("explained", finding("dead_zone")),
     }
     keys = [key(n, kind="outside", effect="vibration", z=4.0 if n == "weak" else 15.0) for n in answers]
     result = score_scenarios(SCENARIOS, keys, answers)
@@ -183,14 +183,14 @@ def with_rival(effect):
 
 def test_wrong_single_names_in_one_run_are_counted_apart():
     answers = {
-        "alone": says("explained", finding("backlash")),
-        "rival": says("explained", with_rival("backlash")),
-        "open": says("unexplained"),
-        "unnamed": says("explained", finding("unknown")),
-        "adequate": says("adequate"),
+        "alone": answer("explained", finding("backlash")),
+        "rival": answer("explained", with_rival("backlash")),
+        "open": answer("unexplained"),
+        "unnamed": answer("explained", finding("unknown")),
+        "adequate": answer("adequate"),
         "refused": None,
-        "right": says("explained", finding("backlash")),
-        "mistaken": says("explained", finding("dead_zone")),
+        "right": answer("explained", finding("backlash")),
+        "mistaken": answer("explained", finding("dead_zone")),
     }
     keys = [
         key(n, "lasting", disturbance=3.0, kind="single" if n in ("right", "mistaken") else "empty") for n in answers
@@ -207,16 +207,16 @@ def test_wrong_single_names_in_one_run_are_counted_apart():
     for words in ("a single wrong name", "undecided", "(2 of 7; 3.7-71.0 %)"):
         assert words in page
         assert words in text
-    quiet = score_scenarios(SCENARIOS, [key("a")], {"a": says("adequate")})
+    quiet = score_scenarios(SCENARIOS, [key("a")], {"a": answer("adequate")})
     assert "undecided" not in scenarios_page(quiet, SETTINGS)
 
 
 def test_a_reported_drift_of_the_right_sensor_counts():
     slow = {"noise": {"sensor": {"height": {"size": 1.0, "standard_error": 0.1}}}}
     answers = {
-        "told": says("unexplained") | slow,
-        "not": says("unexplained", driven="speed"),
-        "small": says("adequate"),
+        "reported": answer("unexplained") | slow,
+        "not": answer("unexplained", driven="speed"),
+        "small": answer("adequate"),
     }
     keys = [
         dataclasses.replace(
@@ -242,7 +242,7 @@ def all_kinds():
         key("c", "useless", useless="wrong <sign>"),
         key("d", kind="single"),
     ]
-    answers = {"a": says("adequate"), "b": says("unexplained", driven="speed"), "c": says("unfit")}
+    answers = {"a": answer("adequate"), "b": answer("unexplained", driven="speed"), "c": answer("unfit")}
     return score_scenarios(SCENARIOS, keys, answers)
 
 

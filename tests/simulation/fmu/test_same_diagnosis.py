@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler o
 
 @pytest.mark.parametrize("system", fmu.RATES)
 def test_the_fmus_have_the_nominal_equations(tmp_path, system):
-    model, loaded = fmu.NAIVE[system](), load_fmu(fmu.as_fmu(system, tmp_path))
+    model, loaded = fmu.NOMINAL[system](), load_fmu(fmu.as_fmu(system, tmp_path))
     assert (model.states, model.inputs, list(model.parameters)) == (
         loaded.states,
         loaded.inputs,

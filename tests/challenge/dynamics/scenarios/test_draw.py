@@ -1,4 +1,4 @@
-"""Each scenario is what its name says, and gives the same case at the same address."""
+"""Each scenario matches its name and gives the same case at the same address."""
 
 import sys
 
@@ -22,7 +22,7 @@ from mkc_torch.simulation.load import load_simulation
 SCENARIOS = {scenario.name: scenario for scenario in dynamics_scenarios().scenarios}
 
 
-def test_the_scenarios_are_all_there():
+def test_all_scenarios_are_listed():
     assert list(SCENARIOS) == [
         "white", "coloured", "pushed_white", "pushed_slowly", "gusts", "held", "far_starts", "runs", "slow_sensor",
         "lasting_push", "lasting_push_runs", "useless",
@@ -71,7 +71,7 @@ def test_a_disturbance_acts_in_every_second_case_with_hidden_physics(name):
 
 @pytest.mark.e2e
 def test_a_disturbance_makes_a_hidden_effect_harder_to_detect():
-    """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
+    """z includes the disturbance: for the same effect and size it falls when process noise is added."""
     from mkc_torch.challenge.dynamics.errors import draw_errors
     from mkc_torch.challenge.dynamics.oracle import power
     from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, draw_disturbance
@@ -80,8 +80,8 @@ def test_a_disturbance_makes_a_hidden_effect_harder_to_detect():
     setting = SYSTEMS["thermal"].draw(generator(2))
     scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     errors = draw_errors(generator(3), scene.course.outputs)
-    pushes = (draw_disturbance(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
-    disturbance = next(disturbance for disturbance in pushes if disturbance.state == "temperature_1")
+    disturbances = (draw_disturbance(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
+    disturbance = next(disturbance for disturbance in disturbances if disturbance.state == "temperature_1")
     effect = SYSTEMS["thermal"].inside[0](generator(5), scene)  # in the same body
     alone, nearby = (
         power(scene.plant, scene.trial, effect, effect.large, noise)
@@ -106,7 +106,7 @@ def test_a_held_input_is_held_in_the_integration(held):
 
 @pytest.mark.e2e
 def test_the_scenario_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
-    """Otherwise nothing would be asked there."""
+    """Otherwise the scenario would test nothing."""
     from dataclasses import replace
 
     more = []
@@ -181,7 +181,7 @@ def test_far_starts_are_ten_times_off(index, tmp_path):
 @pytest.mark.e2e
 @pytest.mark.parametrize("index", range(6))
 def test_a_useless_simulation_follows_no_output_of_the_recording(index):
-    """Nor does a fit from other starts, to the outputs as they are recorded, explain a quarter of any one."""
+    """A fit to the recorded outputs from other starts does not explain a quarter of any output either."""
     case = SCENARIOS["useless"].draw(5, index, False, index)
     assert case.key.useless == ("wrong sign", "another system", "unrelated output")[index % 3]
     assert case.key.follows <= MOST_FOLLOWED
@@ -208,7 +208,7 @@ def test_a_draw_of_which_any_fit_follows_an_output_is_drawn_again(monkeypatch):
 @pytest.mark.e2e
 @pytest.mark.parametrize("system", sorted({*SYSTEMS} - {"servo"}))
 def test_the_right_simulation_can_follow(system):
-    """So that a small share means a useless simulation and not a poor fit."""
+    """A small share then means a useless simulation, not a poor fit."""
     setting = SYSTEMS[system].draw(generator(5, system))
     outputs = simulate(setting.plant, setting.trial).outputs
     assert min(best_shares(generator(6), right(setting.plant), setting.trial, outputs)) > 0.995

@@ -1,4 +1,4 @@
-"""Each scenario of the magnetometer is what its name says."""
+"""Each scenario of the magnetometer matches its name."""
 
 import math
 
@@ -17,7 +17,7 @@ from mkc_torch.simulation.load import load_simulation
 SCENARIOS = {scenario.name: scenario for scenario in magnetometer_scenarios(30.0).scenarios}
 
 
-def test_the_scenarios_are_all_there():
+def test_all_scenarios_are_listed():
     assert list(SCENARIOS) == ["white", "coloured", "wander", "bursts", "orientations", "useless"]
     assert [name for name, scenario in SCENARIOS.items() if not scenario.hides] == ["useless"]
 
@@ -63,7 +63,7 @@ def test_a_drift_has_its_declared_size():
         still = [process.sample(generator(seed, k), 2000) for k, process in enumerate(walking.walks)]
         reach += [float((path - path.mean()).square().mean().sqrt()) / noise.sigma / far for path in still]
     assert math.sqrt(sum(r * r for r in reach) / len(reach)) == pytest.approx(1.0, abs=0.12)
-    # slow: what it does from sample to sample is small compared with the noise
+    # slow: its change from sample to sample is small compared with the noise
     steps = axis_errors(generator(2), walking, 2000).diff(dim=0)
     plain = axis_errors(generator(2), noise, 2000).diff(dim=0)
     assert float((steps - plain).std()) < 0.5 * float(plain.std())
@@ -80,8 +80,8 @@ def test_bursts_are_few_and_short_and_nothing_is_between_them():
     assert key.disturbance.words["share"] * 1500 <= len(key.key.outliers) + 1
 
 
-def test_bursts_go_each_way_as_nothing_that_passes_by_does():
-    """What swells and fades on one side of nought has a mean of 0.9 of its root mean square."""
+def test_bursts_have_both_signs_unlike_a_passing_object():
+    """A one-sided pulse has a mean of 0.9 times its root mean square."""
     shares = []
     for seed in range(30):
         field, mask = bursts(generator(seed), 0.5, 4500, 0.02)

@@ -1,4 +1,4 @@
-"""Process noise is of the spectrum it is named after, of the size it says, and in the rate of one state alone."""
+"""Process noise has its declared spectrum and size, and acts on the rate of one state only."""
 
 import dataclasses
 
@@ -124,7 +124,7 @@ def test_responses_are_those_of_the_true_system(system):
 
 @pytest.mark.e2e
 def test_traces_similar_to_the_disturbance_have_less_weight():
-    """Draws of noise and push together are white of variance one in that metric, in the mean over many."""
+    """Whitened draws of measurement plus process noise have variance 1 on average."""
     scene, errors = scene_of("tanks")
     errors = dataclasses.replace(errors, correlation=0.0, family="gaussian")
     disturbance = draw_disturbance(generator(7), "pushed_slowly", scene, errors)
