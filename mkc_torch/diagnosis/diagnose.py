@@ -95,7 +95,7 @@ def diagnose(
             and the power were measured with the default.
         noise: known standard deviations of the sensors' white noise, by output, in the output's unit; the others are
             estimated.
-        between: known input holds between two samples, "held" or "linear", by input; for the others the more likely
+        input_hold: known input holds between two samples, "held" or "linear", by input; for the others the more likely
             hold is used. For differential equations only.
         quick: True for a quick look without surrogates: candidates are accepted by likelihood less a penalty, leading
             candidates are refitted from fewer starts, and slow tests of evidence are left out. There are no p-values,

@@ -208,7 +208,7 @@ def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     _, table, output = thermistor
     result = mkc("diagnose", table, "--output", output)
     assert result.exit_code == 1
-    assert "give one of --simulation and --simulator-output" in flat(result.stderr)
+    assert "give --simulation or --simulator-output" in flat(result.stderr)
     assert "no magnetometer is recognised among `time`, `temperature`, `current`, `voltage`" in flat(result.stderr)
     assert not output.exists()
     sensor = tmp_path / "sensor.csv"
@@ -273,7 +273,7 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     )
     assert "far enough" in result.stderr
     assert given["noise"] == {"voltage": 0.01, "other": 2.0, "third": 0.001}
-    assert given["between"] == {"temperature": "held"}
+    assert given["input_hold"] == {"temperature": "held"}
 
 
 @pytest.mark.e2e

@@ -97,7 +97,7 @@ def test_an_interrupt_writes_and_reports_the_results_so_far_and_stops(tmp_path, 
     stopped_in_the_search(monkeypatch, "interrupt")
     result = mkc("diagnose", path, *ON_A_MAGNETOMETER, "--output", tmp_path / "out")
     assert result.exit_code == 130
-    assert result.stderr == f"mkc: interrupted; what was known until then was written for {path}.\n"
+    assert result.stderr == f"mkc: interrupted; results so far were written for {path}.\n"
     assert search_of(tmp_path / "out" / "runs" / "1")["stopped"]["reason"] == "interrupt"
     assert not (tmp_path / "out" / "runs" / "2").exists()
 
@@ -142,9 +142,9 @@ WAITING = """
 import sys
 from pathlib import Path
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch.diagnosis.partial_result import UnderWay
+from mkc_torch.diagnosis.partial_result import PartialResult
 from time import sleep
-keep = UnderWay.keep_search
+keep = PartialResult.keep_search
 
 def kept(self, search):
     keep(self, search)
@@ -153,7 +153,7 @@ def kept(self, search):
         check_deadline()
         sleep(0.01)
 
-UnderWay.keep_search = kept
+PartialResult.keep_search = kept
 *sys.argv, begun = sys.argv
 begun = Path(begun)
 from mkc_torch.cli import main
@@ -177,7 +177,7 @@ def test_ctrl_c_ends_all_processes_and_its_files_are_whole(tmp_path):
         # copies have the same streams, which end when the last one has
         _, reported = process.communicate(timeout=120)
     assert process.returncode == 130, reported
-    assert reported.startswith(f"mkc: interrupted; what was known until then was written for {path}.\n")
+    assert reported.startswith(f"mkc: interrupted; results so far were written for {path}.\n")
     assert search_of(out / "a")["stopped"]["reason"] == "interrupt"
 
 

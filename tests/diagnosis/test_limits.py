@@ -20,7 +20,7 @@ from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.test_dynamics_diagnosis import Pendulum, swung
 
 QUICK = {"surrogates": 19, "max_findings": 1}
-NOT_FINISHED = "The search was not finished"
+NOT_FINISHED = "The search was stopped"
 
 
 class Steps:

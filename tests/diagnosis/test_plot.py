@@ -96,16 +96,16 @@ def test_bars_are_the_gains_best_first(found):
 @pytest.mark.parametrize(
     ("draw", "words"),
     [
-        (lambda d: d.plot.residual(9), "`channel`.*9; they are 0 to 3"),
+        (lambda d: d.plot.residual(9), "`channel`.*9.*0 to 3"),
         (lambda d: d.plot.residual("nothing"), "one of norm, turn_x"),
-        (lambda d: d.plot.effect(7), "`finding`.*7; they are 0 to 2"),
+        (lambda d: d.plot.effect(7), "`finding`.*7.*0 to 2"),
         (lambda d: d.plot.over_driver(1, driver="nothing"), "`driver`.*'nothing'; there are"),
         (lambda d: d.plot.forcing(5), "`index`.*5"),
-        (lambda d: d.plot.candidates(0), "`upper` to be at least 1 but got 0"),
-        (lambda d: d.plot.separability(0), "`upper` to be at least 1 but got 0"),
-        (lambda d: dataclasses.replace(d, findings=()).plot.residual(corrected=True), "nothing was found"),
+        (lambda d: d.plot.candidates(0), "`most` to be at least 1 but got 0"),
+        (lambda d: d.plot.separability(0), "`most` to be at least 1 but got 0"),
+        (lambda d: dataclasses.replace(d, findings=()).plot.residual(corrected=True), "`corrected`.*no findings"),
         (lambda d: dataclasses.replace(d, findings=()).plot.effect(), "no finding was made"),
-        (lambda d: dataclasses.replace(d, findings=()).plot.held_out(), "no finding whose gain"),
+        (lambda d: dataclasses.replace(d, findings=()).plot.held_out(), "No finding has a gain"),
         (lambda d: dataclasses.replace(d, candidates=()).plot.candidates(), "no candidates"),
     ],
 )

@@ -21,7 +21,7 @@ LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source
 def public():
     """The public packages that the page on architecture names."""
     text = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
-    sentence = re.search(r"Public names are those of (.+?); a name with an underscore", text)[1]
+    sentence = re.search(r"Public names are those of (.+?), without an underscore", text)[1]
     return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", sentence)]
 
 

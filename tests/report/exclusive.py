@@ -88,7 +88,7 @@ PAIRS = (
         "[Ss]tructure remains|has structure|smooth trend along|Look for the cause of the disturbance",
         "report",
     ),
-    Pair("white", "is not white", "row"),
+    Pair(r"(?<!not )\bwhite\b", "is not white", "row"),
     Pair(r"correlation time \S+ s", r"is white\.", "row"),
     # what to do
     Pair("The simulation can be used", f"{CLAIM}|{DISTURBANCE}|[Nn]earest in the catalogue", "report"),
@@ -169,8 +169,7 @@ RULES: dict[str, Rule] = {
     "adequate with a warning of a disturbance": lambda d: (
         d.verdict == "adequate"
         and any(
-            re.search("acts on the rate|is driven|disturbs|smooth trend along|more structure", w)
-            for w in d.warnings
+            re.search("acts on the rate|is driven|disturbs|smooth trend along|more structure", w) for w in d.warnings
         )
     ),
     "explained without a claim": lambda d: d.verdict == "explained" and not _claims(d),

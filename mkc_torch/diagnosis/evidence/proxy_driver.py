@@ -21,8 +21,7 @@ def test(case: EvidenceContext) -> EvidenceResult:
     name = ", ".join(case.fit.model.terms[-1].columns)
     sentence = (
         f"With {name} as driver, the offset still drifts along the same direction: {name} may be a proxy of an "
-        f"unrecorded "
-        "cause. Find the cause and record it."
+        "unrecorded cause. Find the cause and record it."
     )
     return EvidenceResult("stand_in", True, warnings=(sentence,))
 

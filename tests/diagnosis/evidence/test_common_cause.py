@@ -103,7 +103,7 @@ def test_a_cause_that_was_not_recorded_is_found(diagnosis):
     (finding,) = found.findings
     assert (finding.effect, finding.drivers, found.verdict) == ("unknown", (), "unexplained")
     assert found.p_value == finding.p_value == 0.01
-    assert "no column recorded" in headline(found)
+    assert "unrecorded cause" in headline(found)
 
 
 @pytest.mark.e2e
@@ -136,7 +136,7 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
     assert term.shape == found.model.terms[0].shape
     columns, notes = model.correct(recording)
     assert notes == (
-        "unknown is bound to the time of the diagnosed recording: its offset at the end is taken off all of this one.",
+        "unknown depends on the time of the diagnosed recording: its final offset is subtracted from all samples.",
     )
     strength = torch.linalg.vector_norm(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1), dim=-1)
     truth = float(strength.median())
@@ -152,9 +152,9 @@ def test_a_column_that_follows_the_cause_only_in_part_is_reported_as_a_proxy(who
     recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=column)
     found = diagnose(Magnetometer("norm"), recording)
     assert (found.findings[0].effect, found.findings[0].drivers) == ("driver_offset", ("aux",))
-    sentences = [warning for warning in found.warnings if "stand in" in warning]
+    sentences = [warning for warning in found.warnings if "may be a proxy" in warning]
     assert len(sentences) == (0 if whole else 1)
-    assert all(warning.startswith("What aux leaves of the offset goes on") for warning in sentences)
+    assert all(warning.startswith("With aux as driver, the offset still drifts") for warning in sentences)
 
 
 @pytest.mark.e2e

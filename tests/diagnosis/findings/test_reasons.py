@@ -44,13 +44,13 @@ def reasons_for(fit):
 
 def reached(sentence):
     """Return the residual in rad that a reason states."""
-    return float(sentence.split(" it follows angle to ")[1].removesuffix(" rad."))
+    return float(sentence.split(" the residual is angle ")[1].removesuffix(" rad."))
 
 
 @pytest.mark.e2e
 def test_an_input_of_the_other_sign_is_reported():
     text = reasons_for(at(swung(effect=-1.0, N=N)[0]))
-    assert text[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
+    assert text[0].startswith("With the sign of `torque` reversed, the residual is angle 0.00")
     assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
     # with its sign reversed it matters
     assert not any("does not matter" in item for item in text)
@@ -59,7 +59,7 @@ def test_an_input_of_the_other_sign_is_reported():
 @pytest.mark.e2e
 def test_a_delayed_input_is_reported_with_its_delay():
     text = reasons_for(at(swung(late=5, N=N)[0]))
-    assert text[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
+    assert text[0].startswith("With `torque` delayed by 0.25 s, the residual is angle 0.00")
     assert reached(text[0]) == pytest.approx(NOISE, rel=0.2)
 
 
@@ -67,7 +67,7 @@ def test_a_delayed_input_is_reported_with_its_delay():
 def test_a_parameter_of_the_other_sign_is_reported_even_outside_its_range():
     text = reasons_for(at(swung(N=N)[0], system=UpsideDown))
     assert text[0].startswith("With `stiffness` = -")
-    assert ", which its range forbids, it follows angle to 0.00" in text[0]
+    assert ", which the bounds exclude, the residual is angle 0.00" in text[0]
     value = float(text[0].split("`stiffness` = ")[1].split(",")[0])
     assert value == pytest.approx(-9.0, abs=0.1)
 
@@ -76,7 +76,7 @@ def test_a_parameter_of_the_other_sign_is_reported_even_outside_its_range():
 def test_an_input_that_does_nothing_does_not_matter():
     recording, _ = swung(effect=0.0, N=N)
     text = reasons_for(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
-    assert "`torque` does not matter: held at its mean the simulation follows angle as well." in text
+    assert "`torque` does not matter: held at its mean, the simulation fits angle equally well." in text
 
 
 @pytest.mark.e2e

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("polars")
 
-from mkc_torch.recording.formats import RecordingError, read_topics
+from mkc_torch.recording.formats import RecordingError, read_topics, sandbox
 from tests.recording.formats import writers
 from tests.recording.formats.test_same_samples import KINDS, numbers
 from tests.recording.formats.writers import samples
@@ -152,7 +152,7 @@ def test_a_parquet_file_over_which_polars_would_end_this_process_is_damaged(tmp_
 @pytest.mark.e2e
 def test_an_hdf5_file_over_which_the_library_loops_forever_is_damaged(tmp_path, monkeypatch):
     h5py = pytest.importorskip("h5py")
-    monkeypatch.setattr(trial, "_PATIENCE", (4.0, 0.0))
+    monkeypatch.setattr(sandbox, "_PATIENCE", (4.0, 0.0))
     path = tmp_path / "log.h5"
     with h5py.File(path, "w") as file:
         for name in ("time", "mag_x"):

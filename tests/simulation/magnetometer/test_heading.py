@@ -128,7 +128,7 @@ def test_a_reset_and_a_current_are_found_together():
     assert set(found) == {"heading_reset", "current_field"}
     reset = found["heading_reset"].parameters[0]
     assert reset.unit == "°"
-    assert "within the 180 ° that is plausible" in found["heading_reset"].plausibility
+    assert "within the plausible 180 °" in found["heading_reset"].plausibility
     assert reset.value == pytest.approx(14.0, abs=3.0 * reset.standard_error)
     curve = found["heading_reset"].curve
     assert (curve.driver, curve.value_unit) == ("time", "°")
