@@ -357,7 +357,7 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--run-column", ""), "--run-column is empty"),
         ((path, *out, *known, "--columns", "experiment=a", "--run-column", "b"), "different columns"),
         ((path, *out, *known, "--columns", "mag_x"), "mag_x=mx"),
-        ((path, twin, *out, *known), "same folder"),
+        ((path, twin, *out, *known), "would both write into"),
     ):
         refused(mkc("diagnose", *arguments), words, code=2)
     assert not (tmp_path / "out").exists()

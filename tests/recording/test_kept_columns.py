@@ -121,9 +121,9 @@ def test_a_column_of_that_name_is_replaced_in_its_place(tmp_path):
     assert read_csv(tmp_path / "out.csv") == [["field_x", "a"], ["1.0", "1"], ["1.0", "2"]]
 
 
-cell = st.text(st.characters(exclude_categories=("Cs", "Cc", "Zl", "Zp")), max_size=8).filter(
-    lambda text: "\u2212" not in text
-)
+# typographic minus signs are read as minus signs, with a warning
+letters = st.characters(exclude_categories=("Cs", "Cc", "Zl", "Zp"), exclude_characters="\u2212")
+cell = st.text(letters, max_size=8)
 first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";")))  # not a comment
 
 

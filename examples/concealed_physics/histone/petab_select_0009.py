@@ -2,8 +2,8 @@
 
 Of 2^32 models of histone H4 acetylation the published best has an AICc of -1708.11. Forward selection ends at -1704.70
 and backward elimination at -1707.51; of FAMoS's searches from random models less than 5 % end at the best one (its
-test case). Here the search goes on from every model within 2 of the best so far, with swaps, from ten starts: no rate of
-its own, all 32, and random halves.
+test case). Here the search continues from every model within 2 of the best so far, with swaps, from ten starts: no own
+rate, all 32, and random halves.
 
 It needs the package petab-select (extra `examples`). The data are in this folder, with source and licence.
 """
