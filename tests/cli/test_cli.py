@@ -130,8 +130,8 @@ def test_two_recordings_of_one_name_are_refused_before_any_work(good, tmp_path):
     (tmp_path / "more").mkdir()
     twin = table(tmp_path / "more" / "good.csv", noisy_ellipsoid(100))
     result = mkc("calibrate", good, twin, "--output", tmp_path / "out")
-    refused(result, "same folder", code=2)
-    refused(mkc("calibrate", good, good, "--output", tmp_path / "out"), "same folder", code=2)
+    refused(result, "would both write into", code=2)
+    refused(mkc("calibrate", good, good, "--output", tmp_path / "out"), "would both write into", code=2)
     assert not (tmp_path / "out").exists()
 
 
