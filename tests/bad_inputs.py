@@ -164,7 +164,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "two recordings of one name": ("calibrate", "@rec.csv", "@folder/rec.csv", "--output", "@out"),
     "`--columns mag_x`": ("calibrate", "@rec.csv", "--output", "@out", "--columns", "mag_x"),
     "`--columns mag_x=a,mag_x=b`": ("calibrate", "@rec.csv", "--output", "@out", "--columns", "mag_x=a,mag_x=b"),
-    "`--columns mag_x=a`, where there is none": ("calibrate", "@rec.csv", "--output", "@out", "--columns", "mag_x=a"),
+    "`--columns mag_x=a` without a column a": ("calibrate", "@rec.csv", "--output", "@out", "--columns", "mag_x=a"),
     "`--convert time=parsec`": ("calibrate", "@rec.csv", "--output", "@out", "--convert", "time=parsec"),
     "`--convert speed=km/h`": ("calibrate", "@rec.csv", "--output", "@out", "--convert", "speed=km/h"),
     "`--sensor mag7`": ("calibrate", "@mag0_mag1.csv", "--output", "@out", "--sensor", "mag7"),
@@ -217,7 +217,7 @@ PYTHON: dict[str, Callable[[], Any]] = {
     "`Recording({})`": lambda: Recording({}),
     "`Recording` of columns of other lengths": lambda: Recording({"a": ONES[:, 0], "b": ONES[:3, 0]}),
     "`Recording` of a list": lambda: Recording({"a": [1.0, 2.0]}),
-    '`Recording(...)["mag_x"]`, where there is none': lambda: Recording({"a": ONES[:, 0]})["mag_x"],
+    '`Recording(...)["mag_x"]` without that column': lambda: Recording({"a": ONES[:, 0]})["mag_x"],
     "`Recording.from_frame` of a dict": lambda: Recording.from_frame({"a": [1.0]}),
 }
 
