@@ -213,7 +213,10 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
     if search.given_up:
-        more.append(f"The search for further findings failed. {search.given_up}")
+        more.append(
+            f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
+            "further fit has no finite trajectory. Other physics may be missing too."
+        )
     if search.cut:
         more.append(
             f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "
