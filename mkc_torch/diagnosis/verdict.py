@@ -18,6 +18,9 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["FitAssessment", "assess", "assess_baseline", "impossible_rotations", "noise_environment", "verdict_of"]
 
+_LOST = -1.0
+"""Smallest explained share of an output in the mean over the outputs."""
+
 
 @dataclass(frozen=True)
 class FitAssessment:
@@ -36,12 +39,15 @@ class FitAssessment:
     lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
-        """Whether the simulation explains too little of the variation, both without and with its findings."""
+        """Whether the simulation explains too little of the variation, both without and with its findings.
+
+        An output that runs away counts against the others: an effect can tie one output to an input, and lose another.
+        """
         if self.lost:
             return True
         if not poor_fits(self.follows, settings.followed):
             return False
-        shares = [pooled(fits) for fits in (self.follows, self.corrected) if fits]
+        shares = [pooled(fits, _LOST) for fits in (self.follows, self.corrected) if fits]
         return not shares or max(shares) < settings.useful
 
 
