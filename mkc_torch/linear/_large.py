@@ -17,13 +17,14 @@ from torch import Tensor
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
-from mkc_torch.linear._blocks import CurvatureSums, Density, Sums
+from mkc_torch.linear._blocks import Density, Sums
+from mkc_torch.linear._descent import Descent, PassDerivatives, sandwich_of
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
-from mkc_torch.linear._passes import DescentEnd, PassDerivatives, Rows, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
+from mkc_torch.linear._rows import Rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -132,31 +133,55 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
             fit_state, log_bound=torch.log(_half_width(rows, fit_state.beta, TIGHT * pilot.begin.scale))
         )
     for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike else ():
-        end = descend(some, fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE, passes=passes)
-        if end is None or end.curvature_sums is None:
+        descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
+        end = _descended(some, descent, passes)
+        if end is None:
             return None
-        fit_state, total_weight = _moved(fit_state, end), end.sums.weight.sum()
-        slopes = replace(
-            slopes, curvature=end.curvature_sums.curvature / total_weight, tilt=end.curvature_sums.tilt / total_weight
-        )
+        fit_state, slopes = _moved(fit_state, end), end.slopes
     first: Sums | None = None
     if known.bound is None:
-        end = descend(rows, fit_state, slopes, near=0.0, stop=1.0, passes=passes) if pilot.alike else None
+        descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
+        end = _descended(rows, descent, passes) if pilot.alike else None
         if end is not None:
-            fit_state, first = _moved(fit_state, end), end.sums
+            fit_state, first = _moved(fit_state, end), end.total
         fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
     weights = torch.empty_like(rows.Y)
-    end = descend(
-        rows, fit_state, slopes, near=_NEAR, stop=_STOP, passes=passes, weights=weights, first=first, alike=pilot.alike
-    )
-    if (
-        end is None
-        or end.curvature_sums is None
-        or _d_is_at_its_least(end, fit_state)
-        or _gaussian_is_more_likely(rows, fit_state, end, slopes.grams)
-    ):
+    descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
+    end = _descended(rows, descent, passes, weights, first)
+    if end is None or _d_is_at_its_least(end) or _gaussian_is_more_likely(rows, end):
         return None
-    return _result(rows, fit_state, end, end.curvature_sums, weights)
+    return _result(rows, end, weights)
+
+
+def _descended(
+    rows: Rows,
+    descent: Descent,
+    passes: int,
+    weights: Float[Tensor, "N m"] | None = None,
+    first: Sums | None = None,
+) -> Descent | None:
+    """The end of a descent; None if that takes too many passes.
+
+    Args:
+        rows: rows whose likelihood is maximised.
+        descent: state before the first pass.
+        passes: largest number of passes.
+        weights: filled with the weights at the end.
+        first: sums at the starting point, if known.
+    """
+    for _ in range(passes):
+        total, more = first, None
+        if total is None or descent.close:
+            total, more = rows.evaluate(
+                descent.point.beta[0],
+                descent.density(),
+                with_curvature=descent.with_curvature,
+                weights=weights if descent.close else None,
+            )
+        descent, first = descent.after(total, more), None
+        if descent.done:
+            return descent
+    return None
 
 
 @dataclass(frozen=True)
@@ -220,12 +245,12 @@ def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | 
 
 def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:
     """Half-width of the domain by :func:`domain_rule`, from the residuals of all rows."""
-    low, high = rows.range_at(beta[0])
-    return torch.maximum(0.5 * (high - low), least)
+    found = rows.range_at(beta[0])
+    return torch.maximum(0.5 * (found.high - found.low), least)
 
 
-def _moved(fit_state: FitState, end: DescentEnd) -> FitState:
-    point = end.place.point
+def _moved(fit_state: FitState, end: Descent) -> FitState:
+    point = end.point
     return replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
 
 
@@ -246,10 +271,10 @@ def _is_valid(rows: Rows) -> bool:
     return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
 
 
-def _d_is_at_its_least(end: DescentEnd, fit_state: FitState) -> bool:
+def _d_is_at_its_least(end: Descent) -> bool:
     """Whether d ended at its least, which is that of the pilot."""
-    assert fit_state.log_d_min is not None
-    return fit_state.free_d and bool((end.place.point.log_d <= fit_state.log_d_min).any())
+    assert end.fit_state.log_d_min is not None
+    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.log_d_min).any())
 
 
 def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
@@ -296,58 +321,56 @@ def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n
     return found.curvature
 
 
-def _gaussian_is_more_likely(rows: Rows, fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
+def _gaussian_is_more_likely(rows: Rows, end: Descent) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
-    if not (fit_state.free_kappa and fit_state.free_d) or not bool((end.place.point.kappa > 0).any()):
+    assert end.best is not None
+    assert end.total is not None
+    if not (end.fit_state.free_kappa and end.fit_state.free_d) or not bool((end.point.kappa > 0).any()):
         return False
-    value = float(end.place.per_sample)
-    if _gaussian_value(fit_state, end, grams * end.sums.weight.sum(), _SLACK) >= value:
+    value, grams = end.best.by_channel.value.sum(), end.slopes.grams
+    if _gaussian_value(end, grams * end.total.weight.sum(), _SLACK) >= value:
         return False
     if grams.shape[0] > 1:
         return True
-    return _gaussian_value(fit_state, end, _gram(rows, fit_state, 0).unsqueeze(0), 1.0) < value
+    return _gaussian_value(end, _gram(rows, end.fit_state, 0).unsqueeze(0), 1.0) < float(value)
 
 
-def _gaussian_value(fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"], slack: float) -> float:
+def _gaussian_value(end: Descent, grams: Float64[Tensor, "m n n"], slack: float) -> float:
     """Mean negative log-likelihood of a Gaussian at the least squares of each channel.
 
     Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g`` with ``g = Σ e x`` and ``G = Σ x xᵀ``.
     """
+    fit_state, total, found = end.fit_state, end.total, end.curvature_sums
     assert fit_state.log_bound is not None
     assert fit_state.log_d_min is not None
+    assert total is not None
+    assert found is not None
     root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
-    assert end.curvature_sums is not None
-    moment = (end.curvature_sums.moment * root).unsqueeze(-1)
+    moment = (found.moment * root).unsqueeze(-1)
     lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
-    variance = ((end.curvature_sums.square - slack * lowered) / end.sums.weight).clamp(min=0.0)
+    variance = ((found.square - slack * lowered) / total.weight).clamp(min=0.0)
     d = torch.maximum(variance.sqrt(), torch.exp(fit_state.log_d_min[0]))
     norm = log_partition_value(torch.zeros_like(d), torch.exp(fit_state.log_bound[0]) / d)
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
 
 
-def _result(
-    rows: Rows, fit_state: FitState, end: DescentEnd, found: CurvatureSums, weights: Float[Tensor, "N m"]
-) -> LargeMaximum:
-    point = end.place.point
+def _result(rows: Rows, end: Descent, weights: Float[Tensor, "N m"]) -> LargeMaximum:
+    assert end.best is not None
+    assert end.total is not None
+    assert end.curvature_sums is not None
+    point = end.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     left = used - point.beta.shape[-1]
-    coef, covariance = point.beta[0], _sandwich(found, used, left)
+    coef, covariance = point.beta[0], sandwich_of(end.curvature_sums, used, left)
     if rows.frame is not None:
         coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
     return LargeMaximum(
         coef=coef,
-        fit_state=replace(fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
+        fit_state=replace(end.fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
         weights=weights,
-        log_likelihood=-(end.sums.weight * end.place.by_channel.value).sum(),
+        log_likelihood=-(end.total.weight * end.best.by_channel.value).sum(),
         covariance=covariance,
         dof=coef.new_tensor(float(left)),
-        history=torch.stack(end.history),
+        history=coef.new_tensor(end.history),
     )
-
-
-def _sandwich(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
-    root = found.curvature.diagonal().rsqrt()
-    outer = root.unsqueeze(-1) * root
-    inverse = outer * torch.linalg.pinv(outer * found.curvature, hermitian=True)
-    return used / max(left, 1) * inverse @ found.spread @ inverse

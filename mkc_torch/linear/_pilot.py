@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._blocks import blocks, triangle
+from mkc_torch.linear._blocks import triangle
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDeficientError, linear_problem
+from mkc_torch.linear._rows import blocks
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
