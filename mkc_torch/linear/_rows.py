@@ -87,10 +87,10 @@ def blocks(
     Y: Shaped[Any, "N m"],
     weight: Shaped[Any, "N m"] | None,
     frame: Float64[Tensor, "n n"] | None = None,
-    values: int = VALUES,
+    values: int | None = None,
 ) -> Iterator[Block]:
     """Yield rows times ``frame``, targets and weights in blocks of ``values`` values."""
-    step = max(1, values // Y.shape[-1])
+    step = max(1, (VALUES if values is None else values) // Y.shape[-1])
     for first in range(0, Y.shape[0], step):
         part = slice(first, first + step)
         rows = as_float64(X[part])

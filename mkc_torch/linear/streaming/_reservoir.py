@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+
+from mkc_torch.linear._blocks import Block
 
 if TYPE_CHECKING:
     from jaxtyping import Float64, Int64
-
-    from mkc_torch.linear.streaming._blocks import StreamBlock
 
 __all__ = ["Drawn", "Reservoir", "merged"]
 
@@ -45,11 +46,10 @@ class Reservoir:
         rank: this rank, which replaces ``first`` if that is unknown.
 
     Example:
-        >>> from mkc_torch.linear.streaming._blocks import StreamBlock
         >>> sample = Reservoir(3, seed=0)
         >>> for start in (0, 5):
-        ...     rows = np.arange(start, start + 5.0)
-        ...     sample.add(StreamBlock(np.stack([rows, rows])[None], None))
+        ...     rows = torch.arange(start, start + 5.0).double()
+        ...     sample.add(Block(rows.reshape(5, 1, 1), rows.reshape(5, 1), None))
         >>> sample.drawn().numbers
         array([1, 2, 3])
     """
@@ -63,15 +63,15 @@ class Reservoir:
         self._parts: list[Drawn] = []
         self._held = 0
 
-    def add(self, block: StreamBlock) -> None:
+    def add(self, block: Block) -> None:
         """Draw from the rows of a block."""
-        count = block.Y.shape[-1]
+        count = block.y.shape[0]
         keys = self._random.random((count,))
         chosen = np.flatnonzero(keys < self._limit)
         if len(chosen):
-            parts: list[np.ndarray] = [block.X.reshape(-1, count), block.Y]
-            parts += [] if block.weight is None else [block.weight]
-            rows = np.concatenate([part[:, chosen] for part in parts]).T
+            index = torch.from_numpy(chosen).to(block.y.device)
+            parts = [block.rows.flatten(1), block.y] + ([] if block.weight is None else [block.weight])
+            rows = torch.cat([part[index] for part in parts], 1).cpu().numpy()
             self._parts.append(Drawn(keys[chosen], self._number + chosen, rows))
             self._held += len(chosen)
         self._number += count

@@ -17,13 +17,11 @@ from mkc_torch.linear._estimator import NotFittedError
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._robust_start import Start
 from mkc_torch.linear.em import MKCRegression
-from mkc_torch.linear.streaming._blocks import checked_source
-from mkc_torch.linear.streaming._float32_pass import float32_pass
+from mkc_torch.linear.streaming._batches import checked_source
 from mkc_torch.linear.streaming._pilot import fit_pilot
 from mkc_torch.linear.streaming._progress import StreamChangedError, StreamProgress
 from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
-from mkc_torch.linear.streaming._results import results
-from mkc_torch.linear.streaming._sums import Report, StreamSums, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._sums import flat_length, range_pass, sums_pass
 from mkc_torch.linear.streaming._survey import Survey, survey_rows
 
 if TYPE_CHECKING:
@@ -155,11 +153,15 @@ class StreamedMKCRegression(Inference):
         if progress.phase == "range":
             progress = self._after_range_pass(ranks, batches, progress, checkpoint)
         while progress.phase != "done":
-            before = progress
-            flat = ranks.sum_of(*_pass(batches, before))
-            progress = self._saved(ranks, lambda: _after(before, flat, self.max_passes), checkpoint)  # noqa: B023
+            before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
+            beta, density, curvature = progress.next_pass()
+            flat = ranks.sum_of(
+                lambda: sums_pass(batches, shape, frame, beta, density, with_curvature=curvature),  # noqa: B023
+                flat_length(shape, with_curvature=curvature),
+            )
+            progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
         self._single_channel = progress.survey.shape.single_channel
-        found = ranks.from_first(lambda: results(before, progress, Report.of(flat, progress.survey.shape)))
+        found = ranks.from_first(progress.results)
         for name, value in found.items():
             setattr(self, name, value)
         self._name_columns(batches)
@@ -244,9 +246,7 @@ class StreamedMKCRegression(Inference):
         def begin() -> StreamProgress:
             survey = Survey.of_all(surveys)
             sample = merged([part for part in drawn if part is not None], self.pilot)
-            to_basis = survey.to_coef() if survey.is_ill_conditioned() else None
-            begun = fit_pilot(sample, survey.shape, self._of_sample(), to_basis)
-            return StreamProgress.begin(self._settings(), survey, begun)
+            return StreamProgress.begin(self._settings(), survey, fit_pilot(sample, survey, self._of_sample()))
 
         return self._saved(ranks, begin, checkpoint)
 
@@ -254,7 +254,8 @@ class StreamedMKCRegression(Inference):
         self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
     ) -> StreamProgress:
         """Progress after the pass for the domain."""
-        parts = ranks.gathered(lambda: range_pass(batches, progress.survey.shape, progress.point()))
+        survey, (beta, *_) = progress.survey, progress.next_pass()
+        parts = ranks.gathered(lambda: range_pass(batches, survey.shape, survey.frame(), beta))
         return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
 
     def _saved(
@@ -282,24 +283,6 @@ class StreamedMKCRegression(Inference):
         names = getattr(batches, "column_names", None)
         if names is not None:
             self.feature_names_in_ = names
-
-
-def _pass(batches: Iterable[Any], progress: StreamProgress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
-    """The next pass as a function, and the number of sums that it returns."""
-    assert progress.climb is not None
-    shape, point, climb = progress.survey.shape, progress.point(), progress.climb
-    if progress.phase == "report":
-        return lambda: report_pass(batches, shape, point), Report.length(shape)
-    if climb.rough:
-        return lambda: float32_pass(batches, shape, point), StreamSums.length(shape)
-    return lambda: slopes_pass(batches, shape, point, curvature=climb.curvature), StreamSums.length(shape)
-
-
-def _after(progress: StreamProgress, flat: Float64[Tensor, " k"], max_passes: int) -> StreamProgress:
-    """Progress after a pass."""
-    if progress.phase == "report":
-        return progress.after_report(Report.of(flat, progress.survey.shape).slopes, max_passes)
-    return progress.after_slopes(StreamSums.of(flat, progress.survey.shape), max_passes)
 
 
 def _likely(drawn: Drawn | None, size: int, rows: int) -> Drawn | None:
