@@ -70,16 +70,25 @@ class CurvatureSums(NamedTuple):
 
 
 class ResidualRange(NamedTuple):
-    """Sum of the weighted residuals of each channel, and their least and largest over the samples in use."""
+    """Least and largest residual of each channel over the samples in use."""
 
-    residual: Float64[Tensor, " m"]
     low: Float64[Tensor, " m"]
     high: Float64[Tensor, " m"]
 
     def with_others(self, other: ResidualRange) -> ResidualRange:
-        return ResidualRange(
-            self.residual + other.residual, torch.minimum(self.low, other.low), torch.maximum(self.high, other.high)
-        )
+        return ResidualRange(torch.minimum(self.low, other.low), torch.maximum(self.high, other.high))
+
+    def half(self) -> Float64[Tensor, " m"]:
+        """Half the range."""
+        return 0.5 * (self.high - self.low)
+
+
+class PassResult(NamedTuple):
+    """Sums of a pass over rows, and the curvature sums and the range of the residuals if they were wanted."""
+
+    total: Sums
+    curvature: CurvatureSums | None
+    extent: ResidualRange | None
 
 
 Added = TypeVar("Added", Sums, CurvatureSums)
@@ -96,13 +105,11 @@ def residual(block: Block, coef: Float64[Tensor, " n"]) -> Float64[Tensor, "b m"
     return block.y - torch.matmul(block.rows, coef)
 
 
-def residual_range(block: Block, coef: Float64[Tensor, " n"]) -> ResidualRange:
-    error = residual(block, coef)
+def residual_range(block: Block, error: Float64[Tensor, "b m"]) -> ResidualRange:
     if block.weight is None:
-        return ResidualRange(error.sum(0), *torch.aminmax(error, dim=0))
+        return ResidualRange(*torch.aminmax(error, dim=0))
     used = block.weight > 0
     return ResidualRange(
-        (block.weight * error).sum(0),
         torch.where(used, error, torch.inf).amin(0),
         torch.where(used, error, -torch.inf).amax(0),
     )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.likelihood import DensityState, Derivatives, likelihood_derivatives, newton_proposal
-from mkc_torch.linear._blocks import CurvatureSums, Density, Sums, energy_of
+from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, Sums, energy_of
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns, free_unknowns, inverse_where, moved
 
 if TYPE_CHECKING:
@@ -148,7 +148,8 @@ class Descent:
         slow: share of the length of a step that the next may have; beyond it, the next pass computes the curvature.
         alike: whether ``slopes`` are of similar rows; otherwise the first pass computes the curvature too.
         best: the accepted point of least value.
-        total, curvature_sums: sums at ``best``, and of the last pass near the maximum that computed the curvature.
+        result: sums at ``best``.
+        curvature_sums: sums of the last pass near the maximum that computed the curvature.
         length, left: length of the last step and expected length of the next, in standard errors.
         move: the last step.
         plain: whether the last step was an E-step and an M-step.
@@ -165,7 +166,7 @@ class Descent:
     slow: float = math.inf
     alike: bool = True
     best: EvaluatedPoint | None = None
-    total: Sums | None = None
+    result: PassResult | None = None
     curvature_sums: CurvatureSums | None = None
     length: float = math.inf
     left: float = math.inf
@@ -198,8 +199,9 @@ class Descent:
         """κ and d of the next pass."""
         return Density(self.point.kappa[0], torch.exp(self.point.log_d[0]))
 
-    def after(self, total: Sums, more: CurvatureSums | None) -> Descent:
+    def after(self, result: PassResult) -> Descent:
         """State after the pass at ``point``, from its sums."""
+        total, more = result.total, result.curvature
         total_weight, close = total.weight.sum(), self.close
         now = self
         if more is not None:
@@ -212,7 +214,7 @@ class Descent:
         best = now.best
         if best is not None and not here.value <= best.value + _slack(best.value, rounding, total_weight):
             return now._shorter_step(best)
-        now = replace(now, best=here, total=total, history=(*now.history, here.per_sample))
+        now = replace(now, best=here, result=result, history=(*now.history, here.per_sample))
         move = _newton_move(now.fit_state, here)
         if move is None:
             return now._moved(here, _plain_move(now.fit_state, here, now.slopes, now.unit), plain=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
-from mkc_torch.linear._blocks import Density, Sums
+from mkc_torch.linear._blocks import Density, PassResult
 from mkc_torch.linear._descent import Descent, PassDerivatives, sandwich_of
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
@@ -129,21 +129,20 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     count = pilot.problem.num_samples
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
     if known.bound is None:
-        fit_state = replace(
-            fit_state, log_bound=torch.log(_half_width(rows, fit_state.beta, TIGHT * pilot.begin.scale))
-        )
+        half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
+        fit_state = replace(fit_state, log_bound=torch.log(half))
     for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike else ():
         descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
         end = _descended(some, descent, passes)
         if end is None:
             return None
         fit_state, slopes = _moved(fit_state, end), end.slopes
-    first: Sums | None = None
+    first: PassResult | None = None
     if known.bound is None:
         descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
-        end = _descended(rows, descent, passes) if pilot.alike else None
+        end = _descended(rows, descent, passes, with_range=True) if pilot.alike else None
         if end is not None:
-            fit_state, first = _moved(fit_state, end), end.total
+            fit_state, first = _moved(fit_state, end), end.result
         fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
     weights = torch.empty_like(rows.Y)
     descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
@@ -158,7 +157,9 @@ def _descended(
     descent: Descent,
     passes: int,
     weights: Float[Tensor, "N m"] | None = None,
-    first: Sums | None = None,
+    first: PassResult | None = None,
+    *,
+    with_range: bool = False,
 ) -> Descent | None:
     """The end of a descent; None if that takes too many passes.
 
@@ -167,18 +168,19 @@ def _descended(
         descent: state before the first pass.
         passes: largest number of passes.
         weights: filled with the weights at the end.
-        first: sums at the starting point, if known.
+        first: result at the starting point, if known.
+        with_range: whether to compute the range of the residuals too.
     """
     for _ in range(passes):
-        total, more = first, None
-        if total is None or descent.close:
-            total, more = rows.evaluate(
+        if first is None or descent.close:
+            first = rows.evaluate(
                 descent.point.beta[0],
                 descent.density(),
                 with_curvature=descent.with_curvature,
+                with_range=with_range,
                 weights=weights if descent.close else None,
             )
-        descent, first = descent.after(total, more), None
+        descent, first = descent.after(first), None
         if descent.done:
             return descent
     return None
@@ -217,11 +219,13 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
 
 
 def _on_final_domain(
-    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: Sums | None
-) -> tuple[FitState, Sums | None]:
+    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: PassResult | None
+) -> tuple[FitState, PassResult | None]:
     """Starting point on the domain of the rule; with the sums at it if it equals the rough fit."""
     d = torch.exp(rough.log_d)
-    bound = _half_width(rows, rough.beta, WIDE * d)
+    extent = None if first is None else first.extent
+    extent = rows.range_at(rough.beta[0]) if extent is None else extent
+    bound = torch.maximum(extent.half(), WIDE * d)
     beta = pilot.in_basis(rough.beta)
     state = known.initial_state(pilot.problem, beta, d, bound, least_d(pilot.begin), tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
@@ -241,12 +245,6 @@ def _intermediate_subsets(
 
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
     return replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
-
-
-def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:
-    """Half-width of the domain by :func:`domain_rule`, from the residuals of all rows."""
-    found = rows.range_at(beta[0])
-    return torch.maximum(0.5 * (found.high - found.low), least)
 
 
 def _moved(fit_state: FitState, end: Descent) -> FitState:
@@ -301,9 +299,8 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    total, found = rows.evaluate(
-        fit_state.beta[0], Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0])), with_curvature=True
-    )
+    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
+    total, found, _ = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
     assert found is not None
     total_weight = total.weight.sum()
     grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])
@@ -316,7 +313,7 @@ def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n
     weight = None if rows.weight is None else rows.weight[:, part]
     own = Rows(rows.X[:, part], rows.Y[:, part], weight, rows.frame)
     kappa = torch.zeros_like(fit_state.kappa[0, part])
-    _, found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True)
+    found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True).curvature
     assert found is not None
     return found.curvature
 
@@ -324,11 +321,11 @@ def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n
 def _gaussian_is_more_likely(rows: Rows, end: Descent) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
     assert end.best is not None
-    assert end.total is not None
+    assert end.result is not None
     if not (end.fit_state.free_kappa and end.fit_state.free_d) or not bool((end.point.kappa > 0).any()):
         return False
     value, grams = end.best.by_channel.value.sum(), end.slopes.grams
-    if _gaussian_value(end, grams * end.total.weight.sum(), _SLACK) >= value:
+    if _gaussian_value(end, grams * end.result.total.weight.sum(), _SLACK) >= value:
         return False
     if grams.shape[0] > 1:
         return True
@@ -340,16 +337,16 @@ def _gaussian_value(end: Descent, grams: Float64[Tensor, "m n n"], slack: float)
 
     Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g`` with ``g = Σ e x`` and ``G = Σ x xᵀ``.
     """
-    fit_state, total, found = end.fit_state, end.total, end.curvature_sums
+    fit_state, found = end.fit_state, end.curvature_sums
     assert fit_state.log_bound is not None
     assert fit_state.log_d_min is not None
-    assert total is not None
+    assert end.result is not None
     assert found is not None
     root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
     moment = (found.moment * root).unsqueeze(-1)
     lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
-    variance = ((found.square - slack * lowered) / total.weight).clamp(min=0.0)
+    variance = ((found.square - slack * lowered) / end.result.total.weight).clamp(min=0.0)
     d = torch.maximum(variance.sqrt(), torch.exp(fit_state.log_d_min[0]))
     norm = log_partition_value(torch.zeros_like(d), torch.exp(fit_state.log_bound[0]) / d)
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
@@ -357,7 +354,7 @@ def _gaussian_value(end: Descent, grams: Float64[Tensor, "m n n"], slack: float)
 
 def _result(rows: Rows, end: Descent, weights: Float[Tensor, "N m"]) -> LargeMaximum:
     assert end.best is not None
-    assert end.total is not None
+    assert end.result is not None
     assert end.curvature_sums is not None
     point = end.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
@@ -369,7 +366,7 @@ def _result(rows: Rows, end: Descent, weights: Float[Tensor, "N m"]) -> LargeMax
         coef=coef,
         fit_state=replace(end.fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
         weights=weights,
-        log_likelihood=-(end.total.weight * end.best.by_channel.value).sum(),
+        log_likelihood=-(end.result.total.weight * end.best.by_channel.value).sum(),
         covariance=covariance,
         dof=coef.new_tensor(float(left)),
         history=coef.new_tensor(end.history),

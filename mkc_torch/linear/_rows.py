@@ -17,6 +17,7 @@ from mkc_torch.linear._blocks import (
     Block,
     CurvatureSums,
     Density,
+    PassResult,
     ResidualRange,
     Sums,
     added,
@@ -50,12 +51,13 @@ class Rows:
         return blocks(self.X, self.Y, self.weight, self.frame)
 
     def range_at(self, coef: Float64[Tensor, " n"]) -> ResidualRange:
+        """Range of the residuals, in a pass of half the time."""
         total: ResidualRange | None = None
         for block in self.blocks():
-            part = residual_range(block, coef.to(block.y.device))
+            part = residual_range(block, residual(block, coef))
             total = part if total is None else total.with_others(part)
         assert total is not None
-        return ResidualRange(*(value.cpu() for value in total))
+        return total
 
     def evaluate(
         self,
@@ -63,23 +65,28 @@ class Rows:
         density: Density,
         *,
         with_curvature: bool = False,
+        with_range: bool = False,
         weights: Float[Tensor, "N m"] | None = None,
-    ) -> tuple[Sums, CurvatureSums | None]:
-        """Make one pass: return the sums and, if wanted, the curvature sums; write the weights to ``weights``."""
+    ) -> PassResult:
+        """Make one pass: return the sums and what else is wanted; write the weights to ``weights``."""
         total: Sums | None = None
         more: CurvatureSums | None = None
+        extent: ResidualRange | None = None
         first, plain = 0, is_plain(density.kappa)
         for block in self.blocks():
             error = residual(block, beta)
             q, w = kernel(error, density)
             if with_curvature:
                 more = added(more, curvature_sums(block, error, q, w, density))
+            if with_range:
+                part = residual_range(block, error)
+                extent = part if extent is None else extent.with_others(part)
             if weights is not None:
                 weights[first : first + w.shape[0]] = w
                 first += w.shape[0]
             total = added(total, sums(block, error, q, w, density, plain=plain))
         assert total is not None
-        return total, more
+        return PassResult(total, more, extent)
 
 
 def blocks(

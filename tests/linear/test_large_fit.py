@@ -336,7 +336,7 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     weight = torch.arange(2 * N).double().reshape(N, 2) % 3 if weighted else None
     beta = torch.tensor([1.1, 0.9, 1.2]).double()
     density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
-    total, curvature_sums = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    total, curvature_sums, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     assert curvature_sums is not None
     problem = linear_problem(X, Y, weight)
     in_basis = problem.in_basis(beta)
@@ -350,7 +350,7 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     torch.testing.assert_close(sandwich_of(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
     monkeypatch.setattr(_blocks, "_STRIP", 100)
     monkeypatch.setattr(_rows, "blocks", lambda *args: blocks(*args, 1234))
-    again, transformed = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    again, transformed, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     for reference, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
         torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
 
@@ -360,8 +360,8 @@ def test_a_frame_is_a_change_of_columns():
     frame = torch.linalg.inv(normal(9, 5, 5))
     density = Density(torch.tensor([0.2]).double(), torch.tensor([1.0]).double())
     beta = torch.ones(5).double()
-    plain, curvature_sums = Rows(X[:, None], y[:, None], None).evaluate(beta, density, with_curvature=True)
-    framed, transformed = Rows(X[:, None], y[:, None], None, frame).evaluate(
+    plain, curvature_sums, _ = Rows(X[:, None], y[:, None], None).evaluate(beta, density, with_curvature=True)
+    framed, transformed, _ = Rows(X[:, None], y[:, None], None, frame).evaluate(
         torch.linalg.solve(frame, beta), density, with_curvature=True
     )
     assert curvature_sums is not None

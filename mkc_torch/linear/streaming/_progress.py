@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mkc_torch._support.files import write_atomically
 from mkc_torch.density.likelihood import Derivatives, normaliser_derivatives
-from mkc_torch.linear._blocks import CurvatureSums, Density, ResidualRange, Sums
+from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, ResidualRange, Sums
 from mkc_torch.linear._descent import Descent, EvaluatedPoint, PassDerivatives, sandwich_of
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns
 from mkc_torch.linear._problem import solve_gram
@@ -39,13 +39,18 @@ _SAME = 1e-9
 
 Rounding in another order is a hundredth of it, and a millionth of the rows with other values exceeds it."""
 
-_NEAR = 1e-6
+_NEAR = 2e-5
 """Distance from the maximum, in standard errors of one row, below which a pass computes the curvature.
 
 The covariance is then as accurate as this, and a step with the curvature leaves the square of the distance."""
 
 _FURTHEST = 0.03
 """The same in standard errors, for many rows."""
+
+_LONGER = 0.5
+"""Log of the ratio of the domain to the sample's up to which the sums at the sample's density are a step's.
+
+On a longer domain the share of its tail is adapted first."""
 
 _SLOW = 0.1
 """Share of the length of a step that the next may have; beyond it, the curvature is computed anew."""
@@ -63,7 +68,9 @@ _CLASSES: dict[str, Any] = {
     "point": Unknowns,
     "best": EvaluatedPoint,
     "by_channel": Derivatives,
+    "result": PassResult,
     "total": Sums,
+    "curvature": CurvatureSums,
     "curvature_sums": CurvatureSums,
 }
 """Types of the nested parts of a state, by the name of the field."""
@@ -113,26 +120,30 @@ class StreamProgress:
             return start.beta[0], Density(start.kappa[0], torch.exp(start.log_d[0])), False
         return self.climb.point.beta[0], self.climb.density(), self.climb.with_curvature
 
-    def after_range(self, parts: list[tuple[int, ResidualRange | None]]) -> StreamProgress:
+    def after_range(self, parts: list[tuple[Float64[Tensor, " k"], ResidualRange | None]]) -> StreamProgress:
         """Set the domain: half the range of all residuals, and at least the sample's, which includes ten of its d.
 
         Args:
-            parts: results of the ranks, in their order.
+            parts: sums and ranges of the ranks, in their order.
 
         Raises:
             StreamChangedError: the pass had other rows.
         """
-        start, rows = self.begun.fit_state, sum(count for count, _ in parts)
-        found = [part for _, part in parts if part is not None]
-        whole = reduce(ResidualRange.with_others, found) if found else None
-        self._refuse_other_rows(rows, None if whole is None else whole.residual, start.beta[0])
-        assert whole is not None
+        start = self.begun.fit_state
+        rows, result = sums_of(torch.stack([flat for flat, _ in parts]).sum(0), self.survey.shape)
+        self._refuse_other_rows(rows, result.total.residual, start.beta[0])
+        extent = reduce(ResidualRange.with_others, [part for _, part in parts if part is not None])
         assert start.log_bound is not None
-        log_bound = torch.maximum(start.log_bound, torch.log(0.5 * (whole.high - whole.low)))
+        log_bound = torch.maximum(start.log_bound, torch.log(extent.half()))
+        now, longer = replace(self, passes=self.passes + 1), log_bound - start.log_bound
+        if bool((longer <= _LONGER).all()):
+            climbing = now._climbing(replace(start, log_bound=log_bound))
+            assert climbing.climb is not None
+            return replace(climbing, climb=climbing.climb.after(result))
         # keep the tail density exp(-1/κ) / bound unchanged on the longer domain
-        longer = torch.where(start.kappa > 0, start.kappa, 1.0).reciprocal() + log_bound - start.log_bound
-        kappa = torch.where(start.kappa > 0, longer.reciprocal(), 0.0) if start.free_kappa else start.kappa
-        return replace(self, passes=self.passes + 1)._climbing(replace(start, kappa=kappa, log_bound=log_bound))
+        inverse = torch.where(start.kappa > 0, start.kappa, 1.0).reciprocal() + longer
+        kappa = torch.where(start.kappa > 0, inverse.reciprocal(), 0.0) if start.free_kappa else start.kappa
+        return now._climbing(replace(start, kappa=kappa, log_bound=log_bound))
 
     def after_sums(self, flat: Float64[Tensor, " k"], max_passes: int) -> StreamProgress:
         """Make a step towards the maximum.
@@ -141,9 +152,9 @@ class StreamProgress:
             StreamChangedError: the pass had other rows.
         """
         assert self.climb is not None
-        rows, total, more = sums_of(flat, self.survey.shape)
-        self._refuse_other_rows(rows, total.residual, self.climb.point.beta[0])
-        climb, passes = self.climb.after(total, more), self.passes + 1
+        rows, result = sums_of(flat, self.survey.shape)
+        self._refuse_other_rows(rows, result.total.residual, self.climb.point.beta[0])
+        climb, passes = self.climb.after(result), self.passes + 1
         now = replace(self, passes=passes, climb=climb)
         if climb.done and not self.gaussian and not self.ending and passes < max_passes - 1:
             start = self._gaussian(climb)
@@ -158,21 +169,19 @@ class StreamProgress:
             return replace(now, climb=replace(climb, point=climb.best.point, left=0.0), ending=True)
         return now
 
-    def _refuse_other_rows(
-        self, rows: int, residual: Float64[Tensor, " m"] | None, beta: Float64[Tensor, " n"]
-    ) -> None:
+    def _refuse_other_rows(self, rows: int, residual: Float64[Tensor, " m"], beta: Float64[Tensor, " n"]) -> None:
         """Refuse a pass whose rows differ from those of the first.
 
         Args:
             rows: number of rows of the pass.
-            residual: sums of its weighted residuals, None without rows.
+            residual: sums of its weighted residuals.
             beta: coefficients of these residuals.
 
         Raises:
             StreamChangedError: the rows differ.
         """
         survey, n, frame = self.survey, self.survey.shape.n, self.survey.frame()
-        if rows != survey.rows or residual is None:
+        if rows != survey.rows:
             raise StreamChangedError(
                 f"Expected `batches` to yield the same rows in every pass but got {rows}, after {survey.rows} in the "
                 "first; shuffle if you like, but do not drop a last batch or redraw rows."
@@ -194,7 +203,7 @@ class StreamProgress:
     def _climbing(self, fit_state: FitState, *, alike: bool = True) -> StreamProgress:
         near = min(_NEAR * float(self.survey.weight.sum()) ** 0.5, _FURTHEST)
         climb = Descent.begin(
-            fit_state, self.begun.slopes, near=near, stop=10.0 * near, fresh=True, slow=_SLOW, alike=alike
+            fit_state, self.begun.slopes, near=near, stop=2.0 * near, fresh=True, slow=_SLOW, alike=alike
         )
         return replace(self, phase="climb", climb=climb)
 
@@ -231,7 +240,7 @@ class StreamProgress:
         climb, survey, frame = self.climb, self.survey, self.survey.frame()
         assert climb is not None
         assert climb.best is not None
-        assert climb.total is not None
+        assert climb.result is not None
         assert climb.curvature_sums is not None
         assert climb.fit_state.log_bound is not None
         place = climb.stepped() if climb.done else climb.best.point
@@ -244,7 +253,7 @@ class StreamProgress:
             "sigma_": place.kappa[0].rsqrt(),
             "d_": torch.exp(place.log_d[0]),
             "bound_": torch.exp(climb.fit_state.log_bound[0]),
-            "log_likelihood_": -(climb.total.weight * climb.best.by_channel.value).sum(),
+            "log_likelihood_": -(climb.result.total.weight * climb.best.by_channel.value).sum(),
             "covariance_": covariance,
             "dof_": torch.tensor(float(left), dtype=torch.float64),
             "history_": torch.tensor(climb.history, dtype=torch.float64),

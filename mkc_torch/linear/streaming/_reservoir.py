@@ -6,6 +6,7 @@ rank knows its number of rows, of the number of ranks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from mkc_torch.linear._blocks import Block
 if TYPE_CHECKING:
     from jaxtyping import Float64, Int64
 
-__all__ = ["Drawn", "Reservoir", "merged"]
+__all__ = ["Drawn", "Reservoir", "largest_key", "merged"]
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Reservoir:
         seed: seed of the keys.
         first: number of rows on the ranks before this one, or None if unknown.
         rank: this rank, which replaces ``first`` if that is unknown.
+        rows: number of rows of all ranks, or None if unknown.
 
     Example:
         >>> sample = Reservoir(3, seed=0)
@@ -54,12 +56,12 @@ class Reservoir:
         array([1, 2, 3])
     """
 
-    def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0) -> None:
+    def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0, rows: int | None = None) -> None:
         bits = np.random.PCG64(seed)
         self._random = np.random.Generator(bits.jumped(rank) if first is None else bits.advance(first))
         self._size = size
         self._number = first or 0
-        self._limit = 1.0
+        self._limit = 1.0 if rows is None else largest_key(size, rows)
         self._parts: list[Drawn] = []
         self._held = 0
 
@@ -89,6 +91,14 @@ class Reservoir:
         self._parts, self._held = [kept], len(kept.keys)
         if self._held == self._size:
             self._limit = float(kept.keys.max())
+
+
+def largest_key(size: int, rows: int) -> float:
+    """Limit of the ``size`` smallest keys of ``rows`` rows, six standard deviations above the expected key.
+
+    At worst the sample is slightly too small.
+    """
+    return (size + 6.0 * math.sqrt(size)) / rows if rows > size else 1.0
 
 
 def merged(parts: list[Drawn], size: int) -> Drawn:

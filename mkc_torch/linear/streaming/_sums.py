@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._blocks import CurvatureSums, Density, ResidualRange, Sums, added
+from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, ResidualRange, Sums
 from mkc_torch.linear.streaming._batches import Shape, rows_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["flat_length", "range_pass", "sums_of", "sums_pass"]
+__all__ = ["flat_length", "sums_of", "sums_pass"]
 
 
 def _shapes(shape: Shape) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
@@ -36,9 +36,10 @@ def sums_pass(
     beta: Float64[Tensor, " n"],
     density: Density,
     *,
-    with_curvature: bool,
-) -> Float64[Tensor, " k"]:
-    """Number of this rank's rows and their sums.
+    with_curvature: bool = False,
+    with_range: bool = False,
+) -> tuple[Float64[Tensor, " k"], ResidualRange | None]:
+    """Number of this rank's rows and their sums, and the range of the residuals if wanted and if there are rows.
 
     Args:
         batches: batches of this rank.
@@ -46,40 +47,24 @@ def sums_pass(
         frame: change of basis of the columns, if any.
         beta, density: point of the pass.
         with_curvature: whether to form the curvature sums too, which takes three times as long.
+        with_range: whether to find the range of the residuals.
     """
-    total: Sums | None = None
-    more: CurvatureSums | None = None
-    count = 0
+    flat, extent = torch.zeros(flat_length(shape, with_curvature=with_curvature), dtype=torch.float64), None
     for _, rows in rows_of(batches, shape, frame):
         if len(rows.Y):
-            count += len(rows.Y)
-            part, part_curvature = rows.evaluate(beta, density, with_curvature=with_curvature)
-            total = added(total, part)
-            more = None if part_curvature is None else added(more, part_curvature)
-    if total is None:
-        return torch.zeros(flat_length(shape, with_curvature=with_curvature), dtype=torch.float64)
-    return torch.cat([torch.tensor([float(count)]).double(), *(v.reshape(-1) for v in (*total, *(more or ())))])
+            total, more, part = rows.evaluate(beta, density, with_curvature=with_curvature, with_range=with_range)
+            flat[0] += len(rows.Y)
+            flat[1:] += torch.cat([value.reshape(-1) for value in (*total, *(more or ()))])
+            if part is not None:
+                extent = part if extent is None else extent.with_others(part)
+    return flat, extent
 
 
-def sums_of(flat: Float64[Tensor, " k"], shape: Shape) -> tuple[int, Sums, CurvatureSums | None]:
-    """Number of rows, sums and curvature sums, if there are any, from the result of :func:`sums_pass`."""
+def sums_of(flat: Float64[Tensor, " k"], shape: Shape) -> tuple[int, PassResult]:
+    """Number of rows and sums, from the result of :func:`sums_pass`."""
     sums, more = _shapes(shape)
     shapes = sums + (more if len(flat) == flat_length(shape, with_curvature=True) else [])
     count, *parts = flat.split([1, *(torch.Size(size).numel() for size in shapes)])
     fields = [part.reshape(size) for part, size in zip(parts, shapes, strict=True)]
     found = CurvatureSums(*fields[len(sums) :]) if len(fields) > len(sums) else None
-    return int(count), Sums(*fields[: len(sums)]), found
-
-
-def range_pass(
-    batches: Iterable[Any], shape: Shape, frame: Float64[Tensor, "n n"] | None, beta: Float64[Tensor, " n"]
-) -> tuple[int, ResidualRange | None]:
-    """Number of this rank's rows, and their residuals' range, None without rows."""
-    total: ResidualRange | None = None
-    count = 0
-    for _, rows in rows_of(batches, shape, frame):
-        if len(rows.Y):
-            count += len(rows.Y)
-            part = rows.range_at(beta)
-            total = part if total is None else total.with_others(part)
-    return count, total
+    return int(count), PassResult(Sums(*fields[: len(sums)]), found, None)

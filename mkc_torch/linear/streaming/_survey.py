@@ -31,6 +31,9 @@ NEARLY_DEPENDENT = 1e3
 
 Sums of products of the original columns lose digits by its square, six of sixteen here."""
 
+_MANY_COLUMNS = 16
+"""Number of columns from which the products of an array with itself are faster than those of two arrays."""
+
 LEAST_PIVOT = 1e-3
 """Least pivot of the Cholesky factor of the scaled products of a block's columns.
 
@@ -169,7 +172,7 @@ class _GrowingSurvey:
         self._largest = torch.maximum(self._largest, torch.stack(torch.aminmax(block.y, dim=0)).abs().amax(0).cpu())
         self._used += count * m if block.weight is None else int((block.weight > 0).sum())
         self._weight += count if block.weight is None else block.weight.sum(0).cpu()
-        gram = torch.stack([products(weighted[:, c], joined[:, c]) for c in range(m)]).cpu()
+        gram = torch.stack([_products(block.rows[:, c], joined[:, c], weighted[:, c]) for c in range(m)]).cpu()
         if _is_good(gram):
             self._gram += gram
         else:
@@ -183,6 +186,18 @@ class _GrowingSurvey:
         if self._gram.any():
             self._join(torch.linalg.cholesky(self._gram, upper=True))
         return Survey(self._shape, self.rows, self._used, self._triangle, self._total, self._weight, self._largest)
+
+
+def _products(rows: Tensor, joined: Tensor, weighted: Tensor) -> Float64[Tensor, "k k"]:
+    """Sums of the products of the columns of [x y], of a block without weights by way of the separate x.
+
+    NumPy multiplies an array with itself in another way, which is slower for few columns and faster for many.
+    """
+    if weighted.data_ptr() != joined.data_ptr() or rows.shape[-1] >= _MANY_COLUMNS:
+        return products(weighted, joined)
+    upper = products(rows, joined)
+    last = torch.dot(joined[:, -1], joined[:, -1]).reshape(1)
+    return torch.cat([upper, torch.cat([upper[:, -1], last]).unsqueeze(0)])
 
 
 def _is_good(gram: Float64[Tensor, "m k k"]) -> bool:

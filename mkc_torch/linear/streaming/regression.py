@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
@@ -20,8 +19,8 @@ from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._batches import checked_source
 from mkc_torch.linear.streaming._pilot import fit_pilot
 from mkc_torch.linear.streaming._progress import StreamChangedError, StreamProgress
-from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
-from mkc_torch.linear.streaming._sums import flat_length, range_pass, sums_pass
+from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, largest_key, merged
+from mkc_torch.linear.streaming._sums import flat_length, sums_pass
 from mkc_torch.linear.streaming._survey import Survey, survey_rows
 
 if TYPE_CHECKING:
@@ -156,7 +155,7 @@ class StreamedMKCRegression(Inference):
             before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
             beta, density, curvature = progress.next_pass()
             flat = ranks.sum_of(
-                lambda: sums_pass(batches, shape, frame, beta, density, with_curvature=curvature),  # noqa: B023
+                lambda: sums_pass(batches, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
                 flat_length(shape, with_curvature=curvature),
             )
             progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
@@ -236,9 +235,10 @@ class StreamedMKCRegression(Inference):
         checkpoint: str | os.PathLike[str] | None,
     ) -> StreamProgress:
         """Progress after the first pass."""
-        before = [count for count in counts[: ranks.rank] if count is not None]
-        known = ranks.alone or None not in counts
-        reservoir = Reservoir(self.pilot, self.seed, sum(before) if known else None, ranks.rank)
+        known = [count for count in counts if count is not None]
+        first = sum(known[: ranks.rank]) if ranks.alone or len(known) == len(counts) else None
+        rows = sum(known) if len(known) == len(counts) else None
+        reservoir = Reservoir(self.pilot, self.seed, first, ranks.rank, rows)
         found = ranks.gathered(lambda: survey_rows(batches, reservoir))
         surveys = [survey for survey in found if survey is not None]
         drawn = ranks.gathered(lambda: _likely(reservoir.drawn(), self.pilot, sum(survey.rows for survey in surveys)))
@@ -254,8 +254,8 @@ class StreamedMKCRegression(Inference):
         self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
     ) -> StreamProgress:
         """Progress after the pass for the domain."""
-        survey, (beta, *_) = progress.survey, progress.next_pass()
-        parts = ranks.gathered(lambda: range_pass(batches, survey.shape, survey.frame(), beta))
+        survey, (beta, density, _) = progress.survey, progress.next_pass()
+        parts = ranks.gathered(lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True))
         return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
 
     def _saved(
@@ -289,7 +289,5 @@ def _likely(drawn: Drawn | None, size: int, rows: int) -> Drawn | None:
     """Rows of a rank's sample that may be in the sample of all ranks; the others need not be sent."""
     if drawn is None or rows <= size:
         return drawn
-    # the limit is six standard deviations above the expected key; at worst the sample is slightly too small
-    limit = (size + 6.0 * math.sqrt(size)) / rows
-    chosen = drawn.keys < limit
+    chosen = drawn.keys < largest_key(size, rows)
     return Drawn(drawn.keys[chosen], drawn.numbers[chosen], drawn.rows[chosen])
