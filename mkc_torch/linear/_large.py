@@ -72,15 +72,12 @@ _SLACK = 2.0
 
 
 def is_large(values: CanonicalShapes) -> bool:
-    """Whether :func:`large_maximum` suits these values: one problem of many rows on a CPU.
-
-    On an accelerator the many small operations of a block take longer than the memory access that they save.
-    """
+    """Whether :func:`large_maximum` suits these values: one problem of many rows, on a CPU or a GPU with float64."""
     return (
         values.Y.numel() >= LARGE
         and values.batch.numel() == 1
         and values.Y.shape[-1] <= MAX_IMPLIED_CHANNELS
-        and values.Y.device.type == "cpu"
+        and values.Y.device.type in ("cpu", "cuda")
         and not torch.compiler.is_compiling()
     )
 
@@ -131,7 +128,8 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     if known.bound is None:
         half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
         fit_state = replace(fit_state, log_bound=torch.log(half))
-    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike else ():
+    # on a GPU a pass over all rows takes less time than drawing some of them
+    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike and not rows.Y.is_cuda else ():
         descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
         end = _descended(some, descent, passes)
         if end is None:
@@ -260,13 +258,15 @@ def _rows_of(values: CanonicalShapes) -> Rows:
 
 def _is_valid(rows: Rows) -> bool:
     """Whether all values are finite, weights valid, and fourth powers of Y neither overflow nor underflow."""
+    numbers = [*torch.aminmax(rows.Y), *torch.aminmax(rows.X)]
     if rows.weight is not None:
-        least, most = (float(v) for v in torch.aminmax(rows.weight))
-        if not (least >= 0.0 and most < math.inf and bool((rows.weight.sum(0) > 0).all())):
-            return False
+        numbers += [*torch.aminmax(rows.weight), rows.weight.sum(0).amin()]
+    # one copy from the device
+    low, high, *others = torch.stack(numbers).tolist()
     limit = float(torch.finfo(rows.Y.dtype).max) ** 0.25
-    low, high = (float(v) for v in torch.aminmax(rows.Y))
-    return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
+    if rows.weight is not None and not (others[2] >= 0.0 and others[4] > 0.0):
+        return False
+    return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(value) for value in others)
 
 
 def _d_is_at_its_least(end: Descent) -> bool:

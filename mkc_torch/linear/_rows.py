@@ -7,6 +7,7 @@ reads the data once. On a GPU a pass is a kernel (``_fused_pass``). All sums are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,6 +38,12 @@ if TYPE_CHECKING:
 VALUES = 1 << 15
 """Values in a block: 2.4 MB with nine columns. Half as many take 20 % longer, twice as many 40 %."""
 
+_KERNEL_COLUMNS = 32
+"""Largest number of columns of the kernel."""
+
+VALUES_ON_DEVICE = 1 << 21
+"""The same on an accelerator, where each operation has a cost of its own."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -52,12 +59,16 @@ class Rows:
 
     def range_at(self, coef: Float64[Tensor, " n"]) -> ResidualRange:
         """Range of the residuals, in a pass of half the time."""
+        if runs_kernel(self):
+            extent = self.evaluate(coef, Density(*torch.ones(2, 1, dtype=torch.float64))).extent
+            assert extent is not None
+            return extent
         total: ResidualRange | None = None
         for block in self.blocks():
-            part = residual_range(block, residual(block, coef))
+            part = residual_range(block, residual(block, coef.to(block.y.device)))
             total = part if total is None else total.with_others(part)
         assert total is not None
-        return total
+        return ResidualRange(total.low.cpu(), total.high.cpu())
 
     def evaluate(
         self,
@@ -68,7 +79,20 @@ class Rows:
         with_range: bool = False,
         weights: Float[Tensor, "N m"] | None = None,
     ) -> PassResult:
-        """Make one pass: return the sums and what else is wanted; write the weights to ``weights``."""
+        """Make one pass: return the sums and what else is wanted; write the weights to ``weights``.
+
+        Coefficients, density and results are on the CPU.
+        """
+        if runs_kernel(self):
+            # the module needs Triton
+            from mkc_torch.linear._fused_pass import fused_pass
+
+            weight = None if self.weight is None else self.weight[:, 0]
+            return fused_pass(
+                self.X[:, 0], self.Y[:, 0], weight, beta, density, with_curvature=with_curvature, weights=weights
+            )
+        if isinstance(self.Y, Tensor):
+            beta, density = beta.to(self.Y.device), Density(*(value.to(self.Y.device) for value in density))
         total: Sums | None = None
         more: CurvatureSums | None = None
         extent: ResidualRange | None = None
@@ -86,7 +110,11 @@ class Rows:
                 first += w.shape[0]
             total = added(total, sums(block, error, q, w, density, plain=plain))
         assert total is not None
-        return PassResult(total, more, extent)
+        return PassResult(
+            Sums(*(value.cpu() for value in total)),
+            None if more is None else CurvatureSums(*(value.cpu() for value in more)),
+            None if extent is None else ResidualRange(*(value.cpu() for value in extent)),
+        )
 
 
 def blocks(
@@ -97,7 +125,9 @@ def blocks(
     values: int | None = None,
 ) -> Iterator[Block]:
     """Yield rows times ``frame``, targets and weights in blocks of ``values`` values."""
-    step = max(1, (VALUES if values is None else values) // Y.shape[-1])
+    if values is None:
+        values = VALUES if not isinstance(Y, Tensor) or Y.device.type == "cpu" else VALUES_ON_DEVICE
+    step = max(1, values // Y.shape[-1])
     for first in range(0, Y.shape[0], step):
         part = slice(first, first + step)
         rows = as_float64(X[part])
@@ -111,3 +141,15 @@ def blocks(
 def as_float64(values: Shaped[Any, ...]) -> Float64[Tensor, ...]:
     """A tensor in float64; an array is copied, since a tensor of a read-only array warns."""
     return values.double() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float64))
+
+
+def runs_kernel(rows: Rows) -> bool:
+    """Whether a pass over these rows is a single kernel: one channel of few columns on a GPU, with Triton."""
+    return (
+        isinstance(rows.Y, Tensor)
+        and rows.Y.is_cuda
+        and rows.frame is None
+        and rows.Y.shape[-1] == 1
+        and rows.X.shape[-1] <= _KERNEL_COLUMNS
+        and find_spec("triton") is not None
+    )
