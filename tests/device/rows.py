@@ -17,7 +17,7 @@ REPEATS = 5
 """Number of timings; the least is printed."""
 
 MOST_APART = 1e-3
-"""Largest difference of coefficients from the CPU's on the same data, in standard errors; results of float32 data are rounded."""
+"""Largest difference from the CPU's coefficients, in standard errors; those of float32 data are rounded to float32."""
 
 
 def sample(rows: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ class Shape:
 
 
 def checked_source(batches: object) -> Iterable[Any]:
-    """Return ``batches`` if it can be iterated over repeatedly, else raise.
+    """Return ``batches`` as an iterable that can be read in every pass, else raise.
 
     Raises:
         TypeError: it cannot, or it is a single batch.
@@ -44,12 +44,24 @@ def checked_source(batches: object) -> Iterable[Any]:
             f"{format_value(batches)}, which can be read once; pass a DataLoader, a list, from_memmap(X, Y), or an "
             "object whose __iter__ is a generator function."
         )
+    if callable(batches) and not hasattr(batches, "__iter__"):
+        return _Called(batches)
     if not hasattr(batches, "__iter__"):
         raise TypeError(
             f"Expected argument `batches` to be an iterable of (X, Y) but got {format_value(batches)}; pass a "
-            "DataLoader or a list of batches."
+            "DataLoader, a list of batches, or a function that yields them."
         )
     return batches
+
+
+class _Called:
+    """Batches that a function yields, called in every pass."""
+
+    def __init__(self, function: Callable[[], Iterable[Any]]) -> None:
+        self._function = function
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._function())
 
 
 def rows_of(

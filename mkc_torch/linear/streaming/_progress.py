@@ -53,7 +53,7 @@ _LONGER = 0.5
 On a longer domain the share of its tail is adapted first."""
 
 _SLOW = 0.1
-"""Share of the length of a step that the next may have; beyond it, the curvature is computed anew."""
+"""Share of the length of a step that the next may have; beyond it, the curvature is computed again."""
 
 _EXACT_PASSES = 8
 """Passes after which a fit through most values to rounding, whose precision is limited, ends."""

@@ -35,19 +35,19 @@ class StreamedMKCRegression(Inference):
     The first pass checks and counts the rows and draws a uniform sample of them, which :class:`MKCRegression` fits in
     memory. A second pass sets the domain: half the range of all residuals of that fit, and at least that of the sample.
     It is not needed if the sample has all rows. Newton's method on the coefficients and each channel's σ and d then
-    maximises the likelihood of all rows, from the sample's maximum in two to four passes. A last pass computes the
-    covariance. The deciding sums are float64, also for float32 data. Memory does not grow with the rows: one batch, a
-    block of 80 000 values, and during the first pass twice the sample.
+    maximises the likelihood of all rows, from the sample's maximum, by the passes of :class:`MKCRegression` over many
+    rows: one to three for the gradient, and a last for the covariance. Sums are float64, also for float32 data. Memory
+    does not grow with the rows: one batch, a block of 33 000 values of Y, and during the first pass twice the sample.
 
     If the sample has all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8 or to
-    the accuracy of its maximum. With more rows the domain depends on the sample: ``MKCRegression(bound=fit.bound_)``
-    gives the same result to 1e-8 if it finds the same maximum. With ``bound`` given, only the start depends on the
-    sample.
+    the accuracy of its maximum; the covariance to 1e-4. With more rows the domain depends on the sample:
+    ``MKCRegression(bound=fit.bound_)`` gives the same result to 1e-8 if it finds the same maximum. With ``bound``
+    given, only the start depends on the sample.
 
     In a process group of ``torch.distributed``, for example of torchrun, each rank has its own part of the rows, which
     may be empty, and the sums are over all ranks. All ranks end with bitwise equal numbers. An error on one rank is an
     error on all. So is a rank that dies, which gloo reports at once, and a rank that hangs, after the group's timeout.
-    The computation is on the CPU, wherever the batches are.
+    Tensors on a GPU are summed there; with the backend nccl the sums of the ranks are added there too.
 
     Args:
         sigma: None learns σ; a number in [0.05, inf], or a list of one number for each channel, fixes it.
@@ -56,7 +56,7 @@ class StreamedMKCRegression(Inference):
         start: start of the sample's fit, "lts", "s", "least_squares", or a list or tensor of coefficients.
         pilot: largest number of rows of the sample. Its fit takes some 70 MB with 8 columns and 380 MB with 60. With
             fewer than a few hundred rows it may lead to another maximum where outliers are many.
-        max_passes: largest number of passes over the rows, at least 4; a fit takes 5 to 8.
+        max_passes: largest number of passes over the rows, at least 4; a fit takes 4 to 7.
         seed: seed of the sample and of its start.
 
     Attributes, after ``fit`` (m is 1 for one channel given as (N,)):
@@ -120,7 +120,7 @@ class StreamedMKCRegression(Inference):
 
     def fit(  # type: ignore[override]
         self,
-        batches: Iterable[Any],
+        batches: Iterable[Any] | Callable[[], Iterable[Any]],
         *,
         group: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
@@ -129,8 +129,9 @@ class StreamedMKCRegression(Inference):
 
         Args:
             batches: yields (X, Y) or (X, Y, weight) in every pass: a DataLoader, a list, :func:`from_memmap`,
-                :func:`from_parquet`. X is (N, n) with Y (N,), or (N, m, n) with (N, m), as tensors or arrays. The order
-                of rows may change from pass to pass, the rows may not. In a process group, this rank's batches.
+                :func:`from_parquet`, or a function without arguments that returns an iterator. X is (N, n) with Y (N,),
+                or (N, m, n) with (N, m), as tensors or arrays. The order of rows may change from pass to pass, the rows
+                may not. In a process group, this rank's batches.
             group: process group of ``torch.distributed``; None takes the default group if it is initialised.
             checkpoint: file to which the state is written after every pass. If it exists, the fit resumes from it; data
                 and parameters must be the same. Only rank 0 reads and writes it.
@@ -145,17 +146,18 @@ class StreamedMKCRegression(Inference):
         """
         ranks = Ranks(group)
         counts = ranks.gathered(lambda: getattr(checked_source(batches), "rows", None))
+        source = checked_source(batches)
         resume_from, self._resume_from = self._resume_from, None
         progress = ranks.from_first(lambda: self._resumed(resume_from, checkpoint))
         if progress is None:
-            progress = self._after_survey(ranks, batches, counts, checkpoint)
+            progress = self._after_survey(ranks, source, counts, checkpoint)
         if progress.phase == "range":
-            progress = self._after_range_pass(ranks, batches, progress, checkpoint)
+            progress = self._after_range_pass(ranks, source, progress, checkpoint)
         while progress.phase != "done":
             before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
             beta, density, curvature = progress.next_pass()
             flat = ranks.sum_of(
-                lambda: sums_pass(batches, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
+                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
                 flat_length(shape, with_curvature=curvature),
             )
             progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
