@@ -17,13 +17,14 @@ from torch import Tensor
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
-from mkc_torch.linear._blocks import CurvatureSums, Density, Sums
+from mkc_torch.linear._blocks import Density, PassResult
+from mkc_torch.linear._descent import Descent, PassDerivatives, sandwich_of
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
-from mkc_torch.linear._passes import DescentEnd, PassDerivatives, Rows, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
+from mkc_torch.linear._rows import Rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -71,15 +72,12 @@ _SLACK = 2.0
 
 
 def is_large(values: CanonicalShapes) -> bool:
-    """Whether :func:`large_maximum` suits these values: one problem of many rows on a CPU.
-
-    On an accelerator the many small operations of a block take longer than the memory access that they save.
-    """
+    """Whether :func:`large_maximum` suits these values: one problem of many rows, on a CPU or a GPU with float64."""
     return (
         values.Y.numel() >= LARGE
         and values.batch.numel() == 1
         and values.Y.shape[-1] <= MAX_IMPLIED_CHANNELS
-        and values.Y.device.type == "cpu"
+        and values.Y.device.type in ("cpu", "cuda")
         and not torch.compiler.is_compiling()
     )
 
@@ -128,35 +126,62 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     count = pilot.problem.num_samples
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
     if known.bound is None:
-        fit_state = replace(
-            fit_state, log_bound=torch.log(_half_width(rows, fit_state.beta, TIGHT * pilot.begin.scale))
-        )
-    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike else ():
-        end = descend(some, fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE, passes=passes)
-        if end is None or end.curvature_sums is None:
+        half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
+        fit_state = replace(fit_state, log_bound=torch.log(half))
+    # on a GPU a pass over all rows takes less time than drawing some of them
+    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike and not rows.Y.is_cuda else ():
+        descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
+        end = _descended(some, descent, passes)
+        if end is None:
             return None
-        fit_state, total_weight = _moved(fit_state, end), end.sums.weight.sum()
-        slopes = replace(
-            slopes, curvature=end.curvature_sums.curvature / total_weight, tilt=end.curvature_sums.tilt / total_weight
-        )
-    first: Sums | None = None
+        fit_state, slopes = _moved(fit_state, end), end.slopes
+    first: PassResult | None = None
     if known.bound is None:
-        end = descend(rows, fit_state, slopes, near=0.0, stop=1.0, passes=passes) if pilot.alike else None
+        descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
+        end = _descended(rows, descent, passes, with_range=True) if pilot.alike else None
         if end is not None:
-            fit_state, first = _moved(fit_state, end), end.sums
+            fit_state, first = _moved(fit_state, end), end.result
         fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
     weights = torch.empty_like(rows.Y)
-    end = descend(
-        rows, fit_state, slopes, near=_NEAR, stop=_STOP, passes=passes, weights=weights, first=first, alike=pilot.alike
-    )
-    if (
-        end is None
-        or end.curvature_sums is None
-        or _d_is_at_its_least(end, fit_state)
-        or _gaussian_is_more_likely(rows, fit_state, end, slopes.grams)
-    ):
+    descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
+    end = _descended(rows, descent, passes, weights, first)
+    if end is None or _d_is_at_its_least(end) or _gaussian_is_more_likely(rows, end):
         return None
-    return _result(rows, fit_state, end, end.curvature_sums, weights)
+    return _result(rows, end, weights)
+
+
+def _descended(
+    rows: Rows,
+    descent: Descent,
+    passes: int,
+    weights: Float[Tensor, "N m"] | None = None,
+    first: PassResult | None = None,
+    *,
+    with_range: bool = False,
+) -> Descent | None:
+    """The end of a descent; None if that takes too many passes.
+
+    Args:
+        rows: rows whose likelihood is maximised.
+        descent: state before the first pass.
+        passes: largest number of passes.
+        weights: filled with the weights at the end.
+        first: result at the starting point, if known.
+        with_range: whether to compute the range of the residuals too.
+    """
+    for _ in range(passes):
+        if first is None or descent.close:
+            first = rows.evaluate(
+                descent.point.beta[0],
+                descent.density(),
+                with_curvature=descent.with_curvature,
+                with_range=with_range,
+                weights=weights if descent.close else None,
+            )
+        descent, first = descent.after(first), None
+        if descent.done:
+            return descent
+    return None
 
 
 @dataclass(frozen=True)
@@ -192,11 +217,13 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
 
 
 def _on_final_domain(
-    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: Sums | None
-) -> tuple[FitState, Sums | None]:
+    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: PassResult | None
+) -> tuple[FitState, PassResult | None]:
     """Starting point on the domain of the rule; with the sums at it if it equals the rough fit."""
     d = torch.exp(rough.log_d)
-    bound = _half_width(rows, rough.beta, WIDE * d)
+    extent = None if first is None else first.extent
+    extent = rows.range_at(rough.beta[0]) if extent is None else extent
+    bound = torch.maximum(extent.half(), WIDE * d)
     beta = pilot.in_basis(rough.beta)
     state = known.initial_state(pilot.problem, beta, d, bound, least_d(pilot.begin), tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
@@ -218,14 +245,8 @@ def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | 
     return replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
 
 
-def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:
-    """Half-width of the domain by :func:`domain_rule`, from the residuals of all rows."""
-    low, high = rows.range_at(beta[0])
-    return torch.maximum(0.5 * (high - low), least)
-
-
-def _moved(fit_state: FitState, end: DescentEnd) -> FitState:
-    point = end.place.point
+def _moved(fit_state: FitState, end: Descent) -> FitState:
+    point = end.point
     return replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
 
 
@@ -237,19 +258,21 @@ def _rows_of(values: CanonicalShapes) -> Rows:
 
 def _is_valid(rows: Rows) -> bool:
     """Whether all values are finite, weights valid, and fourth powers of Y neither overflow nor underflow."""
+    numbers = [*torch.aminmax(rows.Y), *torch.aminmax(rows.X)]
     if rows.weight is not None:
-        least, most = (float(v) for v in torch.aminmax(rows.weight))
-        if not (least >= 0.0 and most < math.inf and bool((rows.weight.sum(0) > 0).all())):
-            return False
+        numbers += [*torch.aminmax(rows.weight), rows.weight.sum(0).amin()]
+    # one copy from the device
+    low, high, *others = torch.stack(numbers).tolist()
     limit = float(torch.finfo(rows.Y.dtype).max) ** 0.25
-    low, high = (float(v) for v in torch.aminmax(rows.Y))
-    return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
+    if rows.weight is not None and not (others[2] >= 0.0 and others[4] > 0.0):
+        return False
+    return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(value) for value in others)
 
 
-def _d_is_at_its_least(end: DescentEnd, fit_state: FitState) -> bool:
+def _d_is_at_its_least(end: Descent) -> bool:
     """Whether d ended at its least, which is that of the pilot."""
-    assert fit_state.log_d_min is not None
-    return fit_state.free_d and bool((end.place.point.log_d <= fit_state.log_d_min).any())
+    assert end.fit_state.log_d_min is not None
+    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.log_d_min).any())
 
 
 def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
@@ -276,9 +299,8 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    total, found = rows.evaluate(
-        fit_state.beta[0], Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0])), with_curvature=True
-    )
+    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
+    total, found, _ = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
     assert found is not None
     total_weight = total.weight.sum()
     grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])
@@ -291,63 +313,61 @@ def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n
     weight = None if rows.weight is None else rows.weight[:, part]
     own = Rows(rows.X[:, part], rows.Y[:, part], weight, rows.frame)
     kappa = torch.zeros_like(fit_state.kappa[0, part])
-    _, found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True)
+    found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True).curvature
     assert found is not None
     return found.curvature
 
 
-def _gaussian_is_more_likely(rows: Rows, fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
+def _gaussian_is_more_likely(rows: Rows, end: Descent) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
-    if not (fit_state.free_kappa and fit_state.free_d) or not bool((end.place.point.kappa > 0).any()):
+    assert end.best is not None
+    assert end.result is not None
+    if not (end.fit_state.free_kappa and end.fit_state.free_d) or not bool((end.point.kappa > 0).any()):
         return False
-    value = float(end.place.per_sample)
-    if _gaussian_value(fit_state, end, grams * end.sums.weight.sum(), _SLACK) >= value:
+    value, grams = end.best.by_channel.value.sum(), end.slopes.grams
+    if _gaussian_value(end, grams * end.result.total.weight.sum(), _SLACK) >= value:
         return False
     if grams.shape[0] > 1:
         return True
-    return _gaussian_value(fit_state, end, _gram(rows, fit_state, 0).unsqueeze(0), 1.0) < value
+    return _gaussian_value(end, _gram(rows, end.fit_state, 0).unsqueeze(0), 1.0) < float(value)
 
 
-def _gaussian_value(fit_state: FitState, end: DescentEnd, grams: Float64[Tensor, "m n n"], slack: float) -> float:
+def _gaussian_value(end: Descent, grams: Float64[Tensor, "m n n"], slack: float) -> float:
     """Mean negative log-likelihood of a Gaussian at the least squares of each channel.
 
     Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g`` with ``g = Σ e x`` and ``G = Σ x xᵀ``.
     """
+    fit_state, found = end.fit_state, end.curvature_sums
     assert fit_state.log_bound is not None
     assert fit_state.log_d_min is not None
+    assert end.result is not None
+    assert found is not None
     root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
-    assert end.curvature_sums is not None
-    moment = (end.curvature_sums.moment * root).unsqueeze(-1)
+    moment = (found.moment * root).unsqueeze(-1)
     lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
-    variance = ((end.curvature_sums.square - slack * lowered) / end.sums.weight).clamp(min=0.0)
+    variance = ((found.square - slack * lowered) / end.result.total.weight).clamp(min=0.0)
     d = torch.maximum(variance.sqrt(), torch.exp(fit_state.log_d_min[0]))
     norm = log_partition_value(torch.zeros_like(d), torch.exp(fit_state.log_bound[0]) / d)
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
 
 
-def _result(
-    rows: Rows, fit_state: FitState, end: DescentEnd, found: CurvatureSums, weights: Float[Tensor, "N m"]
-) -> LargeMaximum:
-    point = end.place.point
+def _result(rows: Rows, end: Descent, weights: Float[Tensor, "N m"]) -> LargeMaximum:
+    assert end.best is not None
+    assert end.result is not None
+    assert end.curvature_sums is not None
+    point = end.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     left = used - point.beta.shape[-1]
-    coef, covariance = point.beta[0], _sandwich(found, used, left)
+    coef, covariance = point.beta[0], sandwich_of(end.curvature_sums, used, left)
     if rows.frame is not None:
         coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
     return LargeMaximum(
         coef=coef,
-        fit_state=replace(fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
+        fit_state=replace(end.fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
         weights=weights,
-        log_likelihood=-(end.sums.weight * end.place.by_channel.value).sum(),
+        log_likelihood=-(end.result.total.weight * end.best.by_channel.value).sum(),
         covariance=covariance,
         dof=coef.new_tensor(float(left)),
-        history=torch.stack(end.history),
+        history=coef.new_tensor(end.history),
     )
-
-
-def _sandwich(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
-    root = found.curvature.diagonal().rsqrt()
-    outer = root.unsqueeze(-1) * root
-    inverse = outer * torch.linalg.pinv(outer * found.curvature, hermitian=True)
-    return used / max(left, 1) * inverse @ found.spread @ inverse

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._blocks import blocks, triangle
+from mkc_torch.linear._blocks import triangle
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDeficientError, linear_problem
+from mkc_torch.linear._rows import blocks
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
@@ -33,16 +34,16 @@ def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " 
     among = None if used is None else used.nonzero().squeeze(-1)
     total = values.Y.shape[-2] if among is None else among.shape[0]
     drawn = torch.randint(total, (count,), generator=generator).unique()
-    return drawn if among is None else among[drawn]
+    return drawn if among is None else among[drawn.to(among.device)].cpu()
 
 
 def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShapes:
-    """The rows at ``index`` in float64, as a problem."""
-    weight = values.sample_weight
+    """The rows at ``index`` in float64 on the CPU, as a problem."""
+    weight, index = values.sample_weight, index.to(values.Y.device)
     return CanonicalShapes(
-        values.X.index_select(-3, index).double(),
-        values.Y.index_select(-2, index).double(),
-        None if weight is None else weight.index_select(-2, index).double(),
+        values.X.index_select(-3, index).cpu().double(),
+        values.Y.index_select(-2, index).cpu().double(),
+        None if weight is None else weight.index_select(-2, index).cpu().double(),
         values.batch,
         values.single_channel,
     )
@@ -103,6 +104,6 @@ def _rows_of_leverage(values: CanonicalShapes, count: int, seed: int) -> Int[Ten
     for block in blocks(X, Y, weight):
         of_values = torch.matmul(block.rows, inverse).square().sum(-1)
         found.append((of_values if block.weight is None else of_values * (block.weight > 0)).sum(-1))
-    cumulated = torch.cat(found).cumsum(0)
+    cumulated = torch.cat(found).cumsum(0).cpu()
     drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=cumulated.dtype)
     return torch.searchsorted(cumulated, drawn * cumulated[-1]).clamp(max=Y.shape[0] - 1)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_complex, refuse_no_tensor, refuse_not_real
 from mkc_torch._support.torch_internals import is_wrapped
+from mkc_torch.linear._rank import rank_tolerance
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -438,10 +439,9 @@ def refuse_dependent(upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*
         raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
     n = upper.shape[-1]
     _, singular, right = torch.linalg.svd(upper)
-    tolerance = max(num_rows, n) * torch.finfo(upper.dtype).eps
     # with fewer rows than columns there are fewer singular values than columns
     ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(())
-    if (ratio <= tolerance).any():
+    if (ratio <= rank_tolerance(num_rows, n, upper.dtype)).any():
         worst = right[..., -1, :].reshape(-1, n)[int(ratio.reshape(-1).argmin())]
         involved = [i for i in range(n) if float(worst[i].abs()) > 0.1 * float(worst.abs().max())]
         raise RankDeficientError(

@@ -35,7 +35,7 @@ class MKCRegression(Inference):
     residuals, and at least ten of its d (reason: :func:`mkc_torch.density.fit.domain_rule`). d stays above 0.3 robust
     scales, since the likelihood of residuals that a fit interpolates grows without limit.
 
-    From 20 000 values on, a single problem on a CPU starts from a pilot fit to some of its rows, drawn by ``seed``.
+    From 20 000 values on, a single problem starts from a pilot fit to some of its rows, drawn by ``seed``.
     Joint Newton steps in all unknowns over all rows follow, in float64 whatever the dtype of the data: about eight
     passes, and no copy of X. They end where the next step is less than a millionth of a standard error. If they do not
     reach a maximum, for example where most values are fitted exactly, the fit is made as for fewer values.
@@ -178,7 +178,11 @@ class MKCRegression(Inference):
             if found is not None:
                 self.n_iter_ = len(found.history) - 1
                 flag = torch.ones_like(problem.Y[:, 0, 0], dtype=torch.bool)
-                return replace(found.fit_state, converged=flag, extras=(~flag, found.history.unsqueeze(0)))
+                return replace(
+                    found.fit_state.to(flag.device),
+                    converged=flag,
+                    extras=(~flag, found.history.unsqueeze(0).to(flag.device)),
+                )
             begin, maximum = self._maximise(problem, known)
             self.n_iter_ = len(maximum.history) - 1
             state = maximum.state
@@ -218,7 +222,7 @@ class MKCRegression(Inference):
 
     def _keep_large(self, values: CanonicalShapes, found: LargeMaximum) -> None:
         def restored(value: Tensor) -> Tensor:
-            return value.to(values.Y.dtype).expand((*values.batch, *value.shape))
+            return value.to(values.Y).expand((*values.batch, *value.shape))
 
         self._single_channel = values.single_channel
         self.coef_, self.weights_ = restored(found.coef), restored(found.weights)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.linear import MKCRegression, _passes
+from mkc_torch.linear import MKCRegression, _rows
 from tests.benchmarks.small_fits import milliseconds, peers
 
 COLUMNS = 9
@@ -51,7 +51,7 @@ def least(works: dict[str, Callable[[], object]]) -> dict[str, float]:
 def bytes_read(X: Tensor, y: Tensor) -> int:
     """Bytes of X and y that a fit reads."""
     read = 0
-    blocks = _passes.blocks
+    blocks = _rows.blocks
 
     def counted(*given: Tensor | None) -> Iterator[object]:
         nonlocal read
@@ -59,11 +59,11 @@ def bytes_read(X: Tensor, y: Tensor) -> int:
             read += block.y.numel() * (COLUMNS + 1) * y.element_size()
             yield block
 
-    _passes.blocks = counted
+    _rows.blocks = counted
     try:
         MKCRegression().fit(X, y)
     finally:
-        _passes.blocks = blocks
+        _rows.blocks = blocks
     # the check of every value in addition
     return read + X.nbytes + y.nbytes
 

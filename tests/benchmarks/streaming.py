@@ -30,11 +30,11 @@ import torch
 from torch import distributed as dist
 
 from mkc_torch._support.ranks import Ranks
+from mkc_torch.linear._blocks import Density
 from mkc_torch.linear.streaming import MemmapBatches, StreamedMKCRegression, from_memmap
-from mkc_torch.linear.streaming._blocks import Shape
-from mkc_torch.linear.streaming._float32_pass import float32_pass
+from mkc_torch.linear.streaming._batches import Shape
 from mkc_torch.linear.streaming._reservoir import Reservoir
-from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._sums import flat_length, sums_pass
 from mkc_torch.linear.streaming._survey import survey_rows
 
 COLUMNS = 8
@@ -44,7 +44,9 @@ WRITTEN = 1_000_000
 READ = 65_536
 """Rows that are summed at once: the fastest power of two."""
 
-POINT = StreamPoint(np.ones(COLUMNS), np.array([0.25]), np.array([0.5]))
+SHAPE = Shape(1, COLUMNS, True, False)
+
+POINT = (torch.ones(COLUMNS).double(), Density(torch.tensor([0.25]).double(), torch.tensor([0.5]).double()))
 
 
 def write_table(path: Path, rows: int) -> None:
@@ -73,14 +75,14 @@ def read_and_sum(table: np.ndarray) -> float:
 
 
 def passes(batches: MemmapBatches) -> dict[str, Callable[[], object]]:
-    shape = Shape(1, COLUMNS, True, False)
+    def one_pass(**wanted: bool) -> Callable[[], object]:
+        return lambda: sums_pass(batches, SHAPE, None, *POINT, **wanted)
+
     return {
-        "gradient in float32": lambda: float32_pass(batches, shape, POINT),
-        "gradient": lambda: slopes_pass(batches, shape, POINT, curvature=False),
-        "range of residuals": lambda: range_pass(batches, shape, POINT),
-        "gradient and Hessian": lambda: slopes_pass(batches, shape, POINT, curvature=True),
-        "the first, with a sample": lambda: survey_rows(batches, Reservoir(50_000, 0)),
-        "the last, with the covariance": lambda: report_pass(batches, shape, POINT),
+        "gradient": one_pass(),
+        "gradient and range of residuals": one_pass(with_range=True),
+        "the last, with the covariance": one_pass(with_curvature=True),
+        "the first, with a sample": lambda: survey_rows(batches, Reservoir(50_000, 0, rows=batches.rows)),
     }
 
 
@@ -128,12 +130,10 @@ def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, result
     torch.set_num_threads(1)
     dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=ranks)
     batches, best = batches_of(path, (rank, ranks)), {}
-    shape, group = Shape(1, COLUMNS, True, False), Ranks()
-    length = StreamSums.length(shape)
+    group, length = Ranks(), flat_length(SHAPE, with_curvature=False)
     # a pass for the gradient includes its sum over ranks
     work: dict[str, Callable[[], object]] = {
-        "gradient in float32": lambda: group.sum_of(lambda: float32_pass(batches, shape, POINT), length),
-        "gradient": lambda: group.sum_of(lambda: slopes_pass(batches, shape, POINT, curvature=False), length),
+        "gradient": lambda: group.sum_of(lambda: sums_pass(batches, SHAPE, None, *POINT)[0], length),
         "whole fit": lambda: StreamedMKCRegression().fit(batches),
     }
     for _ in range(repeats):

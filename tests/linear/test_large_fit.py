@@ -8,12 +8,13 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mkc_torch.density.likelihood import energy_derivatives
-from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _passes, em
-from mkc_torch.linear._blocks import Density, blocks, energy_of, kernel, residual, sums
+from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _rows, em
+from mkc_torch.linear._blocks import Density, energy_of, kernel, residual, sums
+from mkc_torch.linear._descent import sandwich_of
 from mkc_torch.linear._mkc import coefficient_covariance
-from mkc_torch.linear._passes import Rows
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
 from mkc_torch.linear._problem import checked_shapes, linear_problem
+from mkc_torch.linear._rows import Rows, blocks
 
 N = 24_000
 """Rows of a fit that starts with a pilot."""
@@ -320,7 +321,7 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
             read += block.y.shape[0]
             yield block
 
-    monkeypatch.setattr(_passes, "blocks", counted)
+    monkeypatch.setattr(_rows, "blocks", counted)
     with Largest(X, y) as largest:
         MKCRegression().fit(X, y)
     assert read < 12 * rows
@@ -335,7 +336,7 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     weight = torch.arange(2 * N).double().reshape(N, 2) % 3 if weighted else None
     beta = torch.tensor([1.1, 0.9, 1.2]).double()
     density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
-    total, curvature_sums = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    total, curvature_sums, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     assert curvature_sums is not None
     problem = linear_problem(X, Y, weight)
     in_basis = problem.in_basis(beta)
@@ -346,10 +347,10 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
         torch.testing.assert_close(mine / total.weight, value, rtol=1e-7, atol=1e-9)
     covariance = coefficient_covariance(problem, in_basis, density.kappa[None], density.d[None], "sandwich", None)
     used = 2 * N if weight is None else int((weight > 0).sum())
-    torch.testing.assert_close(_large._sandwich(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(sandwich_of(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
     monkeypatch.setattr(_blocks, "_STRIP", 100)
-    monkeypatch.setattr(_passes, "blocks", lambda *args: blocks(*args, 1234))
-    again, transformed = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
+    monkeypatch.setattr(_rows, "blocks", lambda *args: blocks(*args, 1234))
+    again, transformed, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     for reference, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
         torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
 
@@ -359,8 +360,8 @@ def test_a_frame_is_a_change_of_columns():
     frame = torch.linalg.inv(normal(9, 5, 5))
     density = Density(torch.tensor([0.2]).double(), torch.tensor([1.0]).double())
     beta = torch.ones(5).double()
-    plain, curvature_sums = Rows(X[:, None], y[:, None], None).evaluate(beta, density, with_curvature=True)
-    framed, transformed = Rows(X[:, None], y[:, None], None, frame).evaluate(
+    plain, curvature_sums, _ = Rows(X[:, None], y[:, None], None).evaluate(beta, density, with_curvature=True)
+    framed, transformed, _ = Rows(X[:, None], y[:, None], None, frame).evaluate(
         torch.linalg.solve(frame, beta), density, with_curvature=True
     )
     assert curvature_sums is not None
@@ -376,7 +377,7 @@ def test_score_is_the_slope_of_the_energy():
     def energy_at(beta: Tensor) -> Tensor:
         block = next(iter(blocks(X[:, None], y[:, None], None)))
         error = residual(block, beta)
-        found = sums(block, error, *kernel(error, density), density)
+        found = sums(block, error, *kernel(error, density), density, plain=True)
         return torch.cat([energy_of(found, density.kappa).value, found.score.flatten()])
 
     beta, step = torch.full((5,), 0.9).double(), 1e-5

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mkc_torch.linear._blocks import Block, triangle
+from mkc_torch.linear._descent import EvaluatedPoint, _newton_move
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns
-from mkc_torch.linear._passes import EvaluatedPoint, _newton_move
 
 GRADIENTS = {
     "inside": [1.0, 0.1, -0.3],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -40,6 +40,12 @@ class FitState:
     free_kappa: bool = False
     free_d: bool = False
     extras: tuple[Tensor, ...] = ()
+
+    def to(self, device: torch.device) -> FitState:
+        """The same on a device; ``extras`` stay where they are."""
+        names = ("beta", "kappa", "log_d", "converged", "log_bound", "log_d_min")
+        moved_fields = {name: value.to(device) for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **moved_fields)
 
 
 @dataclass(frozen=True)

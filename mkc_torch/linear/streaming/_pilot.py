@@ -9,11 +9,15 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.likelihood import normaliser_derivatives
+from mkc_torch.linear._blocks import Density
+from mkc_torch.linear._descent import PassDerivatives
+from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._problem import RankDeficientError
+from mkc_torch.linear._rows import Rows
 from mkc_torch.linear.em import MKCRegression
-from mkc_torch.linear.streaming._blocks import Shape
+from mkc_torch.linear.streaming._batches import Shape
 from mkc_torch.linear.streaming._reservoir import Drawn
-from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, slopes_pass
+from mkc_torch.linear.streaming._survey import Survey
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -32,84 +36,65 @@ class PilotFit:
     """Fit of a sample, as the start of the fit to all rows.
 
     Attributes:
-        coef, kappa, log_d: the sample's maximum, (n,), (m,), (m,).
-        log_bound, log_d_min: log half-width of the sample's domain and least log d, (m,).
-        free_kappa, free_d: whether 1/σ² and d are learned.
+        fit_state: the sample's maximum with its domain and the least d, in the basis of the passes, a batch of 1.
+        slopes: derivatives of the sample at its maximum, and the products of the columns of all rows.
         exact: whether most values lie on the fit to rounding.
         rows: number of rows of the sample.
-        weight: sum of its weights, (m,).
-        sums: :class:`StreamSums` over the sample at its maximum, flat.
     """
 
-    coef: Float64[Tensor, " n"]
-    kappa: Float64[Tensor, " m"]
-    log_d: Float64[Tensor, " m"]
-    log_bound: Float64[Tensor, " m"]
-    log_d_min: Float64[Tensor, " m"]
-    free_kappa: bool
-    free_d: bool
+    fit_state: FitState
+    slopes: PassDerivatives
     exact: bool
     rows: int
-    weight: Float64[Tensor, " m"]
-    sums: Float64[Tensor, " k"]
 
 
-def fit_pilot(
-    drawn: Drawn, shape: Shape, estimator: MKCRegression, to_basis: Float64[Tensor, "n n"] | None = None
-) -> PilotFit:
+def fit_pilot(drawn: Drawn, survey: Survey, estimator: MKCRegression) -> PilotFit:
     """Fit :class:`MKCRegression` to a sample.
 
     Args:
         drawn: the sample.
-        shape: shape of the batches.
+        survey: the survey of all rows.
         estimator: estimator with the parameters of the fit.
-        to_basis: change of basis of the columns for the sums, or None.
 
     Raises:
         RankDeficientError: the sample's columns are linearly dependent.
         ValueError: a parameter of the estimator does not suit the data.
     """
+    shape, frame = survey.shape, survey.frame()
     x, y, weight = _columns(drawn, shape)
+    given = [x, y] if weight is None else [x, y, weight]
     try:
-        fit = estimator.fit(x, y, weight)
+        fit = estimator.fit(*(values.squeeze(1) if shape.single_channel else values for values in given))
     except RankDeficientError as error:
         raise RankDeficientError(
             f"In the sample of {len(x)} rows from which the fit starts: {error} If few rows distinguish these columns, "
             "raise `pilot`."
         ) from None
-    coef, kappa, log_d, log_bound = fit.coef_, fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
-    transformed = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
-    point = StreamPoint(
-        transformed.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy()
-    )
-    flat = slopes_pass([(x, y) if weight is None else (x, y, weight)], shape, point, curvature=True)
-    total = _total_weight(weight, len(x), shape.m)
+    kappa, log_d, log_bound = fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
+    coef = fit.coef_
+    beta = coef if frame is None else torch.linalg.solve(frame, coef.unsqueeze(-1)).squeeze(-1)
+    total, more, _ = Rows(x, y, weight, frame).evaluate(beta, Density(kappa, fit.d_), with_curvature=True)
+    assert more is not None
     exact = bool(fit.exact_fit_)
-    slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * StreamSums.of(flat, shape).qw / total
-    return PilotFit(
-        coef=coef,
-        kappa=kappa,
-        log_d=log_d,
-        log_bound=log_bound,
-        log_d_min=torch.where(slope > _HELD, log_d, torch.log(_LEAST_D * fit.d_)) if not exact else log_d,
+    slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * total.terms[3] / total.weight
+    held = log_d if exact else torch.where(slope > _HELD, log_d, torch.log(_LEAST_D * fit.d_))
+    fit_state = FitState(
+        beta=beta.unsqueeze(0),
+        kappa=kappa.unsqueeze(0),
+        log_d=log_d.unsqueeze(0),
+        converged=torch.zeros(1, dtype=torch.bool),
+        log_bound=log_bound.unsqueeze(0),
+        log_d_min=held.unsqueeze(0),
         free_kappa=estimator.sigma is None,
         free_d=estimator.d is None,
-        exact=exact,
-        rows=len(x),
-        weight=total,
-        sums=flat,
     )
+    weight_sum = total.weight.sum()
+    slopes = PassDerivatives(more.curvature / weight_sum, more.tilt / weight_sum, survey.grams())
+    return PilotFit(fit_state, slopes, exact, len(x))
 
 
-def _total_weight(weight: Tensor | None, rows: int, m: int) -> Float64[Tensor, " m"]:
-    return torch.full((m,), float(rows), dtype=torch.float64) if weight is None else weight.reshape(rows, m).sum(0)
-
-
-def _columns(drawn: Drawn, shape: Shape) -> tuple[Tensor, Tensor, Tensor | None]:
+def _columns(drawn: Drawn, shape: Shape) -> tuple[Tensor, Tensor, Float64[Tensor, "k m"] | None]:
     m, n = shape.m, shape.n
     rows = torch.from_numpy(drawn.rows)
-    x, y = rows[:, : m * n].unflatten(1, (m, n)), rows[:, m * n : m * n + m]
     weight = rows[:, m * n + m :] if shape.weighted else None
-    if not shape.single_channel:
-        return x, y, weight
-    return x.squeeze(1), y.squeeze(1), None if weight is None else weight.squeeze(1)
+    return rows[:, : m * n].unflatten(1, (m, n)), rows[:, m * n : m * n + m], weight

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,13 +13,15 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.files import write_atomically
-from mkc_torch.density.likelihood import normaliser_derivatives
+from mkc_torch.density.likelihood import Derivatives, normaliser_derivatives
+from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, ResidualRange, Sums
+from mkc_torch.linear._descent import Descent, EvaluatedPoint, PassDerivatives, sandwich_of
+from mkc_torch.linear._implicit.stationary import FitState, Unknowns
 from mkc_torch.linear._problem import solve_gram
 from mkc_torch.linear._scale_search import relative_precision
-from mkc_torch.linear.streaming._blocks import Shape
-from mkc_torch.linear.streaming._newton import NEAR, Likelihood, NewtonState, StreamParameters
+from mkc_torch.linear.streaming._batches import Shape
 from mkc_torch.linear.streaming._pilot import PilotFit
-from mkc_torch.linear.streaming._sums import Extremes, StreamPoint, StreamSums
+from mkc_torch.linear.streaming._sums import sums_of
 from mkc_torch.linear.streaming._survey import Survey
 
 if TYPE_CHECKING:
@@ -27,18 +29,51 @@ if TYPE_CHECKING:
 
 __all__ = ["Phase", "StreamChangedError", "StreamProgress"]
 
-Phase = Literal["range", "climb", "report", "done"]
+Phase = Literal["range", "climb", "done"]
 
-FORMAT = 1
+FORMAT = 2
 """Version of a saved state; another version is refused."""
 
 _SAME = 1e-9
-"""Share of a column's absolute sum by which its sum may differ between float64 passes.
+"""Share of a column's absolute sum by which its sum may differ between passes.
 
 Rounding in another order is a hundredth of it, and a millionth of the rows with other values exceeds it."""
 
-_SAME_FLOAT32 = 1e-5
-"""The same for a float32 pass."""
+_NEAR = 2e-5
+"""Distance from the maximum, in standard errors of one row, below which a pass computes the curvature.
+
+The covariance is then as accurate as this, and a step with the curvature leaves the square of the distance."""
+
+_FURTHEST = 0.03
+"""The same in standard errors, for many rows."""
+
+_LONGER = 0.5
+"""Log of the ratio of the domain to the sample's up to which the sums at the sample's density are a step's.
+
+On a longer domain the share of its tail is adapted first."""
+
+_SLOW = 0.1
+"""Share of the length of a step that the next may have; beyond it, the curvature is computed again."""
+
+_EXACT_PASSES = 8
+"""Passes after which a fit through most values to rounding, whose precision is limited, ends."""
+
+_CLASSES: dict[str, Any] = {
+    "survey": Survey,
+    "shape": Shape,
+    "begun": PilotFit,
+    "climb": Descent,
+    "fit_state": FitState,
+    "slopes": PassDerivatives,
+    "point": Unknowns,
+    "best": EvaluatedPoint,
+    "by_channel": Derivatives,
+    "result": PassResult,
+    "total": Sums,
+    "curvature": CurvatureSums,
+    "curvature_sums": CurvatureSums,
+}
+"""Types of the nested parts of a state, by the name of the field."""
 
 
 class StreamChangedError(ValueError):
@@ -53,11 +88,11 @@ class StreamProgress:
         settings: parameters of the fit, by name.
         survey: the survey of all rows.
         begun: the pilot fit.
-        phase: purpose of the next pass: the range of the residuals, the maximum, or the covariance at it; or "done".
+        phase: purpose of the next pass: the range of the residuals, or the maximum; or "done".
         passes: number of passes made.
-        log_bound: log half-width of the domain, (m,).
         climb: state of the maximisation, once it has begun.
         gaussian: whether a Gaussian density at least squares has been tried.
+        ending: whether the next pass is the last in any case.
         converged: whether the maximum was reached.
     """
 
@@ -66,132 +101,97 @@ class StreamProgress:
     begun: PilotFit
     phase: Phase
     passes: int
-    log_bound: Float64[Tensor, " m"]
-    climb: NewtonState | None = None
+    climb: Descent | None = None
     gaussian: bool = False
+    ending: bool = False
     converged: bool = False
 
     @staticmethod
     def begin(settings: dict[str, Any], survey: Survey, begun: PilotFit) -> StreamProgress:
+        progress = StreamProgress(settings, survey, begun, "range", 1)
         # with a sample of all rows the range is known
         known = settings["bound"] is not None or begun.rows == survey.rows
-        progress = StreamProgress(settings, survey, begun, "range", 1, begun.log_bound)
-        return progress._climbing(begun.log_bound) if known else progress
+        return progress._climbing(begun.fit_state) if known else progress
 
-    def likelihood(self) -> Likelihood:
-        transformed = (
-            torch.eye(self.survey.shape.n, dtype=torch.float64)
-            if self.survey.is_ill_conditioned()
-            else self.survey.to_coef()
-        )
-        return Likelihood(
-            weight=self.survey.weight,
-            log_bound=self.log_bound,
-            log_d_min=self.begun.log_d_min,
-            free_kappa=self.begun.free_kappa,
-            free_d=self.begun.free_d,
-            to_basis=transformed,
-            largest=float(self.survey.largest.max()),
-            single=self.survey.single and not self.survey.is_ill_conditioned(),
-        )
-
-    def point(self) -> StreamPoint:
-        """The point at which the next pass is made."""
+    def next_pass(self) -> tuple[Float64[Tensor, " n"], Density, bool]:
+        """Coefficients and density of the next pass, and whether it computes the curvature."""
         if self.climb is None:
-            beta, kappa, log_d = self._in_basis(self.begun.coef), self.begun.kappa, self.begun.log_d
-        else:
-            beta, kappa, log_d = self.climb.trial.beta, self.climb.trial.kappa, self.climb.trial.log_d
-        to_coef, transformed = self.survey.to_coef(), self.survey.is_ill_conditioned()
-        return StreamPoint(
-            coef=(beta if transformed else to_coef @ beta).numpy(),
-            kappa=kappa.numpy(),
-            d=torch.exp(log_d).numpy(),
-            to_basis=to_coef.numpy() if transformed else None,
-        )
+            start = self.begun.fit_state
+            return start.beta[0], Density(start.kappa[0], torch.exp(start.log_d[0])), False
+        return self.climb.point.beta[0], self.climb.density(), self.climb.with_curvature
 
-    def after_range(self, parts: list[Extremes]) -> StreamProgress:
+    def after_range(self, parts: list[tuple[Float64[Tensor, " k"], ResidualRange | None]]) -> StreamProgress:
         """Set the domain: half the range of all residuals, and at least the sample's, which includes ten of its d.
 
         Args:
-            parts: results of the ranks, in their order.
+            parts: sums and ranges of the ranks, in their order.
 
         Raises:
             StreamChangedError: the pass had other rows.
         """
-        whole = reduce(Extremes.with_others, parts)
-        self.refuse_other_rows(whole.rows, torch.from_numpy(whole.residual), self.begun.coef, _SAME)
-        half = 0.5 * torch.from_numpy(whole.high - whole.low)
-        bound = torch.maximum(torch.exp(self.begun.log_bound), half)
-        return replace(self, passes=self.passes + 1)._climbing(torch.log(bound))
+        start = self.begun.fit_state
+        rows, result = sums_of(torch.stack([flat for flat, _ in parts]).sum(0), self.survey.shape)
+        self._refuse_other_rows(rows, result.total.residual, start.beta[0])
+        extent = reduce(ResidualRange.with_others, [part for _, part in parts if part is not None])
+        assert start.log_bound is not None
+        log_bound = torch.maximum(start.log_bound, torch.log(extent.half()))
+        now, longer = replace(self, passes=self.passes + 1), log_bound - start.log_bound
+        if bool((longer <= _LONGER).all()):
+            climbing = now._climbing(replace(start, log_bound=log_bound))
+            assert climbing.climb is not None
+            return replace(climbing, climb=climbing.climb.after(result))
+        # keep the tail density exp(-1/κ) / bound unchanged on the longer domain
+        inverse = torch.where(start.kappa > 0, start.kappa, 1.0).reciprocal() + longer
+        kappa = torch.where(start.kappa > 0, inverse.reciprocal(), 0.0) if start.free_kappa else start.kappa
+        return now._climbing(replace(start, kappa=kappa, log_bound=log_bound))
 
-    def after_slopes(self, sums: StreamSums, max_passes: int) -> StreamProgress:
-        """Make one Newton step towards the maximum.
-
-        Raises:
-            StreamChangedError: the pass had other rows.
-        """
-        assert self.climb is not None
-        self._refuse_other_sums(sums, self.climb)
-        likelihood = self.likelihood()
-        climb = self.climb.after(likelihood, sums)
-        now = replace(self, passes=self.passes + 1, climb=climb)
-        # the precision of a fit through most values to rounding is limited
-        near = climb.near or (self.begun.exact and len(climb.history) >= 8)
-        if not near and now.passes < max_passes - 1:
-            return now
-        if near and not self.gaussian and self.begun.free_kappa and self.begun.free_d:
-            place, value = self._gaussian(likelihood)
-            if value < climb.history[-1]:
-                return replace(now, climb=NewtonState(place, history=climb.history), gaussian=True)
-        if not near and climb.place is not None:
-            climb = replace(climb, trial=climb.place)
-        return replace(now, climb=replace(climb, curvature=True, rough=False), phase="report", gaussian=True)
-
-    def after_report(self, sums: StreamSums, max_passes: int) -> StreamProgress:
-        """Make a last step with the Hessian of the report pass; continue the maximisation if the step is too long.
+    def after_sums(self, flat: Float64[Tensor, " k"], max_passes: int) -> StreamProgress:
+        """Make a step towards the maximum.
 
         Raises:
             StreamChangedError: the pass had other rows.
         """
         assert self.climb is not None
-        self._refuse_other_sums(sums, self.climb)
-        climb = self.climb.after(self.likelihood(), sums)
-        head = float(2.0 * sums.qw.sum() / self.survey.weight.sum())
-        converged = self.begun.exact or climb.near or climb.gain <= 10.0 * NEAR * head
-        now = replace(self, passes=self.passes + 1, climb=climb)
-        if converged or now.passes >= max_passes:
-            return replace(now, phase="done", converged=converged)
-        return replace(now, phase="climb")
+        rows, result = sums_of(flat, self.survey.shape)
+        self._refuse_other_rows(rows, result.total.residual, self.climb.point.beta[0])
+        climb, passes = self.climb.after(result), self.passes + 1
+        now = replace(self, passes=passes, climb=climb)
+        if climb.done and not self.gaussian and not self.ending and passes < max_passes - 1:
+            start = self._gaussian(climb)
+            if start is not None:
+                begun = replace(now._climbing(start, alike=False), gaussian=True)
+                assert begun.climb is not None
+                return replace(begun, climb=replace(begun.climb, history=climb.history))
+        if climb.done or self.ending:
+            return replace(now, phase="done", converged=climb.done or self.begun.exact)
+        if passes >= max_passes - 1 or (self.begun.exact and len(climb.history) >= _EXACT_PASSES):
+            assert climb.best is not None
+            return replace(now, climb=replace(climb, point=climb.best.point, left=0.0), ending=True)
+        return now
 
-    def _refuse_other_sums(self, sums: StreamSums, climb: NewtonState) -> None:
-        coef = self.survey.to_coef() @ climb.trial.beta
-        self.refuse_other_rows(int(sums.rows), sums.residual, coef, _SAME_FLOAT32 if climb.rough else _SAME)
-
-    def refuse_other_rows(
-        self, rows: int, residual: Float64[Tensor, " m"], coef: Float64[Tensor, " n"], same: float
-    ) -> None:
+    def _refuse_other_rows(self, rows: int, residual: Float64[Tensor, " m"], beta: Float64[Tensor, " n"]) -> None:
         """Refuse a pass whose rows differ from those of the first.
 
         Args:
             rows: number of rows of the pass.
             residual: sums of its weighted residuals.
-            coef: coefficients of these residuals.
-            same: tolerance as a share of the sums of absolute values.
+            beta: coefficients of these residuals.
 
         Raises:
             StreamChangedError: the rows differ.
         """
-        survey, n = self.survey, self.survey.shape.n
+        survey, n, frame = self.survey, self.survey.shape.n, self.survey.frame()
         if rows != survey.rows:
             raise StreamChangedError(
                 f"Expected `batches` to yield the same rows in every pass but got {rows}, after {survey.rows} in the "
                 "first; shuffle if you like, but do not drop a last batch or redraw rows."
             )
+        coef = beta if frame is None else frame @ beta
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
         # upper bound of a column's sum of absolute values, by Cauchy-Schwarz
         size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
         size = size[:, n] + size[:, :n] @ coef.abs()
-        wrong = ~((residual - expected).abs() <= same * size)
+        wrong = ~((residual - expected).abs() <= _SAME * size)
         if bool(wrong.any()):
             raise StreamChangedError(
                 "Expected `batches` to yield the same values in every pass but got residuals that sum to "
@@ -200,46 +200,74 @@ class StreamProgress:
                 "saved state."
             )
 
-    def _climbing(self, log_bound: Float64[Tensor, " m"]) -> StreamProgress:
-        begun = self.begun
-        # keep the tail density exp(-1/κ) / bound unchanged on the longer domain
-        longer = torch.where(begun.kappa > 0, begun.kappa, 1.0).reciprocal() + log_bound - begun.log_bound
-        kappa = torch.where(begun.kappa > 0, longer.reciprocal(), 0.0) if begun.free_kappa else begun.kappa
-        place = StreamParameters(self._in_basis(begun.coef), kappa, begun.log_d)
-        now = replace(self, phase="climb", log_bound=log_bound)
-        likelihood = now.likelihood()
-        of_sample = replace(likelihood, weight=begun.weight)
-        hessian = of_sample.hessian(place, StreamSums.of(begun.sums, self.survey.shape))
-        rough = likelihood.allows_float32(place) and begun.rows < self.survey.rows
-        return replace(now, climb=NewtonState(place, curvature=False, rough=rough, hessian=hessian, stale=True))
+    def _climbing(self, fit_state: FitState, *, alike: bool = True) -> StreamProgress:
+        near = min(_NEAR * float(self.survey.weight.sum()) ** 0.5, _FURTHEST)
+        climb = Descent.begin(
+            fit_state, self.begun.slopes, near=near, stop=2.0 * near, fresh=True, slow=_SLOW, alike=alike
+        )
+        return replace(self, phase="climb", climb=climb)
 
-    def _gaussian(self, likelihood: Likelihood) -> tuple[StreamParameters, float]:
-        """Gaussian density at weighted least squares, as in memory, and its mean negative log-likelihood."""
-        n = self.survey.shape.n
-        triangle = self.survey.triangle.clone()
-        triangle[..., :n] = triangle[..., :n] @ self.survey.to_coef()
-        rows, targets = triangle[..., :n], triangle[..., n]
+    def _gaussian(self, climb: Descent) -> FitState | None:
+        """Gaussian density at weighted least squares, as in memory, if its likelihood is higher."""
+        state, survey, n = climb.fit_state, self.survey, self.survey.shape.n
+        assert state.log_bound is not None
+        assert state.log_d_min is not None
+        if not (state.free_kappa and state.free_d):
+            return None
+        frame = survey.frame()
+        basis = survey.to_coef()
+        rows, targets, least = survey.triangle[..., :n] @ basis, survey.triangle[..., n], torch.exp(state.log_d_min[0])
 
-        def solved(precision: Tensor) -> tuple[Tensor, Tensor]:
+        def solved(precision: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             gram = torch.einsum("c,cki,ckj->ij", precision, rows, rows)
             beta = solve_gram(gram, torch.einsum("c,cki,ck->i", precision, rows, targets))
-            mean_square = (targets - rows @ beta).square().sum(-1) / self.survey.weight
-            return beta, torch.maximum(mean_square.sqrt(), torch.exp(likelihood.log_d_min))
+            mean_square = (targets - rows @ beta).square().sum(-1) / survey.weight
+            return beta, torch.maximum(mean_square.sqrt(), least), mean_square
 
-        beta, d = solved(torch.ones_like(self.survey.weight))
-        for _ in range(2 if self.survey.shape.m > 1 else 0):
-            beta, d = solved(relative_precision(d))
-        mean_square = (targets - rows @ beta).square().sum(-1) / self.survey.weight
-        place = StreamParameters(beta, torch.zeros_like(d), torch.log(d))
-        norm = normaliser_derivatives(place.kappa, place.log_d, likelihood.log_bound).value
-        return place, float((0.5 * mean_square / d.square() + norm).sum())
+        beta, d, mean_square = solved(torch.ones_like(survey.weight))
+        for _ in range(2 if survey.shape.m > 1 else 0):
+            beta, d, mean_square = solved(relative_precision(d))
+        norm = normaliser_derivatives(torch.zeros_like(d), torch.log(d), state.log_bound[0]).value
+        if float((0.5 * mean_square / d.square() + norm).sum()) >= climb.history[-1]:
+            return None
+        beta = beta if frame is not None else basis @ beta
+        return replace(
+            state, beta=beta.unsqueeze(0), kappa=torch.zeros_like(state.kappa), log_d=torch.log(d).unsqueeze(0)
+        )
 
-    def _in_basis(self, coef: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-        return torch.linalg.solve(self.survey.to_coef(), coef.unsqueeze(-1)).squeeze(-1)
+    def results(self) -> dict[str, Any]:
+        """Attributes of a fitted estimator, by name, after the last pass and the step after it."""
+        climb, survey, frame = self.climb, self.survey, self.survey.frame()
+        assert climb is not None
+        assert climb.best is not None
+        assert climb.result is not None
+        assert climb.curvature_sums is not None
+        assert climb.fit_state.log_bound is not None
+        place = climb.stepped() if climb.done else climb.best.point
+        left = survey.used - survey.shape.n
+        coef, covariance = place.beta[0], sandwich_of(climb.curvature_sums, survey.used, left)
+        if frame is not None:
+            coef, covariance = frame @ coef, frame @ covariance @ frame.mT
+        return {
+            "coef_": coef,
+            "sigma_": place.kappa[0].rsqrt(),
+            "d_": torch.exp(place.log_d[0]),
+            "bound_": torch.exp(climb.fit_state.log_bound[0]),
+            "log_likelihood_": -(climb.result.total.weight * climb.best.by_channel.value).sum(),
+            "covariance_": covariance,
+            "dof_": torch.tensor(float(left), dtype=torch.float64),
+            "history_": torch.tensor(climb.history, dtype=torch.float64),
+            "exact_fit_": torch.tensor(self.begun.exact),
+            "converged_": torch.tensor(self.converged),
+            "n_iter_": self.passes,
+            "n_rows_": survey.rows,
+            "n_pilot_": self.begun.rows,
+            "n_light_": int(climb.curvature_sums.light),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state as numbers, texts and tensors, readable by ``torch.load(..., weights_only=True)``."""
-        return {"format": FORMAT, **asdict(self)}
+        return {"format": FORMAT, **_plain(self)}
 
     @staticmethod
     def of(state: dict[str, Any]) -> StreamProgress:
@@ -253,16 +281,7 @@ class StreamProgress:
                 "Expected a state of StreamedMKCRegression, of this version, but got something else; start over "
                 "without it."
             )
-        fields = {key: value for key, value in state.items() if key != "format"}
-        survey, climb = dict(fields["survey"]), fields["climb"]
-        fields["survey"] = Survey(**{**survey, "shape": Shape(**survey["shape"])})
-        fields["begun"] = PilotFit(**fields["begun"])
-        if climb is not None:
-            places = {
-                name: None if climb[name] is None else StreamParameters(**climb[name]) for name in ("trial", "place")
-            }
-            fields["climb"] = NewtonState(**{**climb, **places, "history": tuple(climb["history"])})
-        return StreamProgress(**fields)
+        return StreamProgress(**{key: _restored(key, value) for key, value in state.items() if key != "format"})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a file atomically."""
@@ -302,3 +321,18 @@ class StreamProgress:
                     f"Expected argument `{name}` as in the saved state, {self.settings.get(name)!r}, but got "
                     f"{value!r}; use that value, or start over without the state."
                 )
+
+
+def _plain(value: Any) -> Any:
+    """Nested parts of a state as dictionaries."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if hasattr(value, "_asdict"):
+        return {name: _plain(part) for name, part in value._asdict().items()}
+    return value
+
+
+def _restored(name: str, value: Any) -> Any:
+    if name not in _CLASSES or not isinstance(value, dict):
+        return value
+    return _CLASSES[name](**{key: _restored(key, part) for key, part in value.items()})

@@ -6,17 +6,19 @@ rank knows its number of rows, of the number of ranks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+
+from mkc_torch.linear._blocks import Block
 
 if TYPE_CHECKING:
     from jaxtyping import Float64, Int64
 
-    from mkc_torch.linear.streaming._blocks import StreamBlock
-
-__all__ = ["Drawn", "Reservoir", "merged"]
+__all__ = ["Drawn", "Reservoir", "largest_key", "merged"]
 
 
 @dataclass(frozen=True)
@@ -43,35 +45,35 @@ class Reservoir:
         seed: seed of the keys.
         first: number of rows on the ranks before this one, or None if unknown.
         rank: this rank, which replaces ``first`` if that is unknown.
+        rows: number of rows of all ranks, or None if unknown.
 
     Example:
-        >>> from mkc_torch.linear.streaming._blocks import StreamBlock
         >>> sample = Reservoir(3, seed=0)
         >>> for start in (0, 5):
-        ...     rows = np.arange(start, start + 5.0)
-        ...     sample.add(StreamBlock(np.stack([rows, rows])[None], None))
+        ...     rows = torch.arange(start, start + 5.0).double()
+        ...     sample.add(Block(rows.reshape(5, 1, 1), rows.reshape(5, 1), None))
         >>> sample.drawn().numbers
         array([1, 2, 3])
     """
 
-    def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0) -> None:
+    def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0, rows: int | None = None) -> None:
         bits = np.random.PCG64(seed)
         self._random = np.random.Generator(bits.jumped(rank) if first is None else bits.advance(first))
         self._size = size
         self._number = first or 0
-        self._limit = 1.0
+        self._limit = 1.0 if rows is None else largest_key(size, rows)
         self._parts: list[Drawn] = []
         self._held = 0
 
-    def add(self, block: StreamBlock) -> None:
+    def add(self, block: Block) -> None:
         """Draw from the rows of a block."""
-        count = block.Y.shape[-1]
+        count = block.y.shape[0]
         keys = self._random.random((count,))
         chosen = np.flatnonzero(keys < self._limit)
         if len(chosen):
-            parts: list[np.ndarray] = [block.X.reshape(-1, count), block.Y]
-            parts += [] if block.weight is None else [block.weight]
-            rows = np.concatenate([part[:, chosen] for part in parts]).T
+            index = torch.from_numpy(chosen).to(block.y.device)
+            parts = [block.rows.flatten(1), block.y] + ([] if block.weight is None else [block.weight])
+            rows = torch.cat([part[index] for part in parts], 1).cpu().numpy()
             self._parts.append(Drawn(keys[chosen], self._number + chosen, rows))
             self._held += len(chosen)
         self._number += count
@@ -89,6 +91,14 @@ class Reservoir:
         self._parts, self._held = [kept], len(kept.keys)
         if self._held == self._size:
             self._limit = float(kept.keys.max())
+
+
+def largest_key(size: int, rows: int) -> float:
+    """Limit of the ``size`` smallest keys of ``rows`` rows, six standard deviations above the expected key.
+
+    At worst the sample is slightly too small.
+    """
+    return (size + 6.0 * math.sqrt(size)) / rows if rows > size else 1.0
 
 
 def merged(parts: list[Drawn], size: int) -> Drawn:

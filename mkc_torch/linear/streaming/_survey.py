@@ -13,12 +13,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch.linear._blocks import Block, products
 from mkc_torch.linear._problem import refuse_dependent, refuse_magnitude
-from mkc_torch.linear.streaming._blocks import Shape, StreamBlock, blocks
+from mkc_torch.linear.streaming._batches import Shape, rows_of
 from mkc_torch.linear.streaming._reservoir import Reservoir
 
 if TYPE_CHECKING:
@@ -26,10 +26,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Survey", "survey_rows"]
 
-NEARLY_DEPENDENT = 1e5
+NEARLY_DEPENDENT = 1e3
 """Ratio of the singular values of the scaled columns above which every block is transformed to an orthonormal basis.
 
-Sums of products of the original columns lose digits by its square, ten of sixteen here."""
+Sums of products of the original columns lose digits by its square, six of sixteen here."""
+
+_MANY_COLUMNS = 16
+"""Number of columns from which the products of an array with itself are faster than those of two arrays."""
 
 LEAST_PIVOT = 1e-3
 """Least pivot of the Cholesky factor of the scaled products of a block's columns.
@@ -50,7 +53,6 @@ class Survey:
         total: weighted sums of [x y], which identify the rows, (m, n + 1).
         weight: sum of the weights, (m,).
         largest: largest absolute value of Y, (m,).
-        single: whether all batches are float32.
     """
 
     shape: Shape
@@ -60,7 +62,6 @@ class Survey:
     total: Float64[Tensor, "m k"]
     weight: Float64[Tensor, " m"]
     largest: Float64[Tensor, " m"]
-    single: bool
 
     @staticmethod
     def of_all(parts: list[Survey]) -> Survey:
@@ -89,7 +90,6 @@ class Survey:
             total=_summed([part.total for part in parts]),
             weight=_summed([part.weight for part in parts]),
             largest=torch.stack([part.largest for part in parts]).amax(0),
-            single=all(part.single for part in parts),
         )
         whole._check()
         return whole
@@ -118,12 +118,18 @@ class Survey:
         refuse_dependent(upper, scale, self.rows * self.shape.m)
         return torch.linalg.inv(upper) / scale.unsqueeze(-1)
 
-    def is_ill_conditioned(self) -> bool:
-        """Whether the columns are so nearly dependent that every block is transformed to an orthonormal basis."""
+    def frame(self) -> Float64[Tensor, "n n"] | None:
+        """Change of basis of every block if the columns are nearly dependent, else None."""
         n = self.shape.n
         stacked = self.triangle[:, :, :n].reshape(-1, n)
         singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
-        return bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1])
+        return self.to_coef() if bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1]) else None
+
+    def grams(self) -> Float64[Tensor, "m n n"]:
+        """Products of the columns of each channel in the basis of the passes, per unit of weight."""
+        n, frame = self.shape.n, self.frame()
+        rows = self.triangle[:, :, :n] if frame is None else self.triangle[:, :, :n] @ frame
+        return rows.mT @ rows / self.weight.sum()
 
 
 def survey_rows(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
@@ -133,11 +139,14 @@ def survey_rows(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
         TypeError, ValueError: a batch is not like the first, a value is not finite, a weight is negative.
     """
     adding: _GrowingSurvey | None = None
-    for shape, block in blocks(batches):
+    for number, (shape, rows) in enumerate(rows_of(batches)):
         adding = _GrowingSurvey(shape) if adding is None else adding
-        adding.add(block)
-        reservoir.add(block)
-    return None if adding is None else adding.survey()
+        first = 0
+        for block in rows.blocks():
+            adding.add(block, number, first)
+            reservoir.add(block)
+            first += block.y.shape[0]
+    return adding.survey() if adding is not None and adding.rows else None
 
 
 class _GrowingSurvey:
@@ -146,77 +155,79 @@ class _GrowingSurvey:
     def __init__(self, shape: Shape) -> None:
         m, k = shape.m, shape.n + 1
         self._shape = shape
-        self._rows = self._used = 0
-        self._single = True
-        self._total, self._weight, self._largest = np.zeros((m, k)), np.zeros(m), np.zeros(m)
-        self._triangle, self._gram = torch.zeros(m, k, k, dtype=torch.float64), np.zeros((m, k, k))
-        self._space = np.empty(0)
+        self.rows = self._used = 0
+        self._total, self._weight, self._largest = (torch.zeros(size, dtype=torch.float64) for size in ((m, k), m, m))
+        self._triangle, self._gram = (torch.zeros(m, k, k, dtype=torch.float64) for _ in range(2))
 
-    def add(self, block: StreamBlock) -> None:
-        joined = block.joined
-        m, _, count = joined.shape
-        if self._space.size < joined.size:
-            self._space = np.empty(joined.size)
-        weighted = self._space[: joined.size].reshape(joined.shape)
-        own = np.ones((m, count)) if block.weight is None else block.weight
-        total = np.matmul(joined, own[:, :, None])[:, :, 0]
+    def add(self, block: Block, batch: int, first: int) -> None:
+        count, m = block.y.shape
+        joined = torch.cat([block.rows, block.y.unsqueeze(-1)], -1)
+        weighted = joined if block.weight is None else joined * block.weight.unsqueeze(-1)
+        total = weighted.sum(0).cpu()
         # checking the sums is much faster than checking every element for NaN and infinity
-        if not np.isfinite(total).all() or own.min() < 0:
-            refuse_bad_values(block)
-        self._rows += count
-        self._single = self._single and block.single
+        if not bool(torch.isfinite(total).all()) or (block.weight is not None and float(block.weight.min()) < 0):
+            refuse_bad_values(block, batch, first)
+        self.rows += count
         self._total += total
-        self._largest = np.maximum(self._largest, np.maximum(block.Y.max(1), -block.Y.min(1)))
-        self._used += int(np.count_nonzero(own > 0))
-        self._weight += own.sum(1)
-        gram = np.matmul(np.multiply(joined, own[:, None], out=weighted), joined.transpose(0, 2, 1))
+        self._largest = torch.maximum(self._largest, torch.stack(torch.aminmax(block.y, dim=0)).abs().amax(0).cpu())
+        self._used += count * m if block.weight is None else int((block.weight > 0).sum())
+        self._weight += count if block.weight is None else block.weight.sum(0).cpu()
+        gram = torch.stack([_products(block.rows[:, c], joined[:, c], weighted[:, c]) for c in range(m)]).cpu()
         if _is_good(gram):
             self._gram += gram
         else:
-            np.multiply(joined, np.sqrt(own)[:, None], out=weighted)
-            self._join(torch.from_numpy(weighted).mT)
+            scaled = joined if block.weight is None else joined * block.weight.sqrt().unsqueeze(-1)
+            self._join(scaled.transpose(0, 1).cpu())
 
     def _join(self, rows: Float64[Tensor, "m rows k"]) -> None:
         self._triangle = torch.linalg.qr(torch.cat([self._triangle, rows], dim=-2), mode="r").R
 
     def survey(self) -> Survey:
         if self._gram.any():
-            self._join(torch.linalg.cholesky(torch.from_numpy(self._gram), upper=True))
-        total, weight, largest = map(torch.from_numpy, (self._total, self._weight, self._largest))
-        return Survey(self._shape, self._rows, self._used, self._triangle, total, weight, largest, self._single)
+            self._join(torch.linalg.cholesky(self._gram, upper=True))
+        return Survey(self._shape, self.rows, self._used, self._triangle, self._total, self._weight, self._largest)
 
 
-def _is_good(gram: Float64[np.ndarray, "m k k"]) -> bool:
+def _products(rows: Tensor, joined: Tensor, weighted: Tensor) -> Float64[Tensor, "k k"]:
+    """Sums of the products of the columns of [x y], of a block without weights by way of the separate x.
+
+    NumPy multiplies an array with itself in another way, which is slower for few columns and faster for many.
+    """
+    if weighted.data_ptr() != joined.data_ptr() or rows.shape[-1] >= _MANY_COLUMNS:
+        return products(weighted, joined)
+    upper = products(rows, joined)
+    last = torch.dot(joined[:, -1], joined[:, -1]).reshape(1)
+    return torch.cat([upper, torch.cat([upper[:, -1], last]).unsqueeze(0)])
+
+
+def _is_good(gram: Float64[Tensor, "m k k"]) -> bool:
     """Whether the Cholesky factor of products of columns has ten digits; sums of such products then have them too."""
-    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
-    if not (size > 0).all():
+    size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
+    if not bool((size > 0).all()):
         return False
-    try:
-        factor = np.linalg.cholesky(gram / (size[:, :, None] * size[:, None]))
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.diagonal(factor, axis1=-2, axis2=-1).min() > LEAST_PIVOT)
+    factor, info = torch.linalg.cholesky_ex(gram / (size.unsqueeze(-1) * size.unsqueeze(-2)))
+    return not bool(info.any()) and float(factor.diagonal(dim1=-2, dim2=-1).min()) > LEAST_PIVOT
 
 
-def refuse_bad_values(block: StreamBlock) -> None:
+def refuse_bad_values(block: Block, batch: int, first: int) -> None:
     """Raise an error that names the first NaN or infinite value, or the first negative weight.
 
     Raises:
-            ValueError: there is such a value.
+        ValueError: there is such a value.
     """
-    for name, values in (("X", block.X), ("Y", block.Y), ("weight", block.weight)):
+    for name, values in (("X", block.rows), ("Y", block.y), ("weight", block.weight)):
         if values is None:
             continue
-        wrong, kind = ~np.isfinite(values), "finite"
+        wrong, kind = ~torch.isfinite(values), "finite"
         if name == "weight":
             wrong, kind = wrong | (values < 0), "finite and >= 0"
-        if not wrong.any():
+        if not bool(wrong.any()):
             continue
-        *inside, row = (int(i) for i in min(np.argwhere(wrong), key=lambda at: int(at[-1])))
-        place = f", at {tuple(inside)} in it" if np.prod(values.shape[:-1]) > 1 else ""
+        row, *inside = (int(i) for i in wrong.nonzero()[0])
+        place = f", at {tuple(inside)} in it" if values[0].numel() > 1 else ""
         raise ValueError(
-            f"Expected `{name}` to be {kind} but got {values[(*inside, row)]} in row {block.first + row} of batch "
-            f"{block.batch}{place}; drop that row, or give it the weight 0 and a finite value."
+            f"Expected `{name}` to be {kind} but got {float(values[(row, *inside)])} in row {first + row} of batch "
+            f"{batch}{place}; drop that row, or give it the weight 0 and a finite value."
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
@@ -17,13 +16,11 @@ from mkc_torch.linear._estimator import NotFittedError
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._robust_start import Start
 from mkc_torch.linear.em import MKCRegression
-from mkc_torch.linear.streaming._blocks import checked_source
-from mkc_torch.linear.streaming._float32_pass import float32_pass
+from mkc_torch.linear.streaming._batches import checked_source
 from mkc_torch.linear.streaming._pilot import fit_pilot
 from mkc_torch.linear.streaming._progress import StreamChangedError, StreamProgress
-from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
-from mkc_torch.linear.streaming._results import results
-from mkc_torch.linear.streaming._sums import Report, StreamSums, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, largest_key, merged
+from mkc_torch.linear.streaming._sums import flat_length, sums_pass
 from mkc_torch.linear.streaming._survey import Survey, survey_rows
 
 if TYPE_CHECKING:
@@ -38,19 +35,19 @@ class StreamedMKCRegression(Inference):
     The first pass checks and counts the rows and draws a uniform sample of them, which :class:`MKCRegression` fits in
     memory. A second pass sets the domain: half the range of all residuals of that fit, and at least that of the sample.
     It is not needed if the sample has all rows. Newton's method on the coefficients and each channel's σ and d then
-    maximises the likelihood of all rows, from the sample's maximum in two to four passes. A last pass computes the
-    covariance. The deciding sums are float64, also for float32 data. Memory does not grow with the rows: one batch, a
-    block of 80 000 values, and during the first pass twice the sample.
+    maximises the likelihood of all rows, from the sample's maximum, by the passes of :class:`MKCRegression` over many
+    rows: one to three for the gradient, and a last for the covariance. Sums are float64, also for float32 data. Memory
+    does not grow with the rows: one batch, a block of 33 000 values of Y, and during the first pass twice the sample.
 
     If the sample has all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8 or to
-    the accuracy of its maximum. With more rows the domain depends on the sample: ``MKCRegression(bound=fit.bound_)``
-    gives the same result to 1e-8 if it finds the same maximum. With ``bound`` given, only the start depends on the
-    sample.
+    the accuracy of its maximum; the covariance to 1e-4. With more rows the domain depends on the sample:
+    ``MKCRegression(bound=fit.bound_)`` gives the same result to 1e-8 if it finds the same maximum. With ``bound``
+    given, only the start depends on the sample.
 
     In a process group of ``torch.distributed``, for example of torchrun, each rank has its own part of the rows, which
     may be empty, and the sums are over all ranks. All ranks end with bitwise equal numbers. An error on one rank is an
     error on all. So is a rank that dies, which gloo reports at once, and a rank that hangs, after the group's timeout.
-    The computation is on the CPU, wherever the batches are.
+    Tensors on a GPU are summed there; with the backend nccl the sums of the ranks are added there too.
 
     Args:
         sigma: None learns σ; a number in [0.05, inf], or a list of one number for each channel, fixes it.
@@ -59,7 +56,7 @@ class StreamedMKCRegression(Inference):
         start: start of the sample's fit, "lts", "s", "least_squares", or a list or tensor of coefficients.
         pilot: largest number of rows of the sample. Its fit takes some 70 MB with 8 columns and 380 MB with 60. With
             fewer than a few hundred rows it may lead to another maximum where outliers are many.
-        max_passes: largest number of passes over the rows, at least 4; a fit takes 5 to 8.
+        max_passes: largest number of passes over the rows, at least 4; a fit takes 4 to 7.
         seed: seed of the sample and of its start.
 
     Attributes, after ``fit`` (m is 1 for one channel given as (N,)):
@@ -123,7 +120,7 @@ class StreamedMKCRegression(Inference):
 
     def fit(  # type: ignore[override]
         self,
-        batches: Iterable[Any],
+        batches: Iterable[Any] | Callable[[], Iterable[Any]],
         *,
         group: Any = None,
         checkpoint: str | os.PathLike[str] | None = None,
@@ -132,8 +129,9 @@ class StreamedMKCRegression(Inference):
 
         Args:
             batches: yields (X, Y) or (X, Y, weight) in every pass: a DataLoader, a list, :func:`from_memmap`,
-                :func:`from_parquet`. X is (N, n) with Y (N,), or (N, m, n) with (N, m), as tensors or arrays. The order
-                of rows may change from pass to pass, the rows may not. In a process group, this rank's batches.
+                :func:`from_parquet`, or a function without arguments that returns an iterator. X is (N, n) with Y (N,),
+                or (N, m, n) with (N, m), as tensors or arrays. The order of rows may change from pass to pass, the rows
+                may not. In a process group, this rank's batches.
             group: process group of ``torch.distributed``; None takes the default group if it is initialised.
             checkpoint: file to which the state is written after every pass. If it exists, the fit resumes from it; data
                 and parameters must be the same. Only rank 0 reads and writes it.
@@ -148,18 +146,23 @@ class StreamedMKCRegression(Inference):
         """
         ranks = Ranks(group)
         counts = ranks.gathered(lambda: getattr(checked_source(batches), "rows", None))
+        source = checked_source(batches)
         resume_from, self._resume_from = self._resume_from, None
         progress = ranks.from_first(lambda: self._resumed(resume_from, checkpoint))
         if progress is None:
-            progress = self._after_survey(ranks, batches, counts, checkpoint)
+            progress = self._after_survey(ranks, source, counts, checkpoint)
         if progress.phase == "range":
-            progress = self._after_range_pass(ranks, batches, progress, checkpoint)
+            progress = self._after_range_pass(ranks, source, progress, checkpoint)
         while progress.phase != "done":
-            before = progress
-            flat = ranks.sum_of(*_pass(batches, before))
-            progress = self._saved(ranks, lambda: _after(before, flat, self.max_passes), checkpoint)  # noqa: B023
+            before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
+            beta, density, curvature = progress.next_pass()
+            flat = ranks.sum_of(
+                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
+                flat_length(shape, with_curvature=curvature),
+            )
+            progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
         self._single_channel = progress.survey.shape.single_channel
-        found = ranks.from_first(lambda: results(before, progress, Report.of(flat, progress.survey.shape)))
+        found = ranks.from_first(progress.results)
         for name, value in found.items():
             setattr(self, name, value)
         self._name_columns(batches)
@@ -234,9 +237,10 @@ class StreamedMKCRegression(Inference):
         checkpoint: str | os.PathLike[str] | None,
     ) -> StreamProgress:
         """Progress after the first pass."""
-        before = [count for count in counts[: ranks.rank] if count is not None]
-        known = ranks.alone or None not in counts
-        reservoir = Reservoir(self.pilot, self.seed, sum(before) if known else None, ranks.rank)
+        known = [count for count in counts if count is not None]
+        first = sum(known[: ranks.rank]) if ranks.alone or len(known) == len(counts) else None
+        rows = sum(known) if len(known) == len(counts) else None
+        reservoir = Reservoir(self.pilot, self.seed, first, ranks.rank, rows)
         found = ranks.gathered(lambda: survey_rows(batches, reservoir))
         surveys = [survey for survey in found if survey is not None]
         drawn = ranks.gathered(lambda: _likely(reservoir.drawn(), self.pilot, sum(survey.rows for survey in surveys)))
@@ -244,9 +248,7 @@ class StreamedMKCRegression(Inference):
         def begin() -> StreamProgress:
             survey = Survey.of_all(surveys)
             sample = merged([part for part in drawn if part is not None], self.pilot)
-            to_basis = survey.to_coef() if survey.is_ill_conditioned() else None
-            begun = fit_pilot(sample, survey.shape, self._of_sample(), to_basis)
-            return StreamProgress.begin(self._settings(), survey, begun)
+            return StreamProgress.begin(self._settings(), survey, fit_pilot(sample, survey, self._of_sample()))
 
         return self._saved(ranks, begin, checkpoint)
 
@@ -254,7 +256,8 @@ class StreamedMKCRegression(Inference):
         self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
     ) -> StreamProgress:
         """Progress after the pass for the domain."""
-        parts = ranks.gathered(lambda: range_pass(batches, progress.survey.shape, progress.point()))
+        survey, (beta, density, _) = progress.survey, progress.next_pass()
+        parts = ranks.gathered(lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True))
         return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
 
     def _saved(
@@ -284,29 +287,9 @@ class StreamedMKCRegression(Inference):
             self.feature_names_in_ = names
 
 
-def _pass(batches: Iterable[Any], progress: StreamProgress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
-    """The next pass as a function, and the number of sums that it returns."""
-    assert progress.climb is not None
-    shape, point, climb = progress.survey.shape, progress.point(), progress.climb
-    if progress.phase == "report":
-        return lambda: report_pass(batches, shape, point), Report.length(shape)
-    if climb.rough:
-        return lambda: float32_pass(batches, shape, point), StreamSums.length(shape)
-    return lambda: slopes_pass(batches, shape, point, curvature=climb.curvature), StreamSums.length(shape)
-
-
-def _after(progress: StreamProgress, flat: Float64[Tensor, " k"], max_passes: int) -> StreamProgress:
-    """Progress after a pass."""
-    if progress.phase == "report":
-        return progress.after_report(Report.of(flat, progress.survey.shape).slopes, max_passes)
-    return progress.after_slopes(StreamSums.of(flat, progress.survey.shape), max_passes)
-
-
 def _likely(drawn: Drawn | None, size: int, rows: int) -> Drawn | None:
     """Rows of a rank's sample that may be in the sample of all ranks; the others need not be sent."""
     if drawn is None or rows <= size:
         return drawn
-    # the limit is six standard deviations above the expected key; at worst the sample is slightly too small
-    limit = (size + 6.0 * math.sqrt(size)) / rows
-    chosen = drawn.keys < limit
+    chosen = drawn.keys < largest_key(size, rows)
     return Drawn(drawn.keys[chosen], drawn.numbers[chosen], drawn.rows[chosen])

@@ -1,4 +1,4 @@
-"""Compile the kernels of the losses for a GPU, on a machine with or without a GPU.
+"""Compile the kernels of the losses and of large fits for a GPU, on a machine with or without a GPU.
 
     python -m tests.losses.kernels.compilation
 
@@ -19,6 +19,8 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
+from mkc_torch.linear._blocks import Density
+from mkc_torch.linear._fused_pass import fused_pass
 from mkc_torch.losses.kernels.cached import CachedKernel
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -90,6 +92,16 @@ def training_steps() -> Iterator[str]:
     yield labels("bfloat16, weighted, many rows", (3000, 10), torch.bfloat16, weighted=True)
     yield labels("float16, many classes", (2, 5000), torch.float16)
     yield labels("float64, each", (16, 3), torch.float64, reduction="none")
+
+    def rows(name: str, dtype: torch.dtype, columns: int, *, curvature: bool) -> str:
+        X, density = torch.ones(4096, columns, dtype=dtype), Density(*torch.ones(2, 1, dtype=torch.float64))
+        y, beta = torch.ones(4096, dtype=dtype), torch.ones(columns, dtype=torch.float64)
+        fused_pass(X, y, y, beta, density, with_curvature=curvature, weights=y[:, None].clone())
+        return f"rows, {name}"
+
+    yield rows("float32, nine columns", torch.float32, 9, curvature=False)
+    yield rows("float64, nine columns, curvature", torch.float64, 9, curvature=True)
+    yield rows("float32, 32 columns, curvature", torch.float32, 32, curvature=True)
 
 
 def main() -> None:

@@ -1,0 +1,11 @@
+"""The tolerance of the rank test."""
+
+import torch
+
+from mkc_torch.linear._rank import rank_tolerance
+
+
+def test_many_rows_of_float32_are_not_refused_for_their_number():
+    assert rank_tolerance(10_000_000, 9, torch.float32) < 1e-2
+    assert rank_tolerance(500, 9, torch.float64) == 500 * torch.finfo(torch.float64).eps
+    assert rank_tolerance(5, 9, torch.float64) == 9 * torch.finfo(torch.float64).eps
