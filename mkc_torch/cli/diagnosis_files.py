@@ -1,4 +1,4 @@
-"""Diagnose a file and write the results, for `mkc diagnose` and `mkc challenge`."""
+"""Diagnose a file and write the results, for `mkc diagnose`."""
 
 from __future__ import annotations
 
