@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mkc_torch.density._normalizer_of_few import is_few, log_partition_and_slopes
+from mkc_torch.density._numpy_normalizer import is_few, log_partition_and_slopes
 from mkc_torch.density.energy import energy
 from mkc_torch.density.head import HEAD_TOLERANCE, head_rule_constants
 from mkc_torch.density.normalizer import _log_partition_and_slopes, log_partition

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
+from mkc_torch.density.energy import curve_array, energy_array
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -18,9 +19,6 @@ __all__ = ["is_few", "log_partition_and_slopes"]
 
 _FEW = 64
 """Channels up to which NumPy is faster than torch."""
-
-_SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
-"""Coefficients of ``(1 - exp(-x) (1 + x)) / x²``, accurate to all digits for x below 0.05."""
 
 
 def is_few(*values: Tensor) -> bool:
@@ -55,24 +53,11 @@ def log_partition_and_slopes(
     q = 0.5 * (end * nodes) ** 2
     own = kappa[..., None]
     x = own * q
-    density = np.exp(-_energy(q, x, own))
-    small = x < 0.05
-    direct = np.where(small, 1.0, x)
-    curve = (1.0 - np.exp(-direct) * (1.0 + direct)) / direct**2
-    if small.any():
-        near = np.where(small, x, 0.0)
-        series = _SERIES[-1]
-        for coefficient in _SERIES[-2::-1]:
-            series = coefficient + near * series
-        curve = np.where(small, series, curve)
+    density = np.exp(-energy_array(q, x, own))
+    curve = curve_array(x)
     z = 2.0 * length * tail + (share * (density - tail[..., None])).sum(-1)
     slope = tail / safe**2
     by_kappa = (2.0 * length * slope + (share * (q * q * curve * density - slope[..., None])).sum(-1)) / z
     half = 0.5 * length * length
-    by_length = 2.0 * np.exp(-_energy(half, kappa * half, kappa)) / z
+    by_length = 2.0 * np.exp(-energy_array(half, kappa * half, kappa)) / z
     return np.log(z), by_kappa, by_length
-
-
-def _energy(q: ndarray, x: ndarray, kappa: ndarray) -> ndarray:
-    """``(1 - exp(-x)) / kappa`` with ``x = kappa q``; q where x is 0."""
-    return np.where(x > 0, -np.expm1(-x) / np.where(kappa > 0, kappa, 1.0), q)
