@@ -5,7 +5,7 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.recording.formats.base import RecordingError
-from mkc_torch.recording.together import join_recordings
+from mkc_torch.recording.join_recordings import join_recordings
 
 
 def run(begin, name, count=4, step=0.1, **more):
