@@ -32,7 +32,7 @@ from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["REQUIRED_COLUMNS", "LoadedTable", "read_file", "reading_of"]
+__all__ = ["REQUIRED_COLUMNS", "LoadedTable", "load_table", "read_file"]
 
 REQUIRED_COLUMNS = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Required columns: text in any of them is an error."""
@@ -90,10 +90,10 @@ def read_file(
     topics = read_topics(path) if topics is None else topics
     if recognise and not set(_MAG) & set(columns or {}):
         topics = with_row_sensors(topics)
-    return reading_of(path, topics, required, columns=columns, units=units, sensor=sensor, recognise=recognise)
+    return load_table(path, topics, required, columns=columns, units=units, sensor=sensor, recognise=recognise)
 
 
-def reading_of(
+def load_table(
     path: Path,
     topics: Sequence[Topic],
     required: Collection[str],

@@ -20,7 +20,7 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["NAMES", "SelectedResponse", "chosen_response", "rows_of"]
+__all__ = ["NAMES", "SelectedResponse", "rows_of", "select_response"]
 
 _MOST = 3000
 """Most samples of a fit, taken evenly; they determine the offset to a hundredth of the noise, and noise is not what
@@ -60,7 +60,7 @@ class SelectedResponse:
     side_covariance: Float[Tensor, "p p"] | None = None
 
 
-def chosen_response(
+def select_response(
     measured: Float[Tensor, "N 3"],
     turns_at: Callable[[Tensor], Turns],
     taken: Tensor,
