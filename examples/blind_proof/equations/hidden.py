@@ -13,7 +13,7 @@ from examples.blind_proof.draws import choose, happens, log_uniform, uniform
 from examples.blind_proof.equations import flows, forces, transducers
 from examples.blind_proof.equations.forces import bristles, rubber
 from examples.blind_proof.equations.integrate import SystemScene
-from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, SignalChange
 
 Draw = Callable[[Generator, SystemScene], HiddenTerm]
 
@@ -117,16 +117,18 @@ def warm_bias(speed: str) -> Draw:
     return draw
 
 
+def _at_input(scene: SystemScene, name: str, effect: str, form: str, large: float, change: SignalChange) -> HiddenTerm:
+    """Return an effect that changes one input."""
+    changed = transducers.only(scene.plant.inputs.index(name), change)
+    return HiddenTerm(effect, form, (f"input {name}",), large, inputs=changed)
+
+
 def late_actuator(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         pipe = happens(g, 0.5)
         change = transducers.transport if pipe else transducers.lags(4)
-        return HiddenTerm(
-            "input_delay",
-            "transport" if pipe else "four lags in series",
-            (f"input {name}",),
-            0.05 * scene.length,
-            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        return _at_input(
+            scene, name, "input_delay", "transport" if pipe else "four lags in series", 0.05 * scene.length, change
         )
 
     return draw
@@ -134,12 +136,8 @@ def late_actuator(name: str) -> Draw:
 
 def slow_actuator(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        return HiddenTerm(
-            "input_lag",
-            "two lags, of which one is short",
-            (f"input {name}",),
-            0.05 * scene.length,
-            inputs=transducers.only(scene.plant.inputs.index(name), transducers.follower),
+        return _at_input(
+            scene, name, "input_lag", "two lags, of which one is short", 0.05 * scene.length, transducers.follower
         )
 
     return draw
@@ -148,13 +146,7 @@ def slow_actuator(name: str) -> Draw:
 def squared_actuator(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         change = transducers.squared(scene.largest_input(name), uniform(g, 1.8, 2.2))
-        return HiddenTerm(
-            "input_square",
-            "power near the square",
-            (f"input {name}",),
-            1.0,
-            inputs=transducers.only(scene.plant.inputs.index(name), change),
-        )
+        return _at_input(scene, name, "input_square", "power near the square", 1.0, change)
 
     return draw
 
@@ -162,13 +154,7 @@ def squared_actuator(name: str) -> Draw:
 def weak_actuator(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
-        return HiddenTerm(
-            "input_saturation",
-            "smooth limit",
-            (f"input {name}",),
-            2.5,
-            inputs=transducers.only(scene.plant.inputs.index(name), change),
-        )
+        return _at_input(scene, name, "input_saturation", "smooth limit", 2.5, change)
 
     return draw
 
@@ -176,13 +162,7 @@ def weak_actuator(name: str) -> Draw:
 def lapped_valve(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
         change = transducers.soft_gap(scene.largest_input(name))
-        return HiddenTerm(
-            "dead_zone",
-            "smooth overlap",
-            (f"input {name}",),
-            0.4,
-            inputs=transducers.only(scene.plant.inputs.index(name), change),
-        )
+        return _at_input(scene, name, "dead_zone", "smooth overlap", 0.4, change)
 
     return draw
 
@@ -190,13 +170,7 @@ def lapped_valve(name: str) -> Draw:
 def worn_drive(name: str) -> Draw:
     def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
         change = transducers.worn_linkage(scene.largest_input(name))
-        return HiddenTerm(
-            "backlash",
-            "several gaps in series",
-            (f"input {name}",),
-            0.4,
-            inputs=transducers.only(scene.plant.inputs.index(name), change),
-        )
+        return _at_input(scene, name, "backlash", "several gaps in series", 0.4, change)
 
     return draw
 
