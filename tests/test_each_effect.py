@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mkc_torch.challenge.key import canonical
+from examples.blind_proof.key import canonical
 from tests.gate import each_effect
 from tests.gate.each_effect import score_case, strong_cases
 
@@ -52,7 +52,7 @@ def test_the_table_counts_names_and_an_earlier_diagnosis_is_kept(case, tmp_path,
         asked.extend(paths)
         check_score(folder, case.key, "gravity_sag")
 
-    monkeypatch.setattr(each_effect, "diagnose_dynamics", diagnosed)
+    monkeypatch.setattr(each_effect, "diagnose", diagnosed)
     for _ in range(2):
         each_effect.main(["--effects", "gravity_sag", "--per-effect", "1", "--output", str(tmp_path)])
         assert "| gravity_sag | 1 of 1 |" in capsys.readouterr().out

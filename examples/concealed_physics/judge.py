@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mkc_torch.challenge.verdict import StatedCandidate, StatedDiagnosis, stated_diagnosis
+from examples.blind_proof.statements import StatedCandidate, StatedDiagnosis, stated_diagnosis
 
 if TYPE_CHECKING:
-    from known import Expected, Size
+    from examples.concealed_physics.known import Expected, Size
 
 
 def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
         ``right`` and, in ``wrong``, a sentence for each fault.
 
     Example:
-        >>> from known import Expected
+        >>> from examples.concealed_physics.known import Expected
         >>> row = {"verdict": "unfit", "findings": [], "residual_after": {}, "sentences": []}
         >>> judged(row, Expected(verdicts=("adequate",)))
         {'right': False, 'wrong': ['the verdict is unfit, not adequate']}

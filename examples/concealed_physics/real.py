@@ -29,11 +29,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from by_hand import BY_HAND, ByHand
-from judge import judged
-from known import SHARED, Known, cases, data, real
-
-from mkc_torch.challenge.verdict import CLAIMS
+from examples.blind_proof.statements import CLAIMS
+from examples.concealed_physics.by_hand import BY_HAND, ByHand
+from examples.concealed_physics.judge import judged
+from examples.concealed_physics.known import SHARED, Known, cases, data, real
 
 COLUMNS = ("recording", "left out", "claimed", "located", "size", "bias", "open loop", "bound", "CPU, s")
 
@@ -68,7 +67,7 @@ def diagnosed(task: tuple[Known, Path, float]) -> tuple[str, dict[str, Any]]:
     folder = output / re.sub(r"\W", "_", known.name)
     file = folder / "row.json"
     if not file.is_file():
-        from row import write_row
+        from examples.concealed_physics.row import write_row
 
         folder.mkdir(parents=True, exist_ok=True)
         try:

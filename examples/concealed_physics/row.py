@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mkc_torch.challenge.pool import content_of
+from examples.blind_proof.run import content_of
 from mkc_torch.cli.correction import correct, read_correction
 from mkc_torch.cli.diagnosis_files import simulation_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request

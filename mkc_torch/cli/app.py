@@ -11,7 +11,6 @@ from typer.core import TyperGroup
 
 from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
-from mkc_torch.cli.challenge import challenge
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
 from mkc_torch.cli.export import export
@@ -63,7 +62,6 @@ app.command()(calibrate)
 app.command()(apply)
 app.command()(export)
 app.command()(inspect)
-app.command()(challenge)
 app.command()(demo)
 app.command()(new_simulation)
 app.command()(new_effect)

@@ -1,4 +1,4 @@
-"""Correct recordings with a calibration or a model, for `mkc apply` and `mkc challenge`."""
+"""Correct recordings with a calibration or a model, for `mkc apply`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Diagnose a file and write the results, for `mkc diagnose` and `mkc challenge`."""
+"""Diagnose a file and write the results, for `mkc diagnose`."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.io.python_source import SourceError
+from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
-from mkc_torch.recording.together import joint_name
 from mkc_torch.simulation.load import load_simulation, raised_in
 
 if TYPE_CHECKING:

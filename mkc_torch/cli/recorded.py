@@ -8,7 +8,7 @@ from pathlib import Path
 from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Topic
-from mkc_torch.recording.reading import REQUIRED_COLUMNS, LoadedTable, read_file
+from mkc_torch.recording.load import REQUIRED_COLUMNS, LoadedTable, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.row_sensors import with_row_sensors

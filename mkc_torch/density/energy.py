@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,6 +13,7 @@ from mkc_torch._support.arguments import as_numbers, refuse_no_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+    from numpy import ndarray
 
 __all__ = ["KAPPA_MAX", "energy", "inverse_square"]
 
@@ -20,6 +22,9 @@ KAPPA_MAX = 400.0
 
 SIGMA_LEAST = KAPPA_MAX**-0.5 * (1.0 - 1e-5)
 """Smallest ``sigma`` that the normaliser accepts: 0.05 less a tolerance for rounding."""
+
+NEAR = 0.5
+"""``x = kappa z^2 / 2`` below which differences of exponentials lose digits, and series are used."""
 
 _FEW = 4096
 """Elements up to which fewer calls are worth six times the memory."""
@@ -100,12 +105,17 @@ def energy_value(z: Tensor, kappa: Tensor) -> Tensor:
     if not torch.compiler.is_compiling():
         return torch.where(x > 0, -torch.expm1(-x) / divisor, q)
     # compiled code computes expm1 as exp - 1 on some processors, which is 0 for small x
-    small = x < 0.5
-    near = torch.where(small, x, 0.0)
+    small = x < NEAR
+    series = relative_series(torch.where(small, x, 0.0))
+    return torch.where(small, q * series, (1.0 - torch.exp(-x)) / divisor)
+
+
+def relative_series(x: Tensor) -> Tensor:
+    """``(1 - exp(-x)) / x`` for x below ``NEAR``, by its series."""
     series = torch.zeros_like(x)
     for j in range(14, -1, -1):  # sum_j (-x)^j / (j + 1)! in Horner form
-        series = 1.0 / math.factorial(j + 1) - near * series
-    return torch.where(small, q * series, (1.0 - torch.exp(-x)) / divisor)
+        series = 1.0 / math.factorial(j + 1) - x * series
+    return series
 
 
 def energy_dz(z: Tensor, kappa: Tensor) -> Tensor:
@@ -116,7 +126,7 @@ def energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
     """``-(1 - exp(-x) (1 + x)) / kappa^2`` with ``x = kappa z^2 / 2``, smooth at ``kappa = 0`` where it is -z^4/8."""
     q = (0.5 * z * z).clamp(max=torch.finfo(z.dtype).max)  # finite, so that 0 times it is 0
     x = kappa * q
-    small = x < 0.5
+    small = x < NEAR
     near_x = torch.where(small, x, 0.0)
     near = _near(near_x)
     # capped, so that 0 times it stays 0 where kappa = 0 and z² overflows
@@ -177,3 +187,44 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
 def kernel_weight(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """``exp(-kappa z^2 / 2)``: the weight of an error in the fixed point, 1 at ``kappa = 0``."""
     return torch.exp(-0.5 * kappa * z * z)
+
+
+def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
+    x = kappa * q
+    w = torch.exp(-x)
+    divisor = torch.where(kappa > 0, kappa, 1.0)
+    qw = q * w
+    e = -torch.expm1(-x) / divisor
+    first = (e - qw) / divisor
+    second = (2.0 * first - q * qw) / divisor
+    # below this x the differences lose more digits than a series of two terms
+    small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
+    q2 = q * q
+    e = torch.where(small, q - 0.5 * q * x, e)
+    first = torch.where(small, q2 * (0.5 - x / 3.0), first)
+    second = torch.where(small, q * q2 * (1.0 / 3.0 - 0.25 * x), second)
+    return w, e, first, second
+
+
+_CURVE_SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
+"""Coefficients of ``(1 - exp(-x) (1 + x)) / x²``, accurate to all digits for x below 0.05."""
+
+
+def energy_array(q: ndarray, x: ndarray, kappa: ndarray) -> ndarray:
+    """``(1 - exp(-x)) / kappa`` in NumPy with ``x = kappa q``; q where x is 0."""
+    return np.where(x > 0, -np.expm1(-x) / np.where(kappa > 0, kappa, 1.0), q)
+
+
+def curve_array(x: ndarray) -> ndarray:
+    """``(1 - exp(-x) (1 + x)) / x²`` in NumPy, 1/2 at x = 0."""
+    small = x < 0.05
+    direct = np.where(small, 1.0, x)
+    curve = (1.0 - np.exp(-direct) * (1.0 + direct)) / direct**2
+    if small.any():
+        near = np.where(small, x, 0.0)
+        series = _CURVE_SERIES[-1]
+        for coefficient in _CURVE_SERIES[-2::-1]:
+            series = coefficient + near * series
+        curve = np.where(small, series, curve)
+    return curve

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX, energy_value
+from mkc_torch.density.energy import energy_terms as energy_terms  # `linear/` imports it from here
 from mkc_torch.density.head import head_rule, integrate, tail_density
 from mkc_torch.density.normalizer import log_partition_value
 
@@ -40,24 +41,6 @@ class Derivatives(NamedTuple):
     kappa_kappa: Tensor
     kappa_log_d: Tensor
     log_d_log_d: Tensor
-
-
-def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
-    x = kappa * q
-    w = torch.exp(-x)
-    divisor = torch.where(kappa > 0, kappa, 1.0)
-    qw = q * w
-    e = -torch.expm1(-x) / divisor
-    first = (e - qw) / divisor
-    second = (2.0 * first - q * qw) / divisor
-    # below this x the differences lose more digits than a series of two terms
-    small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
-    q2 = q * q
-    e = torch.where(small, q - 0.5 * q * x, e)
-    first = torch.where(small, q2 * (0.5 - x / 3.0), first)
-    second = torch.where(small, q * q2 * (1.0 / 3.0 - 0.25 * x), second)
-    return w, e, first, second
 
 
 def _mean(values: Tensor, weight: Tensor | None) -> Tensor:

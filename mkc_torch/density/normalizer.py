@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_no_tensor, refuse_out_of_range
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.density._normalizer_of_few import is_few, log_partition_and_slopes
+from mkc_torch.density._numpy_normalizer import is_few, log_partition_and_slopes
 from mkc_torch.density.energy import energy, energy_dkappa, energy_value
 from mkc_torch.density.head import HEAD_TOLERANCE, head_rule, head_rule_constants, integrate, tail_density
 from mkc_torch.density.head_table import look_up, reaches_beyond_head

@@ -8,8 +8,8 @@ import torch
 
 from mkc_torch._support.arrays import is_frame
 from mkc_torch.recording.given_columns import EXPERIMENT
+from mkc_torch.recording.join_recordings import Clock, join_recordings, recording_names
 from mkc_torch.recording.recording import Recording
-from mkc_torch.recording.together import Clock, join_recordings, recording_names
 from mkc_torch.simulation.dynamics.own_offsets import with_own_offsets as with_offsets_of_sensors
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.paired import Paired

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from mkc_torch.density.energy import KAPPA_MAX
-from mkc_torch.lightning._pace import Guide, set_pace
+from mkc_torch.lightning._schedule_pace import Guide, set_pace
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
 from mkc_torch.losses.mkc import MKCLoss
 

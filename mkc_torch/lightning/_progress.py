@@ -10,7 +10,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from mkc_torch.lightning._owned import OwnedLoss
-from mkc_torch.lightning._pace import Guide
+from mkc_torch.lightning._schedule_pace import Guide
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
 from mkc_torch.losses.mkc import MKCLoss
 

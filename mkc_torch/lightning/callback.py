@@ -16,8 +16,8 @@ from mkc_torch._support.arguments import checked_number, format_value, refuse_ot
 from mkc_torch.density.expectation_step import damped, damped_kappa, expectation_step
 from mkc_torch.functional import mkc_nll
 from mkc_torch.lightning._owned import SIGMA_CAP, OwnedLoss
-from mkc_torch.lightning._pace import Guide
 from mkc_torch.lightning._progress import MIN_RESIDUALS, Progress
+from mkc_torch.lightning._schedule_pace import Guide
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
 from mkc_torch.losses.mkc import MKCLoss
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_no_tensor, refuse_not_real
+from mkc_torch.density.energy import NEAR, relative_series
 from mkc_torch.losses._checks import Reduction, at_least_float32, refuse_other_reduction
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
 from mkc_torch.losses._label_curves import LabelCurves
@@ -278,15 +279,10 @@ def _faded(deviance: Tensor, kappa: Tensor) -> Tensor:
     """``(1 - exp(-kappa l)) / kappa`` of the cross-entropy l, exactly l at kappa = 0."""
     own = torch.where(kappa > 0, kappa, 1.0)
     x = own * deviance
-    small = x < 0.5
+    small = x < NEAR
     near = torch.where(small, x, 0.0)
-    if torch.compiler.is_compiling():  # compiled expm1 is exp - 1 on some processors, which is 0 for small x
-        series = torch.zeros_like(x)
-        for j in range(14, -1, -1):  # sum_j (-x)^j / (j + 1)! in Horner form
-            series = 1.0 / math.factorial(j + 1) - near * series
-        head = near * series
-    else:
-        head = -torch.expm1(-near)
+    # compiled expm1 is exp - 1 on some processors, which is 0 for small x
+    head = near * relative_series(near) if torch.compiler.is_compiling() else -torch.expm1(-near)
     # expm1 alone would lose the gradient at large x, exp alone the value at small x
     far = 1.0 - torch.exp(-torch.where(small, 1.0, x))
     return torch.where(kappa > 0, torch.where(small, head, far) / own, deviance)

@@ -18,9 +18,9 @@ from mkc_torch.recording.conversions import DEFAULT_UNITS
 from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, counted, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
-from mkc_torch.recording.reading import REQUIRED_COLUMNS, read_file, reading_of
+from mkc_torch.recording.load import REQUIRED_COLUMNS, load_table, read_file
+from mkc_torch.recording.preview import TablePreview
 from mkc_torch.recording.row_sensors import with_row_sensors
-from mkc_torch.recording.shown import TablePreview
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -166,7 +166,7 @@ class Recording(TablePreview):
         topics = [Topic("", table_of_frame(frame, name))]
         if recognise:
             topics = with_row_sensors(topics)
-        found = reading_of(
+        found = load_table(
             Path(name or "the frame"),
             topics,
             REQUIRED_COLUMNS,

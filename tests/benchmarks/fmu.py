@@ -1,4 +1,4 @@
-"""Diagnose with the nominal models of the challenge twice: in PyTorch, and as FMUs that are compiled here.
+"""Diagnose with the nominal models of the blind proof twice: in PyTorch, and as FMUs that are compiled here.
 
     python -m tests.benchmarks.fmu --recordings 60
 
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import torch
 
+from examples.blind_proof.equations import models
 from mkc_torch import Diagnosis, diagnose
-from mkc_torch.challenge.dynamics import generator, nominal_models
 from mkc_torch.simulation import Dynamics, Parameter, Simulation, load_fmu
 from tests.simulation.fmu.made import Model, make_fmu
 
@@ -51,15 +51,15 @@ RATES: Mapping[str, Mapping[str, str]] = {
         "temperature_2": "gain_2*heater_2 - loss_2*(temperature_2 - room)",
     },
 }
-"""The equations of ``mkc_torch.challenge.dynamics.nominal_models``, as texts."""
+"""The equations of ``examples.blind_proof.equations.models``, as texts."""
 
 NOMINAL: Mapping[str, type[Dynamics]] = {
-    "pendulum": nominal_models.Pendulum,
-    "cart_pole": nominal_models.CartPole,
-    "tanks": nominal_models.Tanks,
-    "motor": nominal_models.Motor,
-    "projectile": nominal_models.Projectile,
-    "thermal": nominal_models.Thermal,
+    "pendulum": models.Pendulum,
+    "cart_pole": models.CartPole,
+    "tanks": models.Tanks,
+    "motor": models.Motor,
+    "projectile": models.Projectile,
+    "thermal": models.Thermal,
 }
 
 

@@ -23,7 +23,7 @@ def reads(monkeypatch):
         found.append(path.name)
         return read_topics(path)
 
-    for module in ("cli.calibration_files", "cli.recorded", "recording.reading"):
+    for module in ("cli.calibration_files", "cli.recorded", "recording.load"):
         monkeypatch.setattr(f"mkc_torch.{module}.read_topics", counted)
     return found
 

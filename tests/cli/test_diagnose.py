@@ -1,7 +1,6 @@
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -426,52 +425,6 @@ def test_a_process_that_dies_is_reported(tmp_path):
     (outcome,) = _waited_for(died, tmp_path / "a.csv")
     assert outcome.failed
     assert "the process ended" in outcome.text
-
-
-@pytest.mark.e2e
-def test_challenge(tmp_path):
-    folder = tmp_path / "proof"
-    command = ("challenge", "--cases", 1, "--empty", 1, "--seed", 4, "--duration", 15, "--workers", 1)
-    result = mkc(*command, "--output", folder)
-    assert result.exit_code == 0, result.output
-    for words in ("Blind proof: 2 recordings, hidden physics in 1", "false alarms"):
-        assert words in result.stdout
-    assert str(folder / "challenge.html") in result.stdout
-    flat = " ".join(result.stdout.split())
-    assert re.search(r"at most 7 % false alarms \d+\.0 % (yes|no) ", flat)
-    assert "Empty recordings, at least 400 at level 0.05 1 too few" in flat
-    assert "Too few recordings (1 of at least 400 and" in flat
-    assert " % |" in (folder / "summary.md").read_text(encoding="utf-8")
-    assert "failed none" in " ".join(result.stdout.split())
-    record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
-    assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 4)
-    made = sorted(path.name for path in (folder / "diagnoses").iterdir())
-    assert made == ["case_00000", "case_00001"]
-    assert sorted(p.name for p in (folder / "diagnoses" / "case_00000").iterdir()) == ["diagnosis.json", "model.json"]
-    refused(mkc(*command, "--output", folder), "not empty", "--force")
-
-
-def test_challenge_of_nothing_is_refused(tmp_path):
-    refused(mkc("challenge", "--cases", 0, "--output", tmp_path / "a"), "both 0", code=2)
-    assert not (tmp_path / "a").exists()
-
-
-def test_a_length_is_refused_where_each_system_has_its_own(tmp_path):
-    command = ("challenge", "--family", "dynamics", "--duration", 20, "--output", tmp_path / "a")
-    refused(mkc(*command), "each system has a length of its own", code=2)
-    refused(mkc("challenge", "--family", "weather", "--output", tmp_path / "a"), "magnetometer", "dynamics", code=2)
-    assert not (tmp_path / "a").exists()
-
-
-def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
-    from mkc_torch.cli.challenge_jobs import diagnose_unseen
-
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "diagnosis.json").write_text("{}")
-    path = table(tmp_path / "a.csv", {name: values[:20] for name, values in sensor(QUIET).items()})
-    diagnose_unseen([path], tmp_path)
-    assert not (tmp_path / "a" / "diagnosis.json").exists()
-    assert "too few" in (tmp_path / "a.error.txt").read_text(encoding="utf-8")
 
 
 def test_commands_that_draw_nothing_import_no_pictures():

@@ -268,7 +268,6 @@ def test_a_full_disk_names_the_file(good, tmp_path, monkeypatch):
             for line in (
                 "demo --output {out}",
                 "diagnose {good} --simulation magnetometer --output {out}",
-                "challenge --cases 0 --empty 1 --duration 10 --workers 1 --output {out}",
             )
         ),
     ],

@@ -35,7 +35,7 @@ def answered(*arguments):
     )
 
 
-@pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("challenge",), ("demo",)])
+@pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("demo",)])
 def test_help_comes_without_what_computes(command):
     done = answered(*command, "--help")
     assert (done.returncode, done.stderr) == (0, "")

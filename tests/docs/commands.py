@@ -15,6 +15,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from examples.blind_proof import __main__ as proof
 from mkc_torch.cli.app import app
 from tests.docs.pages import ROOT
 
@@ -23,31 +24,15 @@ MKC = typer.main.get_command(app).commands
 BUILD = ("--config-file", ".zensical.toml")
 """Options of the build of the site, in addition to ``--strict``."""
 
+PROOF = "--cases 0 --empty 1 --workers 1 --seed 1"
+
 SMALL = {
-    "mkc challenge --scenarios --family dynamics --only coloured --only pushed_white --only gusts --only slow_sensor "
-    "--per-scenario 12 --hidden-per-scenario 4 --seed 27182 --workers 1 --output four": (
-        "--help"  # the commands below run its parts
-    ),
-    "mkc challenge --scenarios --family dynamics --only slow_sensor --only lasting_push --only lasting_push_runs "
-    "--only useless --per-scenario 6 --hidden-per-scenario 6 --seed 6161 --workers 1 --output newer": "--help",
-    "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
-    "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
-    "mkc challenge --scenarios --output scenarios": (
-        "--per-scenario 1 --hidden-per-scenario 0 --only white --duration 15 --workers 1"
-    ),
-    "mkc challenge --scenarios --family dynamics --output scenarios_of_dynamics": (
-        "--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"
-    ),
-    "mkc challenge --scenarios --family dynamics --per-scenario 15 --hidden-per-scenario 8 --seed 8608 "
-    "--output scenarios": ("--per-scenario 1 --hidden-per-scenario 0 --only white --workers 1"),
-    "mkc challenge --scenarios --family magnetometer --per-scenario 15 --hidden-per-scenario 5 --seed 7302 "
-    "--output scenarios_of_sensors": "--per-scenario 1 --hidden-per-scenario 0 --only white --duration 15 --workers 1",
-    "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
-    "mkc challenge --family dynamics --seed 7741 --workers 2 --output proof_of_dynamics": (
-        "--seed 1 --cases 0 --empty 1 --workers 1"
-    ),
+    "magnetometer": f"{PROOF} --duration 10",
+    "equations": PROOF,
+    "magnetometer_scenarios": f"{PROOF} --only white --duration 15",
+    "equations_scenarios": f"{PROOF} --only white",
 }
-"""Commands that take minutes or longer, and the options that the tests add to make them small."""
+"""Small runs of each kind of blind proof; the shown runs take hours."""
 
 EXAMPLES = {
     "examples/paper/density.py": "",
@@ -123,6 +108,10 @@ def run(words: list[str], folder: Path) -> None:
             pass  # .ci/run runs the tests
         case ["mkc", *arguments]:
             run_mkc(arguments)
+        case ["python", "-m", "examples.blind_proof", *arguments]:
+            run_proof(arguments, folder)
+        case ["python", "-m", module, *arguments] if module.startswith("examples."):
+            run_example(script_of(module), arguments, folder)
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
         case ["python", "-m", module, *_] if module.startswith(
@@ -153,13 +142,18 @@ def run(words: list[str], folder: Path) -> None:
 
 def run_mkc(arguments: list[str]) -> None:
     """Run the command `mkc` in this process."""
-    small = SMALL.get(shlex.join(["mkc", *arguments]), "").split()
-    result = CliRunner().invoke(app, [*arguments, *small])
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, f"mkc {shlex.join(arguments)}:\n{result.output}\n{result.exception!r}"
-    if (
-        arguments[0] == "challenge" and "--help" not in small
-    ):  # a recording that could not be diagnosed only counts against the proof
-        assert re.search(r"^failed +none", result.output, re.MULTILINE), result.output
+
+
+def run_proof(arguments: list[str], folder: Path) -> None:
+    """Run a small blind proof of the same kind; a recording that could not be diagnosed is a failure."""
+    options = proof.parser().parse_args(arguments)
+    assert proof.KINDS[options.kind](10.0).only(options.only).scenarios
+    place = folder / f"small_{options.output.name}"
+    small = [options.kind, *SMALL[options.kind].split(), "--output", str(place), "--force"]
+    assert proof.main(small) == 0
+    assert not list((place / "diagnoses").glob("*.error.txt"))
 
 
 def run_example(script: str, arguments: list[str], folder: Path) -> None:
@@ -186,6 +180,12 @@ def run_example(script: str, arguments: list[str], folder: Path) -> None:
                 if Path(getattr(sys.modules[name], "__file__", None) or "").parent == (ROOT / script).parent:
                     del sys.modules[name]
     assert not code, f"{script} ended with {code}"
+
+
+def script_of(module: str) -> str:
+    """The file that `python -m` runs for a module or package of the examples."""
+    place = module.replace(".", "/")
+    return f"{place}/__main__.py" if (ROOT / place).is_dir() else f"{place}.py"
 
 
 def example_options(script: str) -> set[str]:

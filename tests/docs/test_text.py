@@ -10,7 +10,7 @@ pytest.importorskip("lightning")
 pytest.importorskip("typer")
 
 from mkc_torch.effects import CATALOGUE
-from tests.docs.commands import MKC, check_install, example_options, mkc_options
+from tests.docs.commands import MKC, check_install, example_options, mkc_options, script_of
 from tests.docs.pages import PAGES, README, ROOT, anchors, blocks, inline, links, prose
 
 MANUAL = {
@@ -52,7 +52,7 @@ def test_the_second_block_of_the_readme_runs_the_tests():
     assert found.strip() == [block.text for block in blocks(README) if block.language == "sh"][1]
     assert found.strip().endswith(".venv/bin/python -m pytest -q -n auto")
     assert "bash -euo pipefail -c \"$test_command -m 'not slow' --dist loadscope\"\n" in script
-    assert "python -m pytest -q -n auto --doctest-modules mkc_torch\n" in script
+    assert "python -m pytest -q -n auto --doctest-modules mkc_torch examples/blind_proof\n" in script
 
 
 def test_the_readme_leads_to_every_page():
@@ -86,7 +86,9 @@ def test_names_exist(page):
 @each_page
 def test_commands_named_in_a_sentence_exist(page):
     known = COMMON.union(*(mkc_options(command) for command in MKC))
-    scripts = {word for block in blocks(page) for word in re.findall(r"examples/\S+\.py", block.text)}
+    texts = [block.text for block in blocks(page)]
+    scripts = {word for text in texts for word in re.findall(r"examples/\S+\.py", text)}
+    scripts |= {script_of(word) for text in texts for word in re.findall(r"python -m (examples[.\w]+)", text)}
     known = known.union(*(example_options(script) for script in scripts))
     for text in inline(page):
         words = text.split()

@@ -3,7 +3,6 @@
 import importlib
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,11 +17,8 @@ ROCKET = "real rocket juno Rocket"
 
 
 @pytest.fixture
-def load(monkeypatch):
-    monkeypatch.syspath_prepend(FOLDER)
-    for name in ("real", "known", "by_hand", "judge", "row"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    return importlib.import_module
+def load():
+    return lambda name: importlib.import_module(f"examples.concealed_physics.{name}")
 
 
 def row(**changes):

@@ -8,18 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from examples.blind_proof.diagnose import request_for
+from examples.blind_proof.equations.cases import equations
+from examples.blind_proof.equations.scenarios import equations_scenarios
+from examples.blind_proof.key import Key
+from examples.blind_proof.magnetometer.cases import magnetometer
+from examples.blind_proof.magnetometer.scenarios import magnetometer_scenarios
+from examples.blind_proof.proof import Case, Proof
+from examples.blind_proof.run import Pool, every, silent
+from examples.blind_proof.score import ProofScore, Score, score_proof
+from examples.blind_proof.scored_case import ScoredCase, scored
 from mkc_torch._support.files import write_atomically
-from mkc_torch.challenge.dynamics.scenarios import dynamics_scenarios
-from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
-from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.magnetometer.scenarios import magnetometer_scenarios
-from mkc_torch.challenge.magnetometer.subject import magnetometer
-from mkc_torch.challenge.pool import Pool, every, silent
-from mkc_torch.challenge.scenario import ScenarioCase, ScenarioKey, Scenarios
-from mkc_torch.challenge.scenarios.score import score_scenarios
-from mkc_torch.challenge.score import score
-from mkc_torch.challenge.subject import Case
-from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 from mkc_torch.recording.recording import write_table
 from tests.gate.work import Job
 
@@ -57,8 +56,7 @@ class _Address:
     """A recording to be drawn: its name in the run, and the function that draws it."""
 
     name: str
-    draw: Callable[[], Case | ScenarioCase]
-    simulation: str = ""
+    draw: Callable[[], Case]
 
 
 def all_scenarios(
@@ -70,30 +68,30 @@ def all_scenarios(
     hidden: int = HIDDEN_PER_SCENARIO,
 ) -> Iterator[Drawn]:
     """Draw the scenarios of both families; only recordings whose name contains ``match``."""
-    for family in (dynamics_scenarios(), magnetometer_scenarios()):
+    for family, proof in (("dynamics", equations_scenarios()), ("magnetometer", magnetometer_scenarios())):
         addresses = [
             # a unique number for each recording, part of its file name
             _Address(name, partial(scenario.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
-            for place, scenario in enumerate(family.scenarios)
+            for place, scenario in enumerate(proof.scenarios)
             for hides, total in ((False, empty), (True, scenario.hidden(empty, hidden)))
             for index in range(total)
-            if match in (name := f"scenario {family.family} {scenario.name} {'hidden' if hides else 'empty'} {index}")
+            if match in (name := f"scenario {family} {scenario.name} {'hidden' if hides else 'empty'} {index}")
         ]
-        yield _of_scenarios(family, *_written(addresses, output / "drawn" / f"scenarios_{family.family}", workers))
+        yield _of_scenarios(proof, *_written(addresses, output / "drawn" / f"scenarios_{family}", workers))
 
 
 def both_proofs(
     output: Path, *, match: str = "", workers: int = 1, sizes: Mapping[str, int] = PER_PROOF
 ) -> Iterator[Drawn]:
     """Draw both proofs; only recordings whose name contains ``match``."""
-    for subject in (magnetometer(), dynamics()):
-        size, text = sizes[subject.name], subject.simulations.read_text(encoding="utf-8") if subject.simulations else ""
+    for family, proof in (("magnetometer", magnetometer()), ("dynamics", equations())):
+        (scenario,), size = proof.scenarios, sizes[family]
         addresses = [
-            _Address(name, partial(subject.draw, SEED, index, index >= size), text)
+            _Address(name, partial(scenario.draw, SEED, index, index < size, index))
             for index in range(2 * size)
-            if match in (name := f"proof {subject.name} {'hidden' if index < size else 'empty'} {index}")
+            if match in (name := f"proof {family} {'hidden' if index < size else 'empty'} {index}")
         ]
-        yield _of_proof(*_written(addresses, output / "drawn" / f"proof_{subject.name}", workers))
+        yield _of_proof(*_written(addresses, output / "drawn" / f"proof_{family}", workers))
 
 
 def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple[list[Job], dict[str, Any]]:
@@ -104,22 +102,24 @@ def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple
     return [job for job, _ in drawn], {job.name: key for job, key in drawn}
 
 
-def _write(folder: Path, address: _Address) -> tuple[Job, Key | ScenarioKey]:
+def _write(folder: Path, address: _Address) -> tuple[Job, Key]:
     case = address.draw()
     recording = folder / f"{case.key.name}.csv"
     write_table(recording, case.recording.columns, overwrite=True)
-    simulation = case.simulation if isinstance(case, ScenarioCase) else address.simulation
-    return Job(address.name, recording, _request(recording, simulation)), case.key
+    simulation = recording.with_suffix(".py")
+    if case.simulation:
+        write_atomically(simulation, case.simulation, overwrite=True)
+    return Job(address.name, recording, request_for(recording, simulation)), case.key
 
 
-def _of_scenarios(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, ScenarioKey]) -> Drawn:
-    def scored(rows: Rows) -> Any:
-        return score_scenarios(family, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
+def _of_scenarios(proof: Proof, jobs: Sequence[Job], keys: Mapping[str, Key]) -> Drawn:
+    def scored_rows(rows: Rows) -> ProofScore:
+        return score_proof(proof, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
 
     def counts(rows: Rows) -> dict[str, str]:
-        found = scored(rows)
-        total, cases = found.total, found.cases
-        apart = {scenario.name for scenario in family.scenarios if scenario.apart}
+        found = scored_rows(rows)
+        shares, cases = found.total.shares, found.cases
+        apart = {scenario.name for scenario in proof.scenarios if scenario.apart}
         together = [case for case in cases if case.key.scenario not in apart]
         empty, useless = [case for case in together if not case.hides], [case for case in cases if case.key.useless]
         of_apart = [case for case in cases if case.key.scenario in apart]
@@ -127,59 +127,53 @@ def _of_scenarios(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, Sce
         return {
             "false alarms": f"{sum(case.stated.alarm for case in empty)}/{len(empty)}",
             **({"a wrong single name in one run": counted_apart} if of_apart else {}),
-            "strong named": f"{total.named.count}/{total.named.total}",
-            "strong named wrong": f"{total.wrong.count}/{total.wrong.total}",
+            "strong named": f"{shares['named'].count}/{shares['named'].total}",
+            "strong named wrong": f"{shares['wrong'].count}/{shares['wrong'].total}",
             "useless unfit": f"{sum(case.stated.verdict == 'unfit' for case in useless)}/{len(useless)}",
-            "useful unfit": f"{total.useful_unfit.count}/{total.useful_unfit.total}",
+            "useful unfit": f"{shares['useful_unfit'].count}/{shares['useful_unfit'].total}",
             "failed": str(sum(case.stated.verdict == "failed" for case in cases)),
         }
 
     def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
-        cases = scored(rows).cases
+        cases = {case.key.name: case for case in scored_rows(rows).cases}
+        found = {name: cases[key.name] for name, key in keys.items()}
         return {
             name: {"named": case.named} if case.hides else {"false_alarm": case.stated.alarm}
-            for name, case in zip(keys, cases, strict=True)
+            for name, case in found.items()
         }
 
-    return Drawn(jobs, {name: _truth(key.key) | _environment(key) for name, key in keys.items()}, counts, outcomes)
+    return Drawn(jobs, {name: _truth(key) | _environment(key) for name, key in keys.items()}, counts, outcomes)
 
 
 def _of_proof(jobs: Sequence[Job], keys: Mapping[str, Key]) -> Drawn:
     names = {name: key.name for name, key in keys.items()}
 
-    def scored(rows: Rows, among: Sequence[str]) -> Any:
-        return score([keys[name] for name in among], _by_key(rows, names), thresholds=())
+    def scored_rows(rows: Rows) -> Score:
+        found = _by_key(rows, names)
+        return Score("proof", [scored(key, found[key.name]) for key in keys.values()])
 
     def counts(rows: Rows) -> dict[str, str]:
-        found = scored(rows, list(keys))
+        found = scored_rows(rows)
+        shares = found.shares
         return {
-            "false alarms": f"{found.false_alarms.count}/{found.false_alarms.total}",
-            "strong named": f"{found.named.count}/{found.named.total}",
+            "false alarms": f"{shares['false_alarms'].count}/{shares['false_alarms'].total}",
+            "strong named": f"{shares['named'].count}/{shares['named'].total}",
             "failed": str(len(found.failed)),
         }
 
     def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
-        outcomes = {}
-        for name, key in keys.items():
-            own = scored(rows, [name])
-            if key.kind == "empty":
-                outcomes[name] = {"false_alarm": bool(own.false_alarms.count)}
-            else:
-                outcomes[name] = {"named": bool(sum(part.named.count for part in own.power_z) or own.doubles[2])}
-        return outcomes
+        cases = dict(zip(keys, scored_rows(rows).cases, strict=True))
+        return {
+            name: {"named": _named(case)} if case.hides else {"false_alarm": case.stated.alarm}
+            for name, case in cases.items()
+        }
 
     return Drawn(jobs, {name: _truth(key) for name, key in keys.items()}, counts, outcomes)
 
 
-def _request(recording: Path, simulation: str) -> Request:
-    """The request with ``simulation``, a source text written next to the recording; empty for the magnetometer."""
-    if not simulation:
-        return Request(simulation=MAGNETOMETER, force=True, report=False)
-    file = recording.with_suffix(".py")
-    write_atomically(file, simulation, overwrite=True)
-    of_a_sensor = recording.stem.startswith("case_")
-    name = "sensor" if of_a_sensor else simulation_class(recording)
-    return Request(simulation=f"{file}:{name}", force=True, report=False)
+def _named(case: ScoredCase) -> bool:
+    """Whether a single effect, or both of two, are named right; an effect outside the catalogue has no name."""
+    return case.named if case.single else case.named_effects == 2
 
 
 def _by_key(rows: Rows, names: Mapping[str, str]) -> dict[str, Mapping[str, Any] | None]:
@@ -192,5 +186,5 @@ def _truth(key: Key) -> dict[str, Any]:
     return {"kind": key.kind, "hidden": effects}
 
 
-def _environment(key: ScenarioKey) -> dict[str, Any]:
+def _environment(key: Key) -> dict[str, Any]:
     return {"disturbance": asdict(key.disturbance) if key.disturbance else None, "useless": key.useless}

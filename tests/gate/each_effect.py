@@ -16,21 +16,18 @@ from pathlib import Path
 
 from torch import Generator
 
-from mkc_torch._support.files import write_atomically
-from mkc_torch.challenge import draws
-from mkc_torch.challenge.dynamics.generator import SYSTEMS, System, case_of
-from mkc_torch.challenge.dynamics.integrate import simulate
-from mkc_torch.challenge.dynamics.oracle import can_be_named, names
-from mkc_torch.challenge.dynamics.scene import SystemScene
-from mkc_torch.challenge.dynamics.subject import dynamics
-from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.pool import content_of
-from mkc_torch.challenge.run import SIMULATIONS
-from mkc_torch.challenge.subject import Case
-from mkc_torch.challenge.thresholds import STRONG_Z
-from mkc_torch.challenge.verdict import named_right, stated_diagnosis
-from mkc_torch.cli.challenge_jobs import diagnose_dynamics
-from mkc_torch.recording.recording import write_table
+from examples.blind_proof import draws
+from examples.blind_proof.aims import STRONG_Z
+from examples.blind_proof.diagnose import diagnose
+from examples.blind_proof.equations.cases import case_of
+from examples.blind_proof.equations.hidden import System
+from examples.blind_proof.equations.integrate import SystemScene, simulate
+from examples.blind_proof.equations.oracle import can_be_named, names
+from examples.blind_proof.equations.systems import SYSTEMS
+from examples.blind_proof.key import Key
+from examples.blind_proof.proof import Case
+from examples.blind_proof.run import SIMULATIONS, content_of, write_case
+from examples.blind_proof.statements import named_right, stated_diagnosis
 
 SEED = 11
 
@@ -91,18 +88,15 @@ def measure(effects: Sequence[str], per_effect: int, seed: int, output: Path, mo
     for effect in effects:
         place = output / effect
         recordings, diagnoses = place / "recordings", place / "diagnoses"
-        for folder in (recordings, diagnoses):
+        for folder in (recordings, diagnoses, place / "second", place / SIMULATIONS):
             folder.mkdir(parents=True, exist_ok=True)
-        source = dynamics().simulations
-        assert source is not None
-        write_atomically(place / SIMULATIONS, source.read_text(encoding="utf-8"), overwrite=True)
         totals[effect] = Counter()
         for _, case in zip(range(per_effect), strong_cases(effect, seed, most), strict=False):
             path = recordings / f"{case.key.name}.csv"
             if not (diagnoses / case.key.name / "diagnosis.json").is_file():
-                write_table(path, case.recording.columns, overwrite=True)
+                write_case(place, case)
                 (diagnoses / case.key.name).mkdir(exist_ok=True)
-                diagnose_dynamics([path], diagnoses)
+                diagnose([path], diagnoses)
             right, text = score_case(case.key, diagnoses)
             totals[effect][right] += 1
             (truth,) = case.key.effects

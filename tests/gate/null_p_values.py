@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from mkc_torch.challenge.binomial import share, uniformity
+from examples.blind_proof.binomial import share, uniformity
 from mkc_torch.recording.recording import Recording
 from tests.gate.null_recordings import KINDS, Spring, recording
 

@@ -10,16 +10,15 @@ import pytest
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from examples.blind_proof.page import proof_page
+from examples.blind_proof.score import ProofScore
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
-from mkc_torch.challenge.page import challenge_page
-from mkc_torch.challenge.scenarios.page import scenarios_page
-from mkc_torch.challenge.score import score
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
-from tests.challenge.scenarios import test_score as scenario_score
-from tests.challenge.test_score import NOTHING, answer, finding, key
+from tests.blind_proof import test_scenarios_score as scenario_score
+from tests.blind_proof.test_score import NOTHING, answer, finding, key, score
 from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -120,10 +119,10 @@ def others():
         calibrate(flat)
     yield "refusal", refusal_report(flat, refused.value)
     keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
-    settings = {"seed": 1, "key_sha256": "0" * 64, "hidden": 3, "empty": 1, LONG: LONG}
+    settings = scenario_score.SETTINGS | {"hidden": 3, LONG: LONG}
     result = score(keys, {"a": answer(finding("hard_iron_step")), "b": NOTHING, "c": answer(finding("offset_drift"))})
-    yield "challenge", challenge_page(result, {LONG: result}, keys, settings)
-    yield "scenarios", scenarios_page(scenario_score.all_kinds(), scenario_score.SETTINGS | {LONG: LONG})
+    yield "proof", proof_page(ProofScore((), result, tuple(result.cases)), {LONG: result}, settings)
+    yield "scenarios", proof_page(scenario_score.all_kinds(), {}, settings)
 
 
 def test_no_other_page_is_wider_than_a_telephone(tmp_path):

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.choose import NAMES, SelectedResponse, rows_of
 from mkc_torch.calibration.aided.evidence import FittedResponse, judged
-from mkc_torch.calibration.aided.lengths import LEVEL, Circle, LengthModel, circle
+from mkc_torch.calibration.aided.length_model import LEVEL, Circle, LengthModel, circle
 from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Model, PlaceField
+from mkc_torch.calibration.aided.select_response import NAMES, SelectedResponse, rows_of
 from mkc_torch.calibration.aided.turns import still
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.nonlinear import NoFitError

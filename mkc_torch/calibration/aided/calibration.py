@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.aided.by_place import chosen_by_place
-from mkc_torch.calibration.aided.choose import SelectedResponse, chosen_response
 from mkc_torch.calibration.aided.evidence import FittedResponse
 from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
-from mkc_torch.calibration.aided.lengths import LengthModel
+from mkc_torch.calibration.aided.length_model import LengthModel
 from mkc_torch.calibration.aided.misfit import robust_size
 from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
 from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, PlaceField
 from mkc_torch.calibration.aided.rotation import from_quaternion
+from mkc_torch.calibration.aided.select_response import SelectedResponse, select_response
 from mkc_torch.calibration.aided.start import offset_by_turns
 from mkc_torch.calibration.aided.turns import Turns, still, turns_of_attitude, turns_of_gyroscope
 from mkc_torch.calibration.aided_result import AidedResult
@@ -126,12 +126,12 @@ def aided_calibration(
     elif by == "attitude":
         whole = turns_of_attitude(usable.stack(*QUATERNION))
         _refuse_other_turns(points[moved], whole.rows(moved), by)
-        chosen = chosen_response(points, lambda _: whole, taken, place=place, upwards=upwards)
+        chosen = select_response(points, lambda _: whole, taken, place=place, upwards=upwards)
     else:
         assert usable.time is not None
         at = partial(turns_of_gyroscope, usable.time, usable.stack(*GYRO), runs)
         _refuse_other_turns(points[moved], at(points.new_zeros(ERRORS)).rows(moved), by)
-        chosen = chosen_response(points, at, taken, place=place, upwards=upwards)
+        chosen = select_response(points, at, taken, place=place, upwards=upwards)
         whole = at(chosen.errors)
     best = chosen.best
     theta, model = best.fit.theta, best.model

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
-from mkc_torch.calibration.aided import choose
+from mkc_torch.calibration.aided import select_response
 from mkc_torch.calibration.aided.mounting import exchanged, mounting
 from mkc_torch.calibration.aided.turns import turns_of_attitude, turns_of_gyroscope
 from mkc_torch.report import calibration_report
@@ -20,9 +20,9 @@ MAG, GYRO, Q = (tuple(f"{name}_{a}" for a in axes) for name, axes in (("mag", "x
 @pytest.fixture(autouse=True, scope="module")
 def few_samples():
     """Fits on a third of the samples, for speed."""
-    kept, choose._MOST = choose._MOST, 1000
+    kept, select_response._MOST = select_response._MOST, 1000
     yield
-    choose._MOST = kept
+    select_response._MOST = kept
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
-from mkc_torch.calibration.aided import by_place, choose, lengths
-from mkc_torch.calibration.aided.lengths import Circle, LengthModel
+from mkc_torch.calibration.aided import by_place, length_model, select_response
+from mkc_torch.calibration.aided.length_model import Circle, LengthModel
 from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.aided.response import PlaceField
 from mkc_torch.report.words.numbers import aided
@@ -20,9 +20,9 @@ GYRO = ("gyro_x", "gyro_y", "gyro_z")
 @pytest.fixture(autouse=True, scope="module")
 def few_samples():
     """Fits on a third of the samples, for speed."""
-    kept, choose._MOST = choose._MOST, 1000
+    kept, select_response._MOST = select_response._MOST, 1000
     yield
-    choose._MOST = kept
+    select_response._MOST = kept
 
 
 def field_of(draw, strength=1.0):
@@ -149,6 +149,6 @@ def test_a_turn_without_tilts_is_equally_likely_on_either_side(rises):
 
 
 def _mirrored(points, rises, place):
-    fitted_model = by_place._model(lengths.circle(points), place, math.copysign(1.0, rises))
+    fitted_model = by_place._model(length_model.circle(points), place, math.copysign(1.0, rises))
     offset = fitted_model.circle.center - math.sin(fitted_model.rises) * fitted_model.scale * fitted_model.circle.axis
     return fitted_model, fitted_model.start(offset, fitted_model.scale * torch.eye(3).double()), points, place

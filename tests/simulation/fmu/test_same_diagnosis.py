@@ -1,4 +1,4 @@
-"""The challenge's nominal models as FMUs: the same equations, and the same diagnoses."""
+"""The blind proof's nominal models as FMUs: the same equations, and the same diagnoses."""
 
 import pytest
 import torch
