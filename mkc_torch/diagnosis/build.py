@@ -40,7 +40,6 @@ from mkc_torch.diagnosis.verdict import (
     verdict_of,
 )
 from mkc_torch.recording.unit_warnings import unit_warnings
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["DiagnosisInputs", "build_diagnosis", "with_search_notes"]
@@ -155,7 +154,7 @@ def _finding(
     if whole.in_short:
         return replace(finding, grade=grade_in_short(finding))
     shape = None
-    if isinstance(whole.final.model.prepared, PreparedDynamics):
+    if whole.final.model.prepared.dynamics is not None:
         shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
     grade = grade_of(finding)
     if shape is not None and shape.curve is not None:

@@ -27,18 +27,16 @@ from mkc_torch.diagnosis.joined import joined, run_counts, with_own_offsets
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.parallel import common_parts
-from mkc_torch.diagnosis.model.process_noise import choose_input_hold, estimate_noise, fit_baseline, open_loop
+from mkc_torch.diagnosis.model.process_noise import choose_input_hold, estimate_noise, fit_baseline, noise_of_fit
 from mkc_torch.diagnosis.partial_diagnosis import cut_short, error_without_fit
 from mkc_torch.diagnosis.partial_result import PartialResult
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.search.own_noise import noise_of_fit
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
 from mkc_torch.diagnosis.verdict import assess_baseline, impossible_rotations
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["diagnose"]
@@ -145,7 +143,7 @@ def diagnose(
         )
     prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
-    fixed = checked_input_hold(input_hold, tuple(getattr(prepared, "input_hold", ())))
+    fixed = checked_input_hold(input_hold, tuple(prepared.input_hold))
     options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
     known = PartialResult(simulation, effects, names, options, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit
@@ -167,10 +165,9 @@ def _diagnosed(
     options = known.options
     declared, fixed, settings = options.declared, options.fixed, options.settings
     generator = torch.Generator().manual_seed(options.seed)
-    if isinstance(prepared, PreparedDynamics):
-        prepared = prepared.with_input_hold(fixed)
-        if options.quick:
-            known.options = options = replace(options, max_findings=min(options.max_findings, 1), judged=False)
+    prepared = prepared.with_input_hold(fixed)
+    if prepared.dynamics is not None and options.quick:
+        known.options = options = replace(options, max_findings=min(options.max_findings, 1), judged=False)
     progress("fitting the simulation alone")
     baseline = fit_baseline(prepared, declared, settings.noise, known.keep_baseline)
     known.baseline = baseline = choose_input_hold(baseline, declared, fixed, settings.noise)
@@ -203,7 +200,7 @@ def _diagnosed(
     if finer is not None:
         return _diagnosed(known.restart(), finer, where, progress)
     known.search, tests = search, known.tests
-    common = [known.simulation, base, base.model, *common_parts(open_loop(base.model.prepared), terms)]
+    common = [known.simulation, base, base.model, *common_parts(base.model.prepared.open_loop(), terms)]
     while search.left:
         case = known.case(search)
         # usually there is no further finding, so compute the evidence ahead

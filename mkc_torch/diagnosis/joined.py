@@ -9,12 +9,8 @@ import torch
 from mkc_torch._support.arrays import is_frame
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
-from mkc_torch.recording.together import Clock, join_recordings, recording_names
-from mkc_torch.simulation.dynamics.own_offsets import with_own_offsets as with_offsets_of_sensors
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.paired import Paired
-from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
-from mkc_torch.simulation.static import PreparedStatic
+from mkc_torch.recording.together import join_recordings, recording_names, refuse_no_recording
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["joined", "run_counts", "with_own_offsets"]
 
@@ -32,7 +28,7 @@ def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -
         return recording, ()
     for number, item in enumerate(recording):
         refuse_no_recording(f"recording[{number}]", item)
-    whole = join_recordings(recording, _clock(simulation))
+    whole = join_recordings(recording, simulation.joint_clock)
     return whole, recording_names(recording) if len(recording) > 1 else ()
 
 
@@ -52,13 +48,4 @@ def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recordin
     counts = torch.tensor(run_counts(recordings))
     of_experiment = torch.arange(len(recordings)).repeat_interleave(counts)
     recording, names = of_experiment[whole[EXPERIMENT].long()], recording_names(recordings)
-    if isinstance(prepared, PreparedDynamics):
-        return with_offsets_of_sensors(prepared, recording, names)
-    return prepared.with_own_offsets(recording, names) if isinstance(prepared, PreparedStatic) else prepared
-
-
-def _clock(simulation: Simulation) -> Clock:
-    """How the times of joined runs relate, so that the simulation keeps the runs apart."""
-    if isinstance(simulation, Paired):  # each sample is compared with what the simulator wrote at its time
-        return "own"
-    return "restart" if getattr(simulation, "joins_experiments", False) else "follow"
+    return prepared.with_own_offsets(recording, names)

@@ -18,7 +18,6 @@ from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.stepwise import StepwiseSearch
 from mkc_torch.diagnosis.stop import Stop
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["cut_short", "error_without_fit"]
 
@@ -89,6 +88,6 @@ def _not_done(known: PartialResult, search: StepwiseSearch, *, judged: bool, lea
         yield "the judgement by unseen blocks"
     if search.found and search.left:
         yield "the search for further findings"
-    if search.found and isinstance(known.base.model.prepared, PreparedDynamics):
+    if search.found and known.base.model.prepared.dynamics is not None:
         yield "the test of the shape of what was found"
     yield "the other tests of evidence"

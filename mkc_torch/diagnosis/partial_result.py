@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.findings.recordings import offsets_of, runs_of
 from mkc_torch.diagnosis.model.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, open_loop
+from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.stepwise import SearchOptions, StepwiseSearch
@@ -84,10 +84,11 @@ class PartialResult:
     def candidates(self) -> tuple[Drivers, tuple[Term, ...]]:
         """The recorded columns that can drive an effect, and the candidates."""
         if self._candidates is None:
-            prepared, settings = open_loop(self.base.model.prepared), self.options.settings
+            prepared, settings = self.base.model.prepared.open_loop(), self.options.settings
             roles = frozenset(role for effect in self.effects for role in effect.roles)
-            measured: frozenset[str] = getattr(self.simulation, "measured", frozenset())
-            found = find_drivers(prepared.recording, self.simulation.columns, settings.drivers, roles, measured)
+            found = find_drivers(
+                prepared.recording, self.simulation.columns, settings.drivers, roles, self.simulation.measured
+            )
             self._candidates = found, candidate_terms(prepared, found.drivers, self.effects)
         return self._candidates
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
 from mkc_torch.diagnosis.findings.disturbances import forcing_of, process_noise_of
-from mkc_torch.diagnosis.findings.reasons import reasons_of, wrong_turns
+from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
 from mkc_torch.diagnosis.result import Finding
 from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["FitAssessment", "assess", "assess_baseline", "impossible_rotations", "noise_environment", "verdict_of"]
 
@@ -55,7 +54,7 @@ def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tup
 
 def impossible_rotations(base: ProcessNoiseFit) -> bool:
     """Whether a search is pointless: the recorded rotations are impossible."""
-    return bool(wrong_turns(base.fit.model.prepared))
+    return bool(base.fit.model.prepared.faults)
 
 
 def assess(
@@ -76,19 +75,19 @@ def assess(
         free = refit_open_loop(final)
         floor = [fit.noise_floor for fit in follows]
         corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared, floor)
-    return FitAssessment(follows, corrected, left, bool(wrong_turns(final.model.prepared)))
+    return FitAssessment(follows, corrected, left, bool(final.model.prepared.faults))
 
 
 def noise_environment(
     base: ProcessNoiseFit, final: FittedModel, known: FitAssessment, *, unfit: bool
 ) -> NoiseEnvironment:
     """Return the goodness of fit and the noise for the report."""
-    prepared = final.model.prepared
+    prepared = final.model.prepared.dynamics
     reasons: tuple[str, ...] = ()
     if unfit:
         fits = [base.fit] if base.free is None else [base.fit, base.free]
         reasons = reasons_of(fits, known.follows)
-    if not isinstance(prepared, PreparedDynamics) or known.noise is None:
+    if prepared is None or known.noise is None:
         return NoiseEnvironment(known.follows, reasons, starts=base.starts)
     model, theta = final.model, final.parameters
     noise = sized_noise(prepared, theta[: model.base], model.changes(theta), model.near, known.noise)

@@ -9,7 +9,7 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits, size_of
 from mkc_torch.simulation import Magnetometer, Static
-from mkc_torch.simulation.protocol import Port
+from mkc_torch.simulation.ports import Port
 from tests.diagnosis.factory import make_follows
 
 N = 4000

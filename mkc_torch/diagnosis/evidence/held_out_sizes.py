@@ -29,13 +29,13 @@ def kept_blocks(
     prepared: PreparedSimulation, models: Sequence[Evidence], blocks: HeldOutBlocks
 ) -> tuple[Bool[Tensor, " N"], list[list[int]]]:
     """Return the samples of blocks in which no model diverges, and each model's diverged blocks, from 0."""
-    known: Tensor | None = getattr(prepared, "measured", None)
+    known = prepared.measured
     count = int(blocks.block.max()) + 1
     kept = torch.ones_like(blocks.block, dtype=torch.bool)
     diverged = []
     for model in models:
         residual = model.residual
-        if known is not None and known.shape == residual.shape:
+        if known.shape == residual.shape:
             reach = _RANGE * (known.amax(0) - known.amin(0))
             out = ~(residual.abs() <= reach) & (reach > 0)
         else:

@@ -55,8 +55,9 @@ def forcing_of(fit: FittedModel, noise: StateSpaceNoise) -> tuple[DisturbanceEst
         fit: gives the trajectory.
         noise: noise model around it.
     """
-    prepared, model = fit.model.prepared, fit.model
-    assert isinstance(prepared, PreparedDynamics)
+    model, prepared = fit.model, fit.model.prepared.dynamics
+    if prepared is None:
+        return ()
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
     courses = disturbance_paths(prepared, theta, changes, model.near, noise.selected)
     states = prepared.trajectory(theta, changes, model.near).states.detach()[prepared.rows]

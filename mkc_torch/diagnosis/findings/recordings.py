@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from mkc_torch.diagnosis.environment import Offset, Run
 from mkc_torch.diagnosis.goodness_of_fit import units_of
 from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 __all__ = ["offsets_of", "runs_of"]
@@ -23,7 +21,7 @@ def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]
         names: of the recordings.
     """
     prepared = final.fit.model.prepared
-    own: tuple[OwnOffset, ...] = getattr(prepared, "own_offsets", ())
+    own = prepared.own_offsets
     units, error = dict(zip(prepared.channels, units_of(prepared), strict=True)), final.standard_error
     row = {name: k for k, name in enumerate(prepared.parameter_names)}
     fitted = {(offset.output, offset.recording): row[offset.name] for offset in own}
@@ -46,14 +44,15 @@ def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence
         names: of the recordings; empty for a single recording.
         counts: number of runs per recording; empty for a single recording.
     """
-    if not isinstance(prepared, PreparedDynamics) or int(prepared.run.max()) < 1:
+    system = prepared.dynamics
+    if system is None or int(system.run.max()) < 1:
         return ()
     if not names:
-        return tuple(Run(0, "", number + 1) for number in range(int(prepared.run.max()) + 1))
+        return tuple(Run(0, "", number + 1) for number in range(int(system.run.max()) + 1))
     each = [
         Run(number, name, run + 1 if count > 1 else 0)
         for number, (name, count) in enumerate(zip(names, counts, strict=True), start=1)
         for run in range(count)
     ]
-    first = (prepared.run.diff(prepend=prepared.run[:1] - 1) != 0).nonzero().flatten()
+    first = (system.run.diff(prepend=system.run[:1] - 1) != 0).nonzero().flatten()
     return tuple(each[int(number)] for number in prepared.recording["experiment"][first])

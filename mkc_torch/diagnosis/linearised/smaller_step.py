@@ -9,7 +9,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 __all__ = ["with_smaller_step"]
 
@@ -20,7 +20,7 @@ NEGLIGIBLE = 1e-3
 """Relative change of every parameter below which the standard errors are not computed."""
 
 
-def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDynamics | None:
+def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedSimulation | None:
     """Return the system with half the step if that moves a parameter by more than half its standard error.
 
     Args:
@@ -31,8 +31,6 @@ def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDyna
         None if the step does not matter, if the user set it, or if it is the smallest.
     """
     known, model = fit.model.prepared, fit.model
-    if not isinstance(known, PreparedDynamics):
-        return None
     finer = known.finer()
     if finer is None:
         return None
@@ -47,4 +45,4 @@ def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDyna
     if not bool((move > NEGLIGIBLE * fit.parameters.abs())[reported].any()):
         return None
     error = estimate(fit, settings).standard_error
-    return finer.observed(None) if bool((move > MOVED_ERRORS * error)[reported].any()) else None
+    return finer.open_loop() if bool((move > MOVED_ERRORS * error)[reported].any()) else None

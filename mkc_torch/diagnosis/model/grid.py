@@ -13,7 +13,8 @@ from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
-from mkc_torch.simulation.protocol import Port, PreparedSimulation, SignalSizes
+from mkc_torch.simulation.ports import Port, SignalSizes
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.model.grid import reach_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.protocol import Change, Nearby
+from mkc_torch.simulation.ports import Change, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -9,7 +9,8 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.simulation.protocol import Port, PreparedSimulation
+from mkc_torch.simulation.ports import Port
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 __all__ = ["Key", "Term", "context_at", "continuous"]
 

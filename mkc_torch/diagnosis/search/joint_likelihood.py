@@ -224,8 +224,9 @@ def joint_likelihood(
 def _scene(
     base: FittedModel, terms: Sequence[Term], tangents: ModelTangents, counts: Tensor
 ) -> _LinearisedRecording | None:
-    prepared, model = base.model.prepared, base.model
-    assert isinstance(prepared, PreparedDynamics)
+    model, prepared = base.model, base.model.prepared.dynamics
+    if prepared is None:
+        return None
     flow = flow_of(prepared, base.parameters[: model.base], model.changes(base.parameters), model.near)
     if flow is None or not all(
         np.isfinite(values).all() for values in (flow.transition, flow.seen, flow.new, flow.shift)

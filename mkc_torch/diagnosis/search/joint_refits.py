@@ -23,7 +23,6 @@ from mkc_torch.diagnosis.search.shape_refinement import refined
 from mkc_torch.diagnosis.search.ties import best_first, in_order
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.protocol import Beginning
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -142,7 +141,7 @@ def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]
 def _first_start(base: FittedModel, away: float) -> list[Start]:
     """Return the initial values as a start if a parameter moved far from them, as a missing effect can cause."""
     prepared = base.model.prepared
-    if not isinstance(prepared, Beginning):
+    if not prepared.beginnings:
         return []
     theta, own = prepared.start(), base.model.base - prepared.beginnings
     sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()

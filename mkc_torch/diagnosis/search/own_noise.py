@@ -6,23 +6,20 @@ from collections.abc import Mapping
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import estimate_noise
+from mkc_torch.diagnosis.model.process_noise import estimate_noise, noise_of_fit
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, noise_of
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["noise_of_fit", "priced", "with_own_noise"]
+__all__ = ["priced", "with_own_noise"]
 
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
     """Return the joint fit of a candidate, with its shape, under the most likely sizes of the remaining noise."""
     noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
-    prepared = fit.model.prepared
-    if noise is None or not isinstance(prepared, PreparedDynamics):
+    if noise is None:
         return shape_fitted(fit)
-    model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+    model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
     try:
         again = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
     except NoFitError:
@@ -32,14 +29,7 @@ def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Se
 
 def priced(fit: FittedModel, settings: Settings) -> float:
     """Return the log-likelihood less the penalty of the disturbances in a fit's noise."""
-    prepared = fit.model.prepared
-    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
+    observer = fit.model.prepared.observer
     return fit.log_likelihood - settings.noise.disturbance_gain * (
         0 if observer is None else len(observer.disturbances)
     )
-
-
-def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """Return the noise model of a fit."""
-    prepared = fit.model.prepared
-    return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None
