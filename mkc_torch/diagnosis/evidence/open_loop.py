@@ -12,8 +12,8 @@ from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out, on_all
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.process_noise import has_process_noise, refit_open_loop
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError

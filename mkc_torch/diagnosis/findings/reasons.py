@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mkc_torch.diagnosis.correcting_model import CorrectingModel
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
-from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
-from mkc_torch.diagnosis.model.term import Term, context_at
+from mkc_torch.diagnosis.model.term import Driver, Term, context_at
+from mkc_torch.diagnosis.result import CorrectingModel
+from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context

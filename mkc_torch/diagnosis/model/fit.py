@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.no_first_fit import no_first_fit
-from mkc_torch.diagnosis.model.parallel import run_parallel
-from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
@@ -33,7 +33,7 @@ __all__ = [
     "choose_input_hold",
     "estimate_noise",
     "first_samples",
-    "fit_baseline",
+    "fit_alone",
     "fit_with_process_noise",
     "has_process_noise",
     "noise_of_fit",
@@ -139,7 +139,7 @@ def estimate_noise(
     )
 
 
-def fit_baseline(
+def fit_alone(
     prepared: PreparedSimulation,
     declared: Mapping[str, float],
     settings: NoiseSettings,

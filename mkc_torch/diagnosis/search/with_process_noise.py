@@ -11,10 +11,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.goodness_of_fit import size_of
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.process_noise import (
     estimate_noise,
     has_process_noise,
@@ -23,17 +21,15 @@ from mkc_torch.diagnosis.model.process_noise import (
     refit_noise,
     refit_open_loop,
 )
-from mkc_torch.diagnosis.model.shaped import shape_fitted
-from mkc_torch.diagnosis.model.term import Key, Term, continuous
-from mkc_torch.diagnosis.search.free_runs import free_runs
+from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
-from mkc_torch.diagnosis.search.linearized import SearchProblem
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
-from mkc_torch.diagnosis.search.quick import price
-from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.own_noise import free_runs, priced, with_own_noise
+from mkc_torch.diagnosis.search.problem import SearchProblem
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.search.ties import in_order
+from mkc_torch.diagnosis.search.significance import price
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
