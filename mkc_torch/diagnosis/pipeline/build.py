@@ -48,6 +48,9 @@ __all__ = [
     "with_search_notes",
 ]
 
+_LOST = -1.0
+"""Smallest explained share of an output in the mean over the outputs."""
+
 
 @dataclass(frozen=True)
 class FitAssessment:
@@ -66,12 +69,15 @@ class FitAssessment:
     lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
-        """Whether the simulation explains too little of the variation, both without and with its findings."""
+        """Whether the simulation explains too little of the variation, both without and with its findings.
+
+        An output that runs away counts against the others: an effect can tie one output to an input, and lose another.
+        """
         if self.lost:
             return True
         if not poor_fits(self.follows, settings.followed):
             return False
-        shares = [pooled(fits) for fits in (self.follows, self.corrected) if fits]
+        shares = [pooled(fits, _LOST) for fits in (self.follows, self.corrected) if fits]
         return not shares or max(shares) < settings.useful
 
 
@@ -335,7 +341,10 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
     if search.given_up:
-        more.append(f"The search for further findings failed. {search.given_up}")
+        more.append(
+            f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
+            "further fit has no finite trajectory. Other physics may be missing too."
+        )
     if search.cut:
         more.append(
             f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "

@@ -12,6 +12,7 @@ import torch
 
 from mkc_torch.diagnosis.evidence.common_cause import course_without, located_cause
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, on_all
+from mkc_torch.diagnosis.findings.finding import ended_shapes
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_noise
@@ -287,7 +288,8 @@ def _in_two_steps(
 ) -> StepwiseSearch:
     """Replace the last finding by a simpler effect and a further finding if the two together score as well.
 
-    A form with more numbers can stand for two effects: friction that falls with speed for dry friction and drag.
+    A form with more numbers can stand for two effects: friction that falls with speed for dry friction and drag. So can
+    a shape parameter that ended at a bound: a power of the speed near 0 for dry friction and drag.
 
     Args:
         before: the search without the last finding.
@@ -299,8 +301,7 @@ def _in_two_steps(
     if options.quick or len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
         return after
     last = after.found[-1]
-    simpler = last.term.effect.reduces_to
-    near = [fit for fit in last.compared if simpler is not None and fit.model.terms[-1].effect.id == simpler.id]
+    near = _simpler_rivals(last)
     if not near:
         return after
     simple = max(near, key=lambda fit: priced(fit, settings))
@@ -322,10 +323,25 @@ def _in_two_steps(
     return both if len(both.found) > len(after.found) else after
 
 
+def _simpler_rivals(last: SearchResult) -> list[FittedModel]:
+    """Return the compared fits of simpler effects that may stand for a part of a finding."""
+    effect, port = last.term.effect, last.term.port
+    if effect.reduces_to is not None:
+        return [fit for fit in last.compared if fit.model.terms[-1].effect.id == effect.reduces_to.id]
+    if not ended_shapes(last.term, last.fit.model.prepared):
+        return []
+    rivals = [fit for fit in last.compared if fit.model.terms[-1].port == port]
+    return [fit for fit in rivals if _numbers(fit) < _numbers(last.fit) and not fit.model.terms[-1].effect.is_curve]
+
+
+def _numbers(fit: FittedModel) -> int:
+    """Number of fitted sizes and shape parameters of the effects."""
+    return fit.model.size + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
+
+
 def _score(fit: FittedModel, settings: Settings) -> float:
     """Log-likelihood less the penalty of the noise, and Schwarz's penalty of the effects' sizes and shapes."""
-    numbers = fit.model.size + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
-    return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * numbers
+    return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * _numbers(fit)
 
 
 def _eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:

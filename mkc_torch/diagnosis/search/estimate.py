@@ -190,9 +190,9 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     step, covariance = found.search.estimate(0, found.series)
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
     if float((step.abs() / error).max()) <= settings.last_step:
-        parameters = parameters - step
         if model.bounds is not None:
-            parameters = parameters.clamp(*model.bounds)
+            step, covariance = within_bounds(parameters, step, covariance, model.bounds)
+        parameters = parameters - step
         residual, nearby = model.answer(parameters)
         # the simulation may have no finite trajectory there
         if bool(residual.isfinite().all()):
@@ -204,6 +204,41 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     return _shapes_free(
         plain.at_least(found.search.doubted_error(0, found.series, settings.doubted_family)), tangents, local
     )
+
+
+def within_bounds(
+    parameters: Float[Tensor, " p"],
+    step: Float[Tensor, " p"],
+    covariance: Float[Tensor, "p p"],
+    bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]],
+) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
+    """Return the step that ends within the bounds, and its covariance.
+
+    A parameter that would leave its range is held at the end of it, and the others take their conditional estimates:
+    cut off alone, it would leave the others at the values that belong to the parameter outside its range.
+
+    Args:
+        parameters: before the step, within the bounds.
+        step: to subtract from the parameters.
+        covariance: of the step.
+        bounds: smallest and largest values.
+    """
+    lower, upper = bounds
+    inside = torch.ones_like(step, dtype=torch.bool)
+    for _ in range(len(step)):
+        ends = parameters - step
+        beyond = torch.maximum(lower - ends, ends - upper).where(inside, ends.new_tensor(-torch.inf))
+        worst = int(beyond.argmax())
+        if float(beyond[worst]) <= 0.0:
+            break
+        inside[worst] = False
+        end = ends[worst].clamp(lower[worst], upper[worst])
+        variance = float(covariance[worst, worst])
+        gain = covariance[:, worst] / variance if variance > 0.0 else torch.zeros_like(step)
+        step = step + gain * (parameters[worst] - end - step[worst])
+        step[worst] = parameters[worst] - end
+        covariance = covariance - gain.unsqueeze(-1) * covariance[worst]
+    return step, covariance
 
 
 def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) -> FinalEstimate:

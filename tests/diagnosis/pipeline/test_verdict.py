@@ -85,6 +85,12 @@ def test_a_poor_fit_is_unfit_whatever_the_residual(findings):
         assert verdict(assessed(LOST, noise=left), *findings, structure=structure, white=white) == "unfit"
 
 
+def test_an_output_that_runs_away_is_unfit_although_another_is_explained():
+    tied, away = make_follows(residual=0.03, explained=0.99), make_follows(residual=0.7, explained=-3.6)
+    assert assessed(LOST, LOST, corrected=(tied, away)).unfit(EvidenceSettings())
+    assert not assessed(LOST, LOST, corrected=(tied, LOST)).unfit(EvidenceSettings())
+
+
 def test_a_single_poor_output_is_not_unfit():
     assert not assessed(FOLLOWING, LOST).unfit(EvidenceSettings())
     assert assessed(LOST, LOST).unfit(EvidenceSettings())
