@@ -101,7 +101,8 @@ def diagnose(
         True
     """
     begin = monotonic()
-    options = SearchOptions(level, surrogates, max_findings, seed, settings, noise or {}, input_hold or {}, quick)
+    declared, holds = {} if noise is None else noise, {} if input_hold is None else input_hold
+    options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, holds, quick)
     problem = prepare(simulation, recording, effects, options, time_limit, progress)
     limit = math.inf if time_limit is None else time_limit
     known = PartialResult(problem)

@@ -66,9 +66,9 @@ class Problem:
     prepared: PreparedSimulation
     effects: tuple[Effect, ...]
     options: SearchOptions
-    recordings: tuple[str, ...] = ()
-    run_counts: tuple[int, ...] = ()
-    progress: Callable[[str], object] = print
+    recordings: tuple[str, ...]
+    run_counts: tuple[int, ...]
+    progress: Callable[[str], object]
 
     @property
     def where(self) -> str:
