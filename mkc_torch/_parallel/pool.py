@@ -23,12 +23,9 @@ from mkc_torch._parallel.deadline import check_deadline, is_limited
 from mkc_torch._parallel.processes import cores
 from mkc_torch._parallel.progress import count, counted, silently
 
-__all__ = ["Serializer", "allow_copies", "shared", "speculative"]
+__all__ = ["Serializer", "allow_copies", "shared"]
 
 T = TypeVar("T")
-
-_SPECULATIVE_NICENESS = 5
-"""Niceness of a copy with speculative work: in competition with other work it gets a quarter of a core."""
 
 _PARENT_DEATH = 1
 """The constant PR_SET_PDEATHSIG of prctl.h."""
@@ -40,7 +37,6 @@ _CHECK_INTERVAL_S = 0.1
 """Seconds between two checks of the deadline while waiting for a copy."""
 
 _copies = 0
-_speculative_copies: list[Future[dict[int, bytes]]] = []
 
 
 def allow_copies(most: int | None = None) -> None:
@@ -71,20 +67,10 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
     check_deadline()
     if len(works) < 2:
         return [work() for work in works]
-    with _running_works(works, min(_copies, len(works) - 1), known, thing=thing) as results:
-        return results()
-
-
-@contextmanager
-def speculative(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> Iterator[Callable[[], list[T]]]:
-    """Start works in copies while this process continues, the last work first; ``known`` as in :func:`shared`.
-
-    Yields a function that returns all results: it does the works that no copy has started, and waits for the others.
-    Without a free core it does all of them. :func:`shared` has priority: these copies run at a lower priority.
-    """
-    busy = sum(not copy.done() for copy in _speculative_copies)
-    with _running_works(works, min(_copies - busy, len(works)), known, ahead=True) as results:
-        yield results
+    parcels, copies = Serializer(known), min(_copies, len(works) - 1)
+    if copies < 1:
+        return [_do(work, parcels, thing) for work in counted(works, len(works), thing)]
+    return _shared_by_copies(works, copies, parcels, thing)
 
 
 class Serializer:
@@ -133,31 +119,20 @@ class _Unpacker(pickle.Unpickler):
         return self._known[pid]
 
 
-@contextmanager
-def _running_works(
-    works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False, thing: str = ""
-) -> Iterator[Callable[[], list[T]]]:
-    """Start works in copies; yields a function that returns all results. All copies are ended on exit."""
-    parcels = Serializer(known)
-    if copies < 1:
-        yield lambda: [_do(work, parcels, thing) for work in counted(works, len(works), thing)]
-        return
+def _shared_by_copies(works: Sequence[Callable[[], T]], copies: int, parcels: Serializer, thing: str) -> list[T]:
+    """Do works in this process and in forked copies, which are all ended on return."""
     # the process that reads a number does that work
     todo, entry = os.pipe()
     # in reverse order: works are sorted by likelihood, and the fit of an unlikely candidate takes longest
     os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in reversed(range(len(works)))))
     os.close(entry)
     before = set(multiprocessing.active_children())
-    task = works, todo, parcels, _SPECULATIVE_NICENESS if ahead else 0
+    task = works, todo, parcels
     pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _initialise_copy, task)
-    begun: list[Future[dict[int, bytes]]] = []
     try:
-        begun += _fork_copies(pool, copies)
-        _speculative_copies.extend(begun if ahead else ())
-        yield lambda: _results(works, parcels, todo, begun, thing)
+        return _results(works, parcels, todo, _fork_copies(pool, copies), thing)
     finally:
         with _uninterrupted():
-            _speculative_copies[:] = [copy for copy in _speculative_copies if copy not in begun]
             for child in set(multiprocessing.active_children()) - before:
                 child.kill()
             pool.shutdown()
@@ -231,15 +206,13 @@ _task: tuple[Sequence[Callable[[], object]], int, Serializer] = ((), 0, Serializ
 """In a copy: the works, the pipe of their numbers, and the serializer of results."""
 
 
-def _initialise_copy(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer, niceness: int) -> None:
+def _initialise_copy(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer) -> None:
     global _task
     _task = works, todo, parcels
     allow_copies(0)
-    _speculative_copies.clear()
     ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
     warnings.simplefilter("ignore")  # another thread may have held the lock of their stream
     gc.disable()
-    os.nice(niceness)
 
 
 def _do_works() -> dict[int, bytes]:

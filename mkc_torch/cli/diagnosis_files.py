@@ -172,7 +172,7 @@ def write_diagnosis(
 
 def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
     """Yield the runs of a table with labels and folders, or the whole table if it is diagnosed at once."""
-    if _EXPERIMENT not in recording or getattr(simulation, "joins_experiments", False):
+    if _EXPERIMENT not in recording or simulation.joins_experiments:
         yield "", recording, folder
         return
     parts = recording.experiments()

@@ -4,42 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from time import monotonic
 
-import torch
-
 from mkc_torch._parallel.deadline import Stopped, limited
-from mkc_torch._parallel.pool import shared, speculative
 from mkc_torch._parallel.progress import counting
-from mkc_torch.diagnosis.arguments import (
-    check_limits,
-    check_numbers,
-    checked_effects,
-    checked_input_hold,
-    checked_noise,
-    refuse_no_settings,
-    refuse_no_simulation,
-)
-from mkc_torch.diagnosis.evidence.run import precompute
-from mkc_torch.diagnosis.goodness_of_fit import poor_fits
-from mkc_torch.diagnosis.joined import joined, run_counts, with_own_offsets
-from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
-from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.parallel import common_parts
-from mkc_torch.diagnosis.model.process_noise import choose_input_hold, estimate_noise, fit_baseline, open_loop
-from mkc_torch.diagnosis.partial_diagnosis import cut_short, error_without_fit
-from mkc_torch.diagnosis.partial_result import PartialResult
+from mkc_torch.diagnosis.pipeline.baseline import fit_baseline
+from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
+from mkc_torch.diagnosis.pipeline.search import stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.search.own_noise import noise_of_fit
-from mkc_torch.diagnosis.settings import Settings, quick_settings
-from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
-from mkc_torch.diagnosis.verdict import assess_baseline, impossible_rotations
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+from mkc_torch.simulation.protocol import Simulation
 
 __all__ = ["diagnose"]
 
@@ -123,111 +101,18 @@ def diagnose(
         True
     """
     begin = monotonic()
-    refuse_no_simulation(simulation)
-    several = () if isinstance(recording, Recording) else tuple(recording)
-    recording, names = joined(simulation, recording)
-    effects = checked_effects(effects)
-    check_numbers(level, surrogates, max_findings, seed)
-    check_limits(quick, time_limit)
-    refuse_no_settings(settings)
-    settings = quick_settings(settings) if quick else settings
-    fewest = settings.search.fewest_samples
-    where = f"{recording.name}: " if recording.name else ""
-    if len(recording) < fewest:
-        raise ValueError(
-            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {fewest} at least. Record longer."
-        )
-    progress("reading the recording")
-    prepared = simulation.prepare(recording)
-    if len(prepared.time) < fewest:
-        raise ValueError(
-            f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
-        )
-    prepared = with_own_offsets(prepared, several)
-    declared = checked_noise(noise, prepared.channels)
-    fixed = checked_input_hold(input_hold, tuple(getattr(prepared, "input_hold", ())))
-    options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
-    known = PartialResult(simulation, effects, names, options, run_counts(several) if names else ())
+    declared, holds = {} if noise is None else noise, {} if input_hold is None else input_hold
+    options = SearchOptions(level, surrogates, max_findings, seed, settings, declared, holds, quick)
+    problem = prepare(simulation, recording, effects, options, time_limit, progress)
     limit = math.inf if time_limit is None else time_limit
+    known = PartialResult(problem)
     with limited(limit, begin=begin) as deadline, counting(progress):
         try:
-            return _diagnosed(known, prepared, where, progress)
+            baseline = fit_baseline(problem, known)
+            steps = stepwise_search(problem, known, baseline)
+            final = estimate(known, steps)
+            evidence = run_tests(known, steps, final)
+            return build_result(known, steps, evidence)
         except Stopped as stopped:
             reason, seconds = stopped.reason, deadline.elapsed
-    if known.baseline is None:
-        raise error_without_fit(reason, limit, where)
-    progress("writing down what is known")
-    return cut_short(known, reason, seconds)
-
-
-def _diagnosed(
-    known: PartialResult, prepared: PreparedSimulation, where: str, progress: Callable[[str], object]
-) -> Diagnosis:
-    """Run the diagnosis; ``known`` holds the partial result if the run is stopped."""
-    options = known.options
-    declared, fixed, settings = options.declared, options.fixed, options.settings
-    generator = torch.Generator().manual_seed(options.seed)
-    if isinstance(prepared, PreparedDynamics):
-        prepared = prepared.with_input_hold(fixed)
-        if options.quick:
-            known.options = options = replace(options, max_findings=min(options.max_findings, 1), judged=False)
-    progress("fitting the simulation alone")
-    baseline = fit_baseline(prepared, declared, settings.noise, known.keep_baseline)
-    known.baseline = baseline = choose_input_hold(baseline, declared, fixed, settings.noise)
-    known.fitted = True
-    base = baseline.fit
-    _refuse_no_noise(base, where)
-    finer = with_smaller_step(base, settings.noise)
-    if finer is not None:
-        return _diagnosed(known.restart(), finer, where, progress)
-    terms = known.candidates[1]
-    if poor_fits(assess_baseline(baseline, declared), settings.evidence.followed):
-        # a poor fit may lack a single effect; further findings wait until the simulation fits with it
-        known.options = options = replace(options, max_findings=min(options.max_findings, 1))
-    hopeless = impossible_rotations(baseline)
-    progress(f"trying {len(terms)} effects")
-    terms = () if hopeless else terms
-    search = first_step(base, terms, options, generator, baseline.free, known.keep_search)
-    refitted_noise_fit = None if search.first is None else search.first.without_candidate
-    noise = (
-        None
-        if refitted_noise_fit is None
-        else estimate_noise(refitted_noise_fit, declared, settings.noise, noise_of_fit(refitted_noise_fit, declared))
-    )
-    if refitted_noise_fit is not None and noise is not None and noise.observer is not None:
-        progress(f"trying {len(terms)} effects under a more likely noise model")
-        known.baseline = baseline = replace(baseline, fit=refitted_noise_fit, noise=noise)
-        base = refitted_noise_fit
-        search = first_step(base, terms, options, generator, baseline.free, known.keep_search)
-    finer = with_smaller_step(search.found[-1].fit, settings.noise) if search.found else None
-    if finer is not None:
-        return _diagnosed(known.restart(), finer, where, progress)
-    known.search, tests = search, known.tests
-    common = [known.simulation, base, base.model, *common_parts(open_loop(base.model.prepared), terms)]
-    while search.left:
-        case = known.case(search)
-        # usually there is no further finding, so compute the evidence ahead
-        with speculative(precompute(case, tests), [*common, *search.parts]) as done:
-            progress(f"trying {len(search.left)} effects in addition to {len(search.found)} found")
-            after = next_step(search, options, generator, known.keep_search)
-            if after.found == search.found:
-                known.search = after
-                return known.diagnosis(after, case, done(), tests)
-        known.search = search = after
-    case = known.case(search)
-    progress("checking what was found")
-    done_ahead = shared(precompute(case, tests), [*common, *search.parts], "test of evidence")
-    return known.diagnosis(search, case, done_ahead, tests)
-
-
-def _refuse_no_noise(base: FittedModel, where: str) -> None:
-    """Raise ValueError for a channel whose residual is constant: no noise is left to test an effect against."""
-    same = (base.residual == base.residual[:1]).all(0)
-    nothing = base.d.square() < torch.finfo(base.d.dtype).tiny
-    exact = (same | nothing).tolist()
-    names = [name for name, is_exact in zip(base.model.prepared.channels, exact, strict=True) if is_exact]
-    if names:
-        raise ValueError(
-            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so no noise is left "
-            "to test effects against. Leave it out of the compared channels, or record it with its noise."
-        )
+    return cut_short(known, reason, seconds, limit)

@@ -65,9 +65,7 @@ def goodness_of_fit(
         declared: known standard deviations of the outputs' white noise, by output.
         floor: estimated standard deviations of the white noise; None to estimate them from third differences.
     """
-    known: Tensor | None = getattr(prepared, "measured", None)
-    if known is None:
-        return ()
+    known = prepared.measured
     own = known - known.median(0).values
     if len(prepared.channels) == 1 and known.shape[1] > 1:
         # a vector's length is compared: its variation if readings scatter equally in all directions
@@ -108,8 +106,7 @@ def goodness_of_fit(
 
 def _in_other_axes(prepared: PreparedSimulation) -> bool:
     """Whether a vector is compared in axes that turn against the recorded columns, such as those of the Earth."""
-    recording = getattr(prepared, "recording", None)
-    return len(prepared.channels) > 1 and recording is not None and not set(prepared.channels) & set(recording.names)
+    return len(prepared.channels) > 1 and not set(prepared.channels) & set(prepared.recording.names)
 
 
 def poor_fits(follows: Sequence[GoodnessOfFit], least: float) -> tuple[GoodnessOfFit, ...]:

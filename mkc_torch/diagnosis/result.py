@@ -1,12 +1,20 @@
-"""The result of a diagnosis: verdict, findings, and the figures of a report."""
+"""The result of a diagnosis: verdict, findings, the figures of a report, and its table in a notebook."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mkc_torch.diagnosis.correcting_model import CorrectingModel
+from torch import Tensor, nn
+
+from mkc_torch._parallel.deadline import Reason
+from mkc_torch._support.html_table import html_table
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
-from mkc_torch.diagnosis.notebook import as_html
 from mkc_torch.diagnosis.parts import (
     Alternative,
     CandidateScore,
@@ -33,11 +41,16 @@ from mkc_torch.diagnosis.parts import (
     value_of,
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
-from mkc_torch.diagnosis.stop import Stop
+from mkc_torch.effects import words_of
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 __all__ = [
     "Alternative",
     "CandidateScore",
+    "CorrectingModel",
     "DensityCheck",
     "Diagnosis",
     "DivergedBlock",
@@ -60,7 +73,99 @@ __all__ = [
     "Stop",
     "Table",
     "Traces",
+    "as_html",
+    "notices",
 ]
+
+_QUICK = (
+    "Quick look: no p-values, false-alarm rate not controlled. Leave out --quick (in Python quick=True) to have both."
+)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Why a diagnosis was stopped before its end, and what was not done.
+
+    Attributes:
+        reason: "time limit" or "interrupt".
+        seconds: run time until the stop.
+        not_done: the missing parts, as nouns.
+    """
+
+    reason: Reason
+    seconds: float
+    not_done: tuple[str, ...]
+
+    def __str__(self) -> str:
+        how = "by an interrupt " if self.reason == "interrupt" else ""
+        left = "; ".join(self.not_done)
+        return f"Stopped {how}after {self.seconds:.0f} s: the search was not finished; not done: {left}."
+
+
+def notices(stop: Stop | None, *, quick: bool) -> tuple[str, ...]:
+    """Return the sentences.
+
+    Example:
+        >>> notices(Stop("time limit", 60.2, ("the search for effects",)), quick=False)
+        ('Stopped after 60 s: the search was not finished; not done: the search for effects.',)
+    """
+    return (*(() if stop is None else (str(stop),)), *((_QUICK,) if quick else ()))
+
+
+class CorrectingModel(nn.Module):
+    """A simulation's sensor or system with the findings in it; see :class:`mkc_torch.diagnosis.DiagnosedModel`."""
+
+    @abstractmethod
+    def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
+        """Return the corrected columns of a recording, and sentences about findings that do not transfer to it."""
+
+    @abstractmethod
+    def to_json(self) -> str:
+        """Return the text of model.json."""
+
+    @abstractmethod
+    def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
+        """Return the simulation with the findings as Python source."""
+
+
+_VERDICTS: dict[Verdict, str] = {
+    "unfit": "verdict.unfit",
+    "adequate": "verdict.nothing",
+    "explained": "verdict.explained",
+    "unexplained": "verdict.structure",
+}
+
+
+def as_html(
+    recording: str,
+    simulation: str,
+    verdict: Verdict,
+    findings: Sequence[Finding],
+    sentences: Sequence[str],
+    *,
+    stop: Stop | None = None,
+) -> str:
+    """Return the table with sentences below it: why the search was stopped, if it was; then advice and warnings."""
+    names = term("label.against", recording=plain(recording) or term("label.recording"), simulation=plain(simulation))
+    heads = ("", "grade", "p", "on unseen data")
+    rows = [_row(finding) for finding in findings]
+    first = term(_VERDICTS[verdict]) if stop is None else term("verdict.unfinished")
+    below = [first, *(typeset(sentence) for sentence in sentences)]
+    for finding in findings:
+        below = [text.replace(finding.effect, words_of(finding.effect, finding.kind)) for text in below]
+    return html_table(names, heads, rows, below)
+
+
+def _row(f: Finding) -> tuple[str, ...]:
+    drivers = f" ({', '.join(plain(name) for name in f.drivers)})" if f.drivers else ""
+    held = f.held_out
+    change = "" if held is None else f"{held.rmse_before:.3g} → {held.rmse_after:.3g} {plain(held.unit)}".rstrip()
+    return (
+        words_of(f.effect, f.kind) + drivers,
+        f.grade.replace("_", " "),
+        "" if f.p_value is None else f"{f.p_value:.2g}",
+        change,
+    )
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class Effect(ABC):
         port: name or kind of the ports where it acts; default "sensor".
         needs: parts that such a port must have; default none.
         excludes: parts that such a port must not have, because another form of the effect covers them; default none.
-        roles: roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` assigns them; default
+        roles: roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.term` assigns them; default
             empty: it depends on time or the signal only.
         driver_optional: whether an effect with roles is also tried without a driver; default False.
         follows_signal: whether its change depends on the signal at its port; default False.

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from mkc_torch._support.arguments import refuse_other_type
+from mkc_torch._support.arrays import is_frame
 from mkc_torch.recording.formats.base import RecordingError, listed
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["Clock", "join_recordings", "joint_name", "recording_names"]
+__all__ = ["Clock", "join_recordings", "joint_name", "recording_names", "refuse_no_recording"]
 
 Clock = Literal["own", "restart", "follow"]
 """How the times of consecutive runs are arranged: unchanged, restarting, or following each other."""
@@ -176,3 +179,17 @@ def _shift_warnings(labels: Sequence[str], moved: Sequence[float]) -> list[str]:
         for label, by in zip(labels, moved, strict=False)
         if by
     ]
+
+
+def refuse_no_recording(name: str, value: object) -> None:
+    """Refuse a value that is not a recording, with the remedy.
+
+    Raises:
+        TypeError: it is a file name, a data frame, or another object.
+    """
+    advice = "make one, Recording({'time': ..., ...}), or read it, Recording.read('REC.csv')"
+    if isinstance(value, (str, os.PathLike)):
+        advice = f"read it, Recording.read({os.fspath(value)!r})"
+    elif is_frame(value):
+        advice = f"make one, Recording({name})"
+    refuse_other_type(name, value, Recording, "a Recording", advice)

@@ -6,7 +6,8 @@ from mkc_torch.simulation.load import SimulationFileError, base_class, load_simu
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.parameter import Parameter, SimulationError
-from mkc_torch.simulation.protocol import Correction, Port, PreparedSimulation, Simulation
+from mkc_torch.simulation.ports import Port
+from mkc_torch.simulation.protocol import Correction, PreparedSimulation, Simulation
 from mkc_torch.simulation.static import Static
 
 __all__ = [

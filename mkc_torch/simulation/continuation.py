@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.torch_internals import functorch_is_active, is_wrapped
-from mkc_torch.simulation.protocol import Answer, Changes, Nearby, PreparedSimulation
+from mkc_torch.simulation.ports import Answer, Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["CompiledResidual", "Continuation", "Meaning", "ResidualTangents", "compiled_residual", "is_plain"]
+__all__ = ["Answering", "CompiledResidual", "Continuation", "Meaning", "ResidualTangents", "is_plain"]
 
 Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
 """Maps the parameters of a fit to the simulation's own parameters and the changes at its ports."""
@@ -43,24 +43,11 @@ class CompiledResidual(Protocol):
         ...
 
 
-@runtime_checkable
-class _Compilable(Protocol):
-    """A prepared simulation that can compile its residual."""
+class Answering(Protocol):
+    """The part of a prepared simulation that a fit evaluates; see :class:`mkc_torch.simulation.PreparedSimulation`."""
 
-    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:
-        """The residual as a function of ``size`` parameters; None where it cannot be compiled."""
-        ...
-
-
-def compiled_residual(prepared: PreparedSimulation, meaning: Meaning, size: int) -> CompiledResidual | None:
-    """The compiled residual of a simulation; None where it cannot be compiled.
-
-    Args:
-        prepared: the simulation.
-        meaning: meaning of the parameters.
-        size: number of parameters.
-    """
-    return prepared.compiled(meaning, size) if isinstance(prepared, _Compilable) else None
+    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer: ...
+    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None: ...
 
 
 def is_plain(parameters: Tensor) -> bool:
@@ -80,7 +67,7 @@ class Continuation:
 
     def __init__(
         self,
-        prepared: PreparedSimulation,
+        prepared: Answering,
         meaning: Meaning,
         near: Nearby | None = None,
         compiled: Callable[[], CompiledResidual | None] | None = None,
@@ -137,7 +124,7 @@ class Continuation:
     def _compiled_for(self, parameters: Tensor) -> CompiledResidual | None:
         if self._compiled is None:
             if self._compile is None:
-                self._compiled = (compiled_residual(self._prepared, self._meaning, len(parameters)),)
+                self._compiled = (self._prepared.compiled(self._meaning, len(parameters)),)
             else:
                 self._compiled = (self._compile(),)
         return self._compiled[0]

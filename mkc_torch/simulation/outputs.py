@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired.alike import SEVERAL
-from mkc_torch.simulation.protocol import Changes, Port, SignalSizes
+from mkc_torch.simulation.ports import Changes, Port, SignalSizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

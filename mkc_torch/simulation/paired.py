@@ -11,10 +11,12 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, refuse_text
 from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.recording.join_recordings import Clock, refuse_no_recording
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, refuse_no_recording
+from mkc_torch.simulation.ports import Changes, Nearby
+from mkc_torch.simulation.protocol import ClosedForm
 from mkc_torch.simulation.runs import successive_runs
 
 if TYPE_CHECKING:
@@ -75,6 +77,8 @@ class Paired:
 
     name = "simulated"
     joins_experiments = True
+    measured: frozenset[str] = frozenset()
+    joint_clock: Clock = "own"
 
     def __init__(
         self,

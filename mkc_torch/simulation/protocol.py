@@ -2,182 +2,53 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_other_type
-from mkc_torch._support.arrays import is_frame
 from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.continuation import CompiledResidual, Meaning
+from mkc_torch.simulation.dynamics.observer import Observer
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.own_offsets import OwnOffset
+from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
+    from typing_extensions import Self
 
 __all__ = [
-    "Answer",
-    "Beginning",
-    "Change",
-    "Changes",
-    "Clocked",
     "ClosedForm",
     "CorrectableSimulation",
     "Correction",
-    "FreeChange",
-    "Nearby",
-    "Port",
+    "Jacobian",
     "PreparedSimulation",
-    "SignalSizes",
-    "SignalTimes",
     "Simulation",
-    "refuse_no_recording",
 ]
 
-Change = Callable[[Tensor], Tensor]
-"""The change at a port, (N, c), as a function of the signal there.
-
-At a port with memory the signal can have more components, the internal states; the change then has more channels, their
-rates.
-"""
-
-Changes = Mapping[str, Change]
-
-
-@dataclass(frozen=True)
-class FreeChange:
-    """A change that does not depend on the signal, which then need not be simulated."""
-
-    of: Change
-
-    def __call__(self, signal: Tensor) -> Tensor:
-        return self.of(signal)
-
-
-@dataclass(frozen=True)
-class SignalTimes:
-    """The G moments at which a port's signal is simulated, where they are not the recording's samples.
-
-    Attributes:
-        time: (G,), in s.
-        before, after: (G,), the samples before and after each moment.
-        share: (G,), position of the moment between these samples, 0 to 1.
-    """
-
-    time: Float[Tensor, " G"]
-    before: Int[Tensor, " G"]
-    after: Int[Tensor, " G"]
-    share: Float[Tensor, " G"]
-
-    def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
-        """Values of the samples, interpolated to these moments."""
-        share = self.share.reshape(-1, *[1] * (values.dim() - 1))
-        return torch.lerp(values[self.before], values[self.after], share)
-
-
-class SignalSizes(NamedTuple):
-    """Sizes of values: the typical and the largest absolute value, the lowest and the highest value.
-
-    Example:
-        >>> SignalSizes.of(torch.tensor([-3.0, 1.0, 2.0]))
-        SignalSizes(typical=2.0, largest=3.0, lowest=-3.0, highest=2.0)
-    """
-
-    typical: float
-    largest: float
-    lowest: float
-    highest: float
-
-    @classmethod
-    def of(cls, values: Float[Tensor, " N"]) -> SignalSizes:
-        """The sizes of these values; the typical absolute value is the median."""
-        size = values.abs()
-        return cls(*(float(value) for value in (size.median(), size.amax(), values.amin(), values.amax())))
-
-
-@dataclass(frozen=True)
-class Port:
-    """A place in a simulation where an effect adds to a signal.
-
-    Attributes:
-        channels: names of the changed components.
-        unit: unit of the change.
-        allows_drift: whether the noise model allows for drift at this port.
-        pointwise: whether a change of a sample changes the residual of this sample only.
-        kind: an effect is tried at every port of its kind; default the port's name.
-        carries: names of the signal's components; default the channels.
-        parts: roles of the signal's components, such as ``{"own": "speed", "position": "angle"}``.
-        part_units, sizes: units and sizes of the parts.
-        clock: moments of the signal; None for the recording's samples.
-        run: number of each moment's run; None where the simulation has no runs.
-        memory: names of the internal states that an effect here may have, with the state whose initial value each
-            takes; empty for the initial value 0.
-
-    Example:
-        >>> sensor = Port(("mag_x", "mag_y", "mag_z"), "µT", kind="sensor")
-        >>> sensor.at(torch.ones(5, 3)).shape  # at the recording's own samples
-        torch.Size([5, 3])
-    """
-
-    channels: tuple[str, ...]
-    unit: str
-    allows_drift: bool = False
-    pointwise: bool = True
-    kind: str = ""
-    carries: tuple[str, ...] = ()
-    parts: Mapping[str, str] = field(default_factory=dict)
-    part_units: Mapping[str, str] = field(default_factory=dict)
-    sizes: Mapping[str, SignalSizes] = field(default_factory=dict)
-    clock: SignalTimes | None = None
-    run: Int[Tensor, " G"] | None = None
-    memory: Mapping[str, str] = field(default_factory=dict)
-
-    def in_series(self, name: str) -> bool:
-        """Whether effects at this port, named ``name``, act in series, each on the output of the previous effect.
-
-        Effects on an input or an output are in a signal chain; forces on a rate add up.
-
-        Example:
-            >>> Port(("u",), "V", kind="input").in_series("input u"), Port(("v",), "m/s²").in_series("rate of v")
-            (True, False)
-        """
-        return (self.kind or name) in ("input", "output", "outputs")
-
-    def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
-        """Values of the samples, interpolated to the moments of this port's signal."""
-        return values if self.clock is None else self.clock.at(values)
-
-
-class Nearby(Protocol):
-    """The start of an evaluation near a known evaluation, such as a trajectory.
-
-    Attributes:
-        bare: the same without derived data that can be recomputed.
-    """
-
-    @property
-    def bare(self) -> Nearby: ...
-
-
-class Answer(NamedTuple):
-    """The residual of a simulation, and a start for evaluations at parameters nearby.
-
-    Attributes:
-        residual: (N, m), recording minus prediction; NaN where the simulation has no solution.
-        nearby: the argument ``near`` of :meth:`PreparedSimulation.answer`; None inside of a transform, and for a
-            simulation in closed form.
-    """
-
-    residual: Float[Tensor, "N m"]
-    nearby: Nearby | None = None
+Jacobian = Literal["forward", "reverse twice"]
+"""How a fit differentiates a residual: by forward mode, or for many small operations by double reverse mode."""
 
 
 class ClosedForm(ABC):
-    """A prepared simulation in closed form, which needs no start for its evaluation."""
+    """Base class of prepared simulations in closed form, without states, process noise, or a start of evaluations.
+
+    A derived class provides the other members of :class:`PreparedSimulation`.
+    """
+
+    prior: GaussianPrior | None = None
+    faults: tuple[str, ...] = ()
+    input_hold: Mapping[str, str] = MappingProxyType({})
+    own_offsets: tuple[OwnOffset, ...] = ()
+    beginnings: int = 0
+    jacobian: Jacobian = "forward"
+    observer: Observer | None = None
+    dynamics: PreparedDynamics | None = None
 
     @abstractmethod
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
@@ -186,6 +57,34 @@ class ClosedForm(ABC):
     def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:  # noqa: ARG002
         """The residual; see :meth:`PreparedSimulation.answer`."""
         return Answer(self.residual(theta, changes))
+
+    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:  # noqa: ARG002
+        """None: torch evaluates the closed form."""
+        return None
+
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:  # noqa: ARG002
+        """The prior, which no effect changes."""
+        return self.prior
+
+    def observed(self, observer: Observer | None) -> Self:  # noqa: ARG002
+        """The simulation itself: it has no states to observe."""
+        return self
+
+    def open_loop(self) -> Self:
+        """The simulation itself: it has no observer."""
+        return self
+
+    def with_input_hold(self, hold: Mapping[str, str]) -> Self:  # noqa: ARG002
+        """The simulation itself: it uses no values between samples."""
+        return self
+
+    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> Self:  # noqa: ARG002
+        """The simulation itself: its outputs have no offsets of single recordings."""
+        return self
+
+    def finer(self) -> Self | None:
+        """None: there is no step of integration."""
+        return None
 
 
 class PreparedSimulation(Protocol):
@@ -204,6 +103,14 @@ class PreparedSimulation(Protocol):
             not, an effect that follows the signal would be a false alarm.
         warnings: sentences about what the recording does not determine.
         state: constants that a :class:`Correction` needs in addition to the parameters; JSON-serialisable.
+        measured: (N, k), the recorded columns that the residual is computed of.
+        faults: sentences about faults of the recording with which no comparison is meaningful; usually empty.
+        input_hold: "held", "linear" or "smooth" for each input that is used between samples.
+        own_offsets: offsets of the outputs in single recordings, where several are diagnosed together.
+        beginnings: number of parameters of single runs and recordings, their offsets and initial states; they are last.
+        jacobian: how a fit differentiates the residual.
+        observer: the observer that corrects the states at each sample; None in open loop.
+        dynamics: the simulation as differential equations, for estimates of process noise; None in closed form.
     """
 
     @property
@@ -230,6 +137,22 @@ class PreparedSimulation(Protocol):
     def warnings(self) -> tuple[str, ...]: ...
     @property
     def state(self) -> Mapping[str, object]: ...
+    @property
+    def measured(self) -> Float[Tensor, "N k"]: ...
+    @property
+    def faults(self) -> tuple[str, ...]: ...
+    @property
+    def input_hold(self) -> Mapping[str, str]: ...
+    @property
+    def own_offsets(self) -> tuple[OwnOffset, ...]: ...
+    @property
+    def beginnings(self) -> int: ...
+    @property
+    def jacobian(self) -> Jacobian: ...
+    @property
+    def observer(self) -> Observer | None: ...
+    @property
+    def dynamics(self) -> PreparedDynamics | None: ...
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         """A robust start of the parameters, from the samples in ``rows``; None for all samples.
@@ -257,12 +180,16 @@ class PreparedSimulation(Protocol):
         """The signal at each port, for effects that depend on it."""
         ...
 
+    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:
+        """The residual as a function of ``size`` parameters, computed without torch; None where that is impossible.
 
-@runtime_checkable
-class Clocked(Protocol):
-    """A prepared simulation with clock parameters, which an effect can be equivalent to."""
+        Args:
+            meaning: maps these parameters to the simulation's own parameters and the changes at its ports.
+            size: number of parameters.
+        """
+        ...
 
-    def prior_given(self, settled: Collection[str]) -> GaussianPrior:
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:
         """The prior of the parameters, given effects that are equivalent to clock parameters.
 
         Args:
@@ -270,17 +197,30 @@ class Clocked(Protocol):
         """
         ...
 
+    def observed(self, observer: Observer | None) -> PreparedSimulation:
+        """The simulation with its states corrected by an observer; None for the open loop."""
+        ...
 
-@runtime_checkable
-class Beginning(Protocol):
-    """A prepared simulation whose last parameters are the initial states of its runs, after recordings' offsets.
+    def open_loop(self) -> PreparedSimulation:
+        """The simulation without an observer."""
+        ...
 
-    Attributes:
-        beginnings: number of these parameters.
-    """
+    def with_input_hold(self, hold: Mapping[str, str]) -> PreparedSimulation:
+        """The simulation with other holds of its inputs, by input; unchanged without values between samples."""
+        ...
 
-    @property
-    def beginnings(self) -> int: ...
+    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> PreparedSimulation:
+        """The simulation with an offset of each output in each recording, where the recordings determine it.
+
+        Args:
+            recording: number of each sample's recording.
+            names: names of the recordings.
+        """
+        ...
+
+    def finer(self) -> PreparedSimulation | None:
+        """The simulation with half the step of integration; None where the step is fixed, or there is none."""
+        ...
 
 
 class Correction(Protocol):
@@ -329,9 +269,9 @@ class Simulation(Protocol):
         columns: names of the columns that the simulation uses, which do not drive effects.
         joins_experiments: whether all runs of a recording, separated by its column ``experiment``, are fitted jointly;
             otherwise each run is diagnosed separately.
-
-    An optional attribute ``measured`` has the names of the columns that it is compared with: a column that repeats a
-    measured column drives no effect.
+        measured: columns whose copies drive no effect, because the simulation is compared with them.
+        joint_clock: how the times of recordings that are diagnosed together are arranged, see
+            :data:`mkc_torch.recording.join_recordings.Clock`.
 
     Example:
         >>> from mkc_torch.simulation import Static
@@ -351,6 +291,10 @@ class Simulation(Protocol):
     def columns(self) -> frozenset[str]: ...
     @property
     def joins_experiments(self) -> bool: ...
+    @property
+    def measured(self) -> frozenset[str]: ...
+    @property
+    def joint_clock(self) -> Clock: ...
 
     def prepare(self, recording: Recording) -> PreparedSimulation:
         """The simulation together with a recording.
@@ -360,17 +304,3 @@ class Simulation(Protocol):
             ValueError: it cannot be simulated; the message states why.
         """
         ...
-
-
-def refuse_no_recording(name: str, value: object) -> None:
-    """Refuse a value that is not a recording, with the remedy.
-
-    Raises:
-        TypeError: it is a file name, a data frame, or another object.
-    """
-    advice = "make one, Recording({'time': ..., ...}), or read it, Recording.read('REC.csv')"
-    if isinstance(value, (str, os.PathLike)):
-        advice = f"read it, Recording.read({os.fspath(value)!r})"
-    elif is_frame(value):
-        advice = f"make one, Recording({name})"
-    refuse_other_type(name, value, Recording, "a Recording", advice)

@@ -10,13 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch._support.arguments import refuse_other_type, refuse_text
-from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
+from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.recording.join_recordings import Clock, refuse_no_recording
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.own_offsets import OwnOffset, determined_offsets
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
-from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, SignalSizes, refuse_no_recording
+from mkc_torch.simulation.ports import Changes, Nearby, Port, SignalSizes
+from mkc_torch.simulation.protocol import ClosedForm
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -108,6 +110,10 @@ class Static:
     def measured(self) -> frozenset[str]:
         return frozenset(self.outputs)
 
+    @property
+    def joint_clock(self) -> Clock:
+        return "restart" if self.joins_experiments else "follow"
+
     def output(self, time: Tensor, u: Any, p: Any) -> Mapping[str, Tensor]:
         """The predicted outputs: name of the column to (N,).
 
@@ -198,8 +204,6 @@ class Static:
 
 class PreparedStatic(ClosedForm):
     """A function of inputs together with a recording."""
-
-    prior: GaussianPrior | None = None
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from mkc_torch._parallel.deadline import Stopped, check_deadline, is_limited, limited, stopped_by_interrupt, within
-from mkc_torch._parallel.pool import allow_copies, shared, speculative
+from mkc_torch._parallel.pool import allow_copies, shared
 from tests.started import started
 
 
@@ -118,10 +118,15 @@ def test_no_work_starts_after_the_deadline(copies):
 @linux
 @pytest.mark.usefixtures("one_copy")
 def test_deadline_ends_a_copy_that_is_waited_for():
-    with limited(0.3), speculative([signal.pause]) as answer:
-        time.sleep(0.2)  # the copy has started the work
-        with pytest.raises(Stopped):
-            answer()
+    here = os.getpid()
+
+    def work():
+        while os.getpid() != here:
+            time.sleep(0.01)
+        time.sleep(0.05)
+
+    with limited(0.3), pytest.raises(Stopped):
+        shared([work] * 3)
     assert multiprocessing.active_children() == []
 
 

@@ -8,13 +8,11 @@ import subprocess
 import sys
 import textwrap
 import time
-from contextlib import contextmanager
 
 import pytest
 import torch
 
-from mkc_torch._parallel import pool as _pool
-from mkc_torch._parallel.pool import Serializer, allow_copies, shared, speculative
+from mkc_torch._parallel.pool import Serializer, allow_copies, shared
 from tests.started import started
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux only")
@@ -29,7 +27,6 @@ def _copies():
     yield
     allow_copies(0)
     assert multiprocessing.active_children() == []
-    assert _pool._speculative_copies == []
 
 
 def elsewhere(value):
@@ -42,22 +39,6 @@ def elsewhere(value):
     return work
 
 
-@contextmanager
-def begun(work):
-    """A work, and a function that waits until a copy has started it."""
-    ready, started_end = os.pipe()
-
-    def announced():
-        os.write(started_end, b"x")
-        return work()
-
-    try:
-        yield announced, lambda: os.read(ready, 1)
-    finally:
-        os.close(ready)
-        os.close(started_end)
-
-
 def test_results_come_in_order_and_copies_take_part():
     results = shared([elsewhere(k) for k in range(9)])
     assert [value for value, _ in results] == list(range(9))
@@ -67,8 +48,6 @@ def test_results_come_in_order_and_copies_take_part():
 def test_without_copies_this_process_does_all_work():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
-    with speculative([os.getpid]) as answer:
-        assert answer() == [HERE]
 
 
 def test_nothing_is_forked_on_other_systems_than_linux(monkeypatch):
@@ -82,15 +61,11 @@ def test_a_single_work_needs_no_copy():
 
 
 def test_copies_do_not_fork_copies():
-    """Also while other copies of this process are working."""
-
     def work():
         time.sleep(0.05)
-        with speculative([os.getpid]) as answer:
-            return {os.getpid(), *shared([os.getpid, os.getpid]), *answer()}
+        return {os.getpid(), *shared([os.getpid, os.getpid])}
 
-    with speculative([signal.pause]):
-        assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
+    assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
 
 
 def test_work_with_an_unpicklable_result_is_done_here():
@@ -106,8 +81,6 @@ def test_work_of_a_killed_copy_is_done_here():
         return os.getpid()
 
     assert shared([dies] * 5) == [HERE] * 5
-    with speculative([dies] * 5) as answer:
-        assert answer() == [HERE] * 5
 
 
 def test_without_memory_for_a_copy_this_process_does_all_work(monkeypatch):
@@ -116,8 +89,6 @@ def test_without_memory_for_a_copy_this_process_does_all_work(monkeypatch):
 
     monkeypatch.setattr(os, "fork", fails)
     assert shared([os.getpid] * 3) == [HERE] * 3
-    with speculative([os.getpid]) as answer:
-        assert answer() == [HERE]
 
 
 def test_an_error_of_a_work_is_raised_here():
@@ -156,58 +127,8 @@ def test_known_objects_are_pickled_by_their_number():
         Serializer().packed(known[1])
 
 
-def test_speculative_work_runs_in_a_copy():
-    known = object()
-    with begun(lambda: (os.getpid(), known)) as (work, wait), speculative([work], [known]) as answer:
-        wait()
-        [(process, same)] = answer()
-    assert process != HERE
-    assert same is known
-
-
-def test_shared_work_has_priority_over_speculative_work():
-    with begun(lambda: os.nice(0)) as (work, wait), speculative([work]) as answer:
-        wait()
-        results = shared([elsewhere(k) for k in range(9)])
-        assert len({process for _, process in results}) == 3
-        assert answer() > [os.nice(0)]
-
-
-def test_without_a_free_core_speculative_work_is_done_on_request():
-    allow_copies(1)
-    with speculative([signal.pause]), speculative([os.getpid]) as answer:
-        assert answer() == [HERE]
-    with speculative([os.getpid]) as first:
-        first()  # its core is free from now on
-        while not all(copy.done() for copy in _pool._speculative_copies):
-            time.sleep(0.01)
-        with begun(os.getpid) as (work, wait), speculative([work]) as answer:
-            wait()
-            assert answer() != [HERE]
-
-
-def test_speculative_work_that_has_not_started_is_done_on_request():
-    """The copy starts with the last work."""
-    allow_copies(1)
-    with (
-        begun(lambda: (time.sleep(0.5), os.getpid())) as (last, wait),
-        speculative([*(elsewhere(k) for k in range(5)), last]) as answer,
-    ):
-        wait()
-        *others, (_, process) = answer()
-    assert [value for value, _ in others] == list(range(5))
-    assert HERE in {by for _, by in others}
-    assert process != HERE
-
-
-def test_an_error_of_speculative_work_is_raised_on_request():
-    with speculative([lambda: 1 / 0]) as answer, pytest.raises(ZeroDivisionError):
-        answer()
-
-
-def test_unused_copies_are_ended():
-    with speculative([signal.pause]):
-        pass
+def test_copies_are_ended():
+    shared([elsewhere(k) for k in range(5)])
     assert multiprocessing.active_children() == []
 
 

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.linear import MKCRegression

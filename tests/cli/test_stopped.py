@@ -18,8 +18,8 @@ from mkc_torch._parallel.deadline import Stopped
 from mkc_torch.cli import console, diagnosis_files
 from mkc_torch.cli.console import progress
 from mkc_torch.diagnosis.io.diagnosis_json import validate
-from mkc_torch.diagnosis.partial_result import PartialResult
-from mkc_torch.diagnosis.stop import Stop
+from mkc_torch.diagnosis.pipeline.partial import PartialResult
+from mkc_torch.diagnosis.result import Stop
 from tests.cli.test_cli import mkc
 from tests.cli.test_diagnose import STEPPED, quiet, refused, sensor
 from tests.diagnosis.factory import make_diagnosis
@@ -142,7 +142,7 @@ WAITING = """
 import sys
 from pathlib import Path
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch.diagnosis.partial_result import PartialResult
+from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from time import sleep
 keep = PartialResult.keep_search
 

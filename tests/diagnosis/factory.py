@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.environment import (
     ProcessNoise,
     ShapeCheck,
 )
-from mkc_torch.diagnosis.evidence import held_out_gain, remaining
+from mkc_torch.diagnosis.evidence import prediction, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.grading import grade_of
 from mkc_torch.diagnosis.result import (
@@ -234,7 +234,7 @@ def _step(channels, has_time):
             EffectParameter("onset", 41.32, 0.14, "s"),
         ),
         p_value=0.005,
-        evidence=(held_out_gain.as_result(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
+        evidence=(prediction.held_out_gain_result(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
         alternatives=(
             Alternative("offset_drift", (), 41.2, True),
             Alternative("current_field", ("current",), 1.3, False),
@@ -261,7 +261,7 @@ def _current(channels, has_time):
             EffectParameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
         ),
         p_value=0.01,
-        evidence=(held_out_gain.as_result(None, "The event has no second occurrence to be held out."),),
+        evidence=(prediction.held_out_gain_result(None, "The event has no second occurrence to be held out."),),
         alternatives=(),
         plausible=True,
         plausibility="0.37 µT/A; up to 1 µT/A occurs.",
@@ -283,7 +283,7 @@ def _unknown(channels, _has_time):
         parameters=(EffectParameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
         p_value=0.045,
         evidence=(
-            held_out_gain.as_result(
+            prediction.held_out_gain_result(
                 HeldOut(0.0021, (-0.0004, 0.0046), 0.5214, 0.5198, "µT"), "Blocks of 4 s with gaps of 1 s."
             ),
         ),

@@ -8,9 +8,9 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import choose_input_hold, fit_baseline, open_loop
+from mkc_torch.diagnosis.model.process_noise import choose_input_hold, fit_alone
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation import Dynamics, Parameter
 from mkc_torch.simulation.dynamics.first_fit import strong_observer
@@ -94,7 +94,7 @@ def swung(disturbance="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
 def fitted_under_noise(recording, system=Pendulum):
     """Fit a simulation without effects, under its most likely noise."""
     prepared = system().prepare(recording).with_input_hold({"torque": "held"})
-    baseline = fit_baseline(prepared, {}, NoiseSettings())
+    baseline = fit_alone(prepared, {}, NoiseSettings())
     return choose_input_hold(baseline, {}, {"torque": "held"}, NoiseSettings())
 
 
@@ -123,4 +123,4 @@ def at_the_truth(disturbance="white", seed=0):
 
 def candidates(fit, effects):
     """Return the candidates for a search at a fit."""
-    return candidate_terms(open_loop(fit.model.prepared), (), effects)
+    return candidate_terms(fit.model.prepared.open_loop(), (), effects)

@@ -8,11 +8,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.search.linearise import linearise
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter

@@ -9,7 +9,7 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits, size_of
 from mkc_torch.simulation import Magnetometer, Static
-from mkc_torch.simulation.protocol import Port
+from mkc_torch.simulation.ports import Port
 from tests.diagnosis.factory import make_follows
 
 N = 4000
@@ -22,7 +22,8 @@ def randn(*size, seed=0):
 
 
 def simulating(measured, channels=("angle",), unit="rad"):
-    return SimpleNamespace(measured=measured, channels=channels, unit=unit, ports={})
+    recording = SimpleNamespace(names=channels)
+    return SimpleNamespace(measured=measured, channels=channels, unit=unit, ports={}, recording=recording)
 
 
 def followed(measured, residual, declared=None, floor=None, **more):
@@ -136,8 +137,7 @@ def test_the_variation_of_a_length_is_that_of_isotropic_readings():
     assert followed(turning, 0.5 * randn(N, 1), channels=("norm",), unit="µT")[0].explained > 0.99
 
 
-def test_without_recorded_outputs_there_is_no_goodness_of_fit():
-    assert goodness_of_fit(SimpleNamespace(channels=("gap",), unit="", ports={}), randn(N, 1), {}, None) == ()
+def test_without_a_recorded_column_for_each_output_there_is_no_goodness_of_fit():
     assert followed(randn(N, 3), randn(N, 2), channels=("a", "b")) == ()
 
 

@@ -14,7 +14,7 @@ import torch
 import mkc_torch.diagnosis
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis import Settings
-from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import (
     ConfirmationSettings,
     DriverSettings,
@@ -25,13 +25,13 @@ from mkc_torch.diagnosis.settings import (
 )
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.test_stepwise import BLOCKS, NOTHING, evidence, located
+from tests.diagnosis.pipeline.test_stepwise import BLOCKS, NOTHING, evidence, located
 from tests.simulation.tumbling import tumbling
 
 ROOT = Path(mkc_torch.diagnosis.__file__).parent
 SOURCES = sorted(ROOT.rglob("*.py"))
 STAGES = [field.default.__class__ for field in fields(Settings)]
-holds = importlib.import_module("mkc_torch.diagnosis.stepwise")._holds
+holds = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")._holds
 
 
 def is_number(node):

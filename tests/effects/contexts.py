@@ -5,7 +5,7 @@ import torch
 from mkc_torch.effects import DYNAMICS, PAIRED, Context
 from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.outputs import ALL, output_ports
-from mkc_torch.simulation.protocol import SignalSizes
+from mkc_torch.simulation.ports import SignalSizes
 
 UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m"), "any": ("V",), "spin": ("rad/s",)}
 

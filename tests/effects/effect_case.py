@@ -13,7 +13,7 @@ import torch
 from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
 from mkc_torch.effects.waveforms import outer_product
 from mkc_torch.simulation.dynamics.ports import memory_at
-from mkc_torch.simulation.protocol import SignalSizes
+from mkc_torch.simulation.ports import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
 NONLINEAR = ("delay", "clock_drift", "backlash")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch._support.unit_text import duration
-from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.parts import Alternative, Finding
 from mkc_torch.effects import DYNAMICS, kind_of, words_of
 from mkc_torch.effects.dynamics.constant_force import ConstantForce

@@ -6,8 +6,8 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import CATALOGUE, GainEffect
 from mkc_torch.simulation import Magnetometer

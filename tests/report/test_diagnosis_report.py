@@ -9,18 +9,9 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 from mkc_torch.density import ChannelTails
-from mkc_torch.diagnosis.evidence import (
-    density,
-    driver_shift,
-    extrapolation,
-    held_out_gain,
-    intermittency,
-    onset,
-    remaining,
-)
+from mkc_torch.diagnosis.evidence import prediction, remaining, residual_noise, timing
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import (
     CandidateScore,
     DensityCheck,
@@ -170,7 +161,7 @@ def test_names_and_texts_from_files_are_escaped_everywhere():
     (parameter, *_) = first.parameters
     (rival, *_) = first.alternatives
     hostile = first_changed(
-        hostile, held_out_gain.as_result(None, bad),
+        hostile, prediction.held_out_gain_result(None, bad),
         EvidenceResult("bad", rows=(Row(bad, bad),), table=Table(bad, (bad,), ((bad,),), bad)),
         drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, plausibility=bad,
         parameters=(dataclasses.replace(parameter, name=bad, unit=bad),),
@@ -258,7 +249,9 @@ def test_a_smooth_correction_worse_than_the_findings_is_not_reported():
 def graded(gain, interval, before, after):
     """Headline, tone and advice on a step with this held-out evidence, and its diagnosis."""
     held_out = HeldOut(gain, interval, before, after, "µT")
-    diagnosis = first_changed(make_diagnosis(1, samples=240), held_out_gain.as_result(held_out, ""), alternatives=())
+    diagnosis = first_changed(
+        make_diagnosis(1, samples=240), prediction.held_out_gain_result(held_out, ""), alternatives=()
+    )
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
     return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
 
@@ -348,7 +341,7 @@ def test_event_times_and_the_label_of_each_number_are_shown():
 def test_an_intermittent_step_is_reported_as_intermittent():
     intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
     diagnosis = first_changed(
-        make_diagnosis(1, samples=4500), onset.as_result((5.9, 6.3)), intermittency.as_result(True),
+        make_diagnosis(1, samples=4500), timing.onset_result((5.9, 6.3)), timing.intermittency_result(True),
         onset=6.2, intervals=intervals, alternatives=(),
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
@@ -392,7 +385,9 @@ def test_the_noise_has_units_and_its_density_is_compared():
         DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
         DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
     ]
-    changed = with_evidence(dataclasses.replace(made, noise=noise), density.as_result(checks, EvidenceSettings()))
+    changed = with_evidence(
+        dataclasses.replace(made, noise=noise), residual_noise.as_result(checks, EvidenceSettings())
+    )
     text = text_of(diagnosis_report(changed))
     assert "Is the density right? channel distance of the density" in text
     assert "drift of the offset 0.379 µT, its standard deviation over the recording" in text
@@ -463,7 +458,7 @@ def test_extrapolation_of_a_finding_is_reported():
         (-0.02, (-0.12, 0.09), "it is not significant at high values: −0.020"),
         (-0.3, (-0.4, -0.2), "it degrades the prediction at high values: −0.300"),
     ):
-        result = extrapolation.as_result(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
+        result = prediction.extrapolation_result(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
         text = text_of(diagnosis_report(first_changed(diagnosis, result)))
         assert f"beyond its range fitted at low values of its driver, {label}" in text
 
@@ -472,7 +467,7 @@ def test_the_gain_of_shifted_copies_of_the_driver_is_reported():
     for as_good, text in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
             make_diagnosis(1, samples=240),
-            driver_shift.as_result(DriverShift(38, as_good, 22.5), BY_LOAD, EvidenceSettings()),
+            timing.driver_shift_result(DriverShift(38, as_good, 22.5), BY_LOAD, EvidenceSettings()),
             drivers=("load",),
         )
         verb = "gain" if as_good > 1 else "gains"

@@ -10,7 +10,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.result import DivergedBlock, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis import environment, unseen
 from mkc_torch.report.diagnosis import verdict as top
@@ -231,7 +231,7 @@ def test_each_output_has_its_own_residual_sizes_and_noise_floor():
     )
     traces = dataclasses.replace(made.traces, channels=("angle", "rate"), unit="")
     made = dataclasses.replace(made, traces=traces, findings=tuple(
-        with_evidence(f, held_out_gain.as_result(held, "")) for f in made.findings
+        with_evidence(f, prediction.held_out_gain_result(held, "")) for f in made.findings
     ))  # fmt: skip
     for item in (made, dataclasses.replace(made, findings=made.findings[:1])):
         text = text_of(diagnosis_report(item))

@@ -15,12 +15,12 @@ pytest.importorskip("rich")
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.environment import NoiseEnvironment, ShapeCheck
-from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
+from mkc_torch.diagnosis.pipeline.build import FitAssessment, verdict_of
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, EffectParameter, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_follows
@@ -71,7 +71,7 @@ def findings(draw, place):
         ),
         plausible=draw(st.booleans()),
         plausibility="such sizes occur",
-        evidence=(held_out_gain.as_result(held, "" if held else "One side of it is too short."),),
+        evidence=(prediction.held_out_gain_result(held, "" if held else "One side of it is too short."),),
     )
     shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
     grade = "nearest" if shape is not None and shape.curve is not None else grade_of(finding)
@@ -92,7 +92,7 @@ class Case:
 
 @st.composite
 def diagnoses(draw):
-    """A diagnosis built as `mkc_torch.diagnosis.build` does it, with its grades, verdict and advice."""
+    """A diagnosis built as `mkc_torch.diagnosis.pipeline.build` does it, with its grades, verdict and advice."""
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
     found = [item for item in found if not (item.grade == "unconfirmed" and is_zero_within_error(item))]
     white = draw(st.booleans())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mkc_torch.recording import Recording
 from mkc_torch.simulation import Dynamics
 from mkc_torch.simulation.continuation import Continuation
-from mkc_torch.simulation.protocol import Answer
+from mkc_torch.simulation.ports import Answer
 
 TIME = torch.linspace(0.0, 6.0, 121, dtype=torch.float64)
 

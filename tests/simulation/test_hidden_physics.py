@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import DriverSettings, NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
@@ -309,7 +309,7 @@ def test_a_recorded_spin_drives_the_lift():
     truth = runge_kutta(turned(lambda t: 0.01 * spun(t)), [0.0, 1.0, 20.0, 5.0], TIME)
     recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spun(TIME))
     simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
-    from mkc_torch.diagnosis.model.drivers import find_drivers
+    from mkc_torch.diagnosis.model.term import find_drivers
 
     (driver,) = find_drivers(
         simulation.recording, simulation.system.columns, DriverSettings(), frozenset({"spin"})

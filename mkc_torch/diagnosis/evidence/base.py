@@ -10,11 +10,10 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
 from mkc_torch.diagnosis.goodness_of_fit import units_of
-from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, Row, SmoothCorrection, Table
+from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation.protocol import PreparedSimulation

@@ -1,4 +1,4 @@
-"""Whether the drifts of several channels have a common cause: one course along one direction."""
+"""A cause that was not recorded: drift of all axes along one direction, and columns that only stand for it."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.drift import DriftStatistics
-from mkc_torch.diagnosis.linearised.linear_search import log_survival
-from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
-from mkc_torch.diagnosis.linearised.tangents import SlowBasis
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import ANY, Term
 from mkc_torch.diagnosis.noise.cosine_basis import course_of
+from mkc_torch.diagnosis.noise.drift import DriftStatistics
+from mkc_torch.diagnosis.search.estimate import drift_residuals
+from mkc_torch.diagnosis.search.linear_search import log_survival
+from mkc_torch.diagnosis.search.linearise import LinearisedSearch, linearise
+from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.search.tangents import SlowBasis, tangents_of
 from mkc_torch.effects.context import Shape
-from mkc_torch.effects.sensor.unrecorded import COURSE
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
-__all__ = ["CommonCause", "common_cause"]
+__all__ = ["CommonCause", "common_cause", "course_without", "goes_on", "located_cause", "proxy_driver_evidence"]
 
 _ROUNDS, _SETTLED = 40, 1e-2
 """Maximum number of MM iterations, and the gain in nats below which they stop."""
@@ -144,3 +151,94 @@ def _free(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
     inner = root @ covariance @ seen @ covariance @ root
     values, vectors = torch.linalg.eigh(0.5 * (inner + inner.mT))
     return inverse @ (vectors * values.clamp(min=0.0).sqrt()) @ vectors.mT @ inverse
+
+
+def located_cause(base: FittedModel, located: SearchResult, level: float, surrogates: int) -> SearchResult | None:
+    """Return the search result with a common cause of the channels' drifts; None without a common cause.
+
+    Args:
+        base: fit without findings.
+        located: result of a search without a significant candidate.
+        level: rate of false alarms.
+        surrogates: number of surrogates of the other p-values, which limits the smallest p-value.
+    """
+    slow, share = located.scene.tangents.slow, located.scene.settings.confirmation.unrecorded
+    cause = common_cause(located.tested_search, slow)
+    if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > share * level:
+        return None
+    model, start = _with_cause(base, cause.direction, cause.shape)
+    term = model.terms[-1]
+    fit = fitted_with_effect(base, model, start, graduate=False)
+    others = [replace(ranked, gap=max(cause.gain - ranked.gain, 0.0)) for ranked in located.ranking]
+    return replace(
+        located,
+        term=term,
+        fit=fit,
+        p_value=max(cause.p_value / share, 1.0 / (1 + surrogates)),
+        beyond=0.0,
+        stretch=None,
+        ranking=(Ranked(len(located.scene.terms), cause.gain, 0.0), *others),
+        look=located.look.with_more([term]),
+    )
+
+
+def course_without(
+    base: FittedModel, located: SearchResult, train: Bool[Tensor, " N"]
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """Return the model with the course estimated from training samples only, and a start.
+
+    Args:
+        base: fit without findings.
+        located: result of :func:`located_cause`.
+        train: mask of the training samples.
+    """
+    counts = located.scene.counts * train.unsqueeze(-1)
+    known = linearise(
+        base.model,
+        base.parameters,
+        counts * located.scene.values,
+        counts,
+        located.scene.tangents.bare,
+        spectrum=located.look.linearised.spectrum,
+    )
+    direction = -located.fit.model.gammas(located.fit.parameters)[-1]
+    cause = common_cause(known, located.scene.tangents.slow)
+    if cause is None:
+        return _with_cause(base, torch.zeros_like(direction), located.term.shape)
+    cause = cause.towards(direction)
+    return _with_cause(base, cause.direction, cause.shape)
+
+
+def _with_cause(
+    base: FittedModel, direction: Float[Tensor, " c"], shape: Shape
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    # the residual is recording minus prediction
+    return base.model.with_term(Term(Unrecorded(), None, shape)), torch.cat([base.parameters, -direction])
+
+
+def proxy_driver_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Warn if the column of the last finding may be a proxy of an unrecorded cause."""
+    if not case.ahead:
+        return EvidenceResult("stand_in", False)
+    name = ", ".join(case.fit.model.terms[-1].columns)
+    sentence = (
+        f"With {name} as driver, the offset still drifts along the same direction: {name} may be a proxy of an "
+        "unrecorded cause. Find the cause and record it."
+    )
+    return EvidenceResult("stand_in", True, warnings=(sentence,))
+
+
+def goes_on(case: EvidenceContext) -> bool:
+    """Whether the residual drift has the direction of the last finding."""
+    fit, settings = case.fit, case.settings
+    last = fit.model.terms[-1] if fit.model.terms else None
+    if last is None or last.driver is None or last.driver.role != ANY or last.port != Unrecorded.port:
+        return False
+    tangents = tangents_of(fit.model, fit.parameters, settings.noise)
+    left = drift_residuals(fit, fit.model, fit.parameters, tangents, settings.noise)
+    cause = common_cause(left.noise, left.slow)
+    gamma = fit.model.gammas(fit.parameters)[-1]
+    if cause is None or cause.p_value > settings.evidence.stand_in or len(gamma) != len(cause.direction):
+        return False
+    cosine = torch.nn.functional.cosine_similarity(gamma, cause.direction, dim=0)
+    return float(cosine.abs()) >= settings.evidence.stand_in_along

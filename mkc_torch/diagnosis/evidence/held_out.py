@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.functional import mkc_nll
 

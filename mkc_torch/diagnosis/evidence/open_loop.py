@@ -12,12 +12,11 @@ from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out, on_all
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
-from mkc_torch.diagnosis.model.process_noise import has_process_noise, open_loop, refit_open_loop
+from mkc_torch.diagnosis.model.process_noise import has_process_noise, refit_open_loop
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["OpenLoop", "open_loop_evidence", "running_unjudged"]
 
@@ -83,8 +82,7 @@ def running_unjudged(base: FittedModel, alone: FittedModel | None, found: tuple[
 
 def _of_sensors(fit: FittedModel) -> bool:
     """Whether a fit has drift but no process noise, so that its parameters are those of an open-loop fit."""
-    prepared = fit.model.prepared
-    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
+    observer = fit.model.prepared.observer
     return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
 
 
@@ -93,7 +91,7 @@ _Run = tuple[FittedModel, Evidence]
 
 def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
     """Simulate open loop with a fit's parameters, and on each fold with the parameters without it."""
-    model = JointModel(open_loop(fit.model.prepared), fit.model.terms, fit.model.near)
+    model = JointModel(fit.model.prepared.open_loop(), fit.model.terms, fit.model.near)
     residual = model.residual(fit.parameters).detach()
     if not bool(residual.isfinite().all()):
         return _refitted(fit, known, blocks, alone)
@@ -128,7 +126,7 @@ def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks, alone: Fitte
 
 
 def _from_alone(fit: FittedModel, alone: FittedModel) -> FittedModel | None:
-    model = JointModel(open_loop(fit.model.prepared), fit.model.terms, alone.model.near)
+    model = JointModel(fit.model.prepared.open_loop(), fit.model.terms, alone.model.near)
     start = torch.cat([alone.parameters, fit.parameters.new_zeros(model.size - alone.model.size)])
     try:
         return fitted(model, start, fit.bound, graduate=False)

@@ -1,4 +1,4 @@
-"""Warning for intervals in which the final fit rejects most samples."""
+"""Evidence of few samples: rejected stretches, and effects whose evidence lies in one short stretch."""
 
 from __future__ import annotations
 
@@ -7,19 +7,46 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.recording.disturbance import RejectedInterval, disturbed_intervals
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["rejected_warning", "test"]
+__all__ = ["called", "localised_evidence", "rejected_evidence", "rejected_warning"]
+
+
+def localised_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Return a warning with the interval."""
+    located, time = case.first, case.prepared.time
+    if located is None or located.stretch is None:
+        return EvidenceResult("one_stretch")
+    begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
+    sentence = (
+        f"From {begin:.1f} to {end:.1f} s the residual fits {called(located.term)}, but hardly elsewhere. Other "
+        f"intervals "
+        "misfit too and no effect explains them, so this interval counts as a burst of outliers. Record again, for "
+        "longer."
+    )
+    return EvidenceResult("one_stretch", (begin, end), warnings=(sentence,))
+
+
+def called(term: Term) -> str:
+    """Return the name of a candidate in a sentence."""
+    if term.effect.unrecorded:
+        return "an unrecorded cause"
+    along = "a curve along" if term.effect.is_curve else f"{term.effect.id} by"
+    if term.columns:
+        return f"{along} {', '.join(term.columns)}"
+    return "an unnamed curve" if term.effect.is_curve else term.effect.id
+
 
 _MOST_LISTED = 3
 """Largest number of intervals that are listed, the longest."""
 
 
-def test(case: EvidenceContext) -> EvidenceResult:
+def rejected_evidence(case: EvidenceContext) -> EvidenceResult:
     """Return a warning with the intervals; none for a recording without times."""
     if case.prepared.recording.time is None:
         return EvidenceResult("rejected")

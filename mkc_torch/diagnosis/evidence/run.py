@@ -1,17 +1,40 @@
-"""Run the tests of evidence after the search; their expensive parts run in parallel before."""
+"""Run the tests of evidence: all of them, or the fast tests of a quick look; expensive parts run ahead."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
-from mkc_torch.diagnosis.linearised.estimate import FinalEstimate, estimate
+from mkc_torch.diagnosis.evidence.prediction import held_out_gain_evidence, held_out_gain_result
+from mkc_torch.diagnosis.evidence.rejected import localised_evidence, rejected_evidence
+from mkc_torch.diagnosis.evidence.residual_noise import whiteness_evidence
+from mkc_torch.diagnosis.search.estimate import FinalEstimate, estimate
 
-__all__ = ["EvidenceReport", "precompute", "run_tests"]
+__all__ = ["EvidenceReport", "all_results", "in_short", "precompute", "results_of_tests"]
+
+
+def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
+    """Return the fast tests.
+
+    Args:
+        held_out: whether findings were scored on held-out blocks.
+    """
+    blocks = held_out_gain_evidence if held_out else _not_judged
+    return (
+        EvidenceTest(blocks, each_finding=True),
+        EvidenceTest(localised_evidence),
+        EvidenceTest(rejected_evidence),
+        EvidenceTest(whiteness_evidence),
+    )
+
+
+def _not_judged(_: EvidenceContext) -> EvidenceResult:
+    return held_out_gain_result(None, "no held-out blocks in a quick look, or the search was stopped before")
 
 
 @dataclass(frozen=True)
@@ -31,7 +54,14 @@ def precompute(case: EvidenceContext, tests: Sequence[EvidenceTest] = TESTS) -> 
     return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(_final, case)]
 
 
-def run_tests(case: EvidenceContext, done: Sequence[Any], tests: Sequence[EvidenceTest] = TESTS) -> EvidenceReport:
+def all_results(case: EvidenceContext, tests: Sequence[EvidenceTest], known: Iterable[object] = ()) -> EvidenceReport:
+    """Run the tests, their expensive parts in parallel; ``known`` holds objects that every process has."""
+    return results_of_tests(case, shared(precompute(case, tests), known, "test of evidence"), tests)
+
+
+def results_of_tests(
+    case: EvidenceContext, done: Sequence[Any], tests: Sequence[EvidenceTest] = TESTS
+) -> EvidenceReport:
     """Run the tests in their order, with the results of :func:`precompute`."""
     *ahead, final = done
     case = replace(case, estimate=final)

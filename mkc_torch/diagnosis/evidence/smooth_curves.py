@@ -11,10 +11,10 @@ from torch import Tensor
 
 from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
+from mkc_torch.diagnosis.model.term import Driver
 from mkc_torch.diagnosis.noise.cosine_basis import cosines
-from mkc_torch.simulation.protocol import Port
+from mkc_torch.simulation.ports import Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

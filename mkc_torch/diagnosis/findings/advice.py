@@ -1,18 +1,37 @@
-"""Advice of a diagnosis: actions for each finding, and how to distinguish it from its rivals."""
+"""Advice: what to do or to record next, and where a magnetometer's misfit may come from."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
 from mkc_torch._support.unit_text import tidy
-from mkc_torch.diagnosis.environment import ProcessNoise
+from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
 from mkc_torch.diagnosis.findings.grading import change, transfers, worth_correcting
-from mkc_torch.diagnosis.findings.misfit import follows_all
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.effects.kinds import MOTION
 
-__all__ = ["advice_of", "nothing_shows"]
+__all__ = ["advice_of", "follows", "follows_all", "nothing_shows"]
+
+_FLOOR = 2.0
+"""Residual, in noise floors, up to which an output that hardly varies counts as fitted."""
+
+
+def follows(fit: GoodnessOfFit) -> bool:
+    """Whether the residual of an output is smaller than that of its mean, or at the sensor's noise.
+
+    Example:
+        >>> still = GoodnessOfFit("angle", "rad", 0.0051, 0.005, -0.04, 0.005, "declared", 0.005, 0.007)
+        >>> lost = GoodnessOfFit("angle", "rad", 0.36, 0.35, -0.06, 0.005, "declared", 0.35, 0.02)
+        >>> follows(still), follows(lost)
+        (True, False)
+    """
+    return fit.residual < fit.rmse_of_mean or fit.residual <= _FLOOR * fit.noise_floor
+
+
+def follows_all(environment: NoiseEnvironment) -> bool:
+    """Whether :func:`follows` holds for each output."""
+    return all(follows(fit) for fit in environment.goodness_of_fit)
 
 
 def nothing_shows(diagnosis: Diagnosis) -> bool:

@@ -1,9 +1,9 @@
-"""Convert a located effect to a finding."""
+"""Findings: their sizes, curves and doubts, and how well they are separable from other candidates."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,24 +11,106 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.forward_mode import make_dual
-from mkc_torch._support.unit_text import ratio, tidy
+from mkc_torch._support.unit_text import ratio, sized, tidy
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
-from mkc_torch.diagnosis.findings.doubts import far_from_plausible, shape_at_ends
 from mkc_torch.diagnosis.findings.experiment_design import SAME, distinguishing_state
-from mkc_torch.diagnosis.findings.formula import formulas
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
+from mkc_torch.diagnosis.findings.shape import formulas
+from mkc_torch.diagnosis.model.shapes import reach_of
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference
+from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference, Separability
+from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
+__all__ = [
+    "ended_shapes",
+    "far_from_plausible",
+    "finding_of",
+    "intervals_of",
+    "labels",
+    "parameters_of",
+    "places_of",
+    "separability",
+    "shape_at_ends",
+    "times_plausible",
+]
+
+FAR = 10.0
+"""Multiple of the plausible size above which a finding is unconfirmed."""
+
+_AT_END = 0.01
+"""Relative distance within which a number is at a bound."""
+
+
+def shape_at_ends(term: Term, prepared: PreparedSimulation, context: Context) -> tuple[str, ...]:
+    """Return a sentence for each shape parameter at a bound.
+
+    Args:
+        term: the effect with its fitted shape.
+        prepared: the simulation.
+        context: context of the effect.
+    """
+    return tuple(_ended(term, prepared, context))
+
+
+def far_from_plausible(term: Term, gamma: Tensor, context: Context) -> str:
+    """Return why the amplitude is impossible: at its bound, or above :data:`FAR` times a plausible size; else empty.
+
+    Args:
+        term: the effect.
+        gamma: its amplitude.
+        context: context of the effect.
+    """
+    first = term.effect.quantities(term.shape, context)[0]
+    largest, most = float(gamma[: first.size].abs().max()), term.effect.upper
+    name = first.name.replace("_", " ")
+    # an upper bound of 1 is a share, which may be 1
+    if 1.0 < most < math.inf and _near(largest, most):
+        return f"Its {name} ended at {sized(most, tidy(first.unit))}, the upper bound: the recording does not limit it."
+    times = times_plausible(term, gamma, context)
+    if times is not None and times > FAR:
+        return f"Its {name} is {times:.2g} times the largest plausible size ({term.effect.source})."
+    return ""
+
+
+def times_plausible(term: Term, gamma: Tensor, context: Context) -> float | None:
+    """Return the largest number of the first quantity as a multiple of the plausible size; None if that is unknown."""
+    first, limit = term.effect.quantities(term.shape, context)[0], term.effect.plausible
+    times = ratio(term.effect.plausible_unit or first.unit, first.unit)
+    if not math.isfinite(limit) or times is None:
+        return None
+    return float(gamma[: first.size].abs().max()) / (limit * times)
+
+
+def _ended(term: Term, prepared: PreparedSimulation, context: Context) -> Iterator[str]:
+    for name, side in ended_shapes(term, prepared).items():
+        text = sized(float(term.shape[name]), tidy(term.effect.unit_of_shape(name, context)))
+        yield (
+            f"{term.effect.id}: its {name.replace('_', ' ')} ended at {text}, the {side} bound: this recording "
+            "does not determine it. Other physics may act there, or the recording is too short."
+        )
+
+
+def ended_shapes(term: Term, prepared: PreparedSimulation) -> dict[str, str]:
+    """Return the fitted shape parameters that ended at a bound without a physical meaning, and which bound."""
+    found = {}
+    for name, ends in reach_of(term, prepared).items():
+        for side, end in zip(("least", "greatest"), ends, strict=True):
+            if side not in term.effect.natural_ends.get(name, ()) and _near(float(term.shape[name]), end):
+                found[name] = side
+    return found
+
+
+def _near(value: float, end: float) -> bool:
+    return abs(value - end) <= _AT_END * abs(end)
+
 
 _MOST_ALTERNATIVES = 5
 """Number of listed alternatives; inseparable ones are always listed."""
@@ -310,4 +392,33 @@ def labels(terms: Sequence[Term]) -> tuple[str, ...]:
         + (f" ({', '.join(t.columns)})" if t.columns else "")
         + (f" at {t.port}" if (t.effect.id, t.columns) in several else "")
         for t in terms
+    )
+
+
+_MOST = 8
+"""Largest number of candidates in the matrix."""
+
+
+def separability(located: SearchResult) -> Separability:
+    """Return the separability of the leading candidates at their best shapes, in the metric of the noise.
+
+    The trace of a candidate is its tangent along the best γ, orthogonal to the simulation's parameters. The share is
+    the
+    squared norm that remains after projection on the rival, relative to the norm before.
+    """
+    numbers = [ranked.number for ranked in located.ranking[:_MOST]]
+    traces, spaces, left = [], [], []
+    for number in numbers:
+        trace, space, kept = located.look.linearised.search.trace(number, located.look.linearised.series)
+        traces.append(trace)
+        spaces.append(space)
+        left.append(kept)
+    share = torch.ones(len(numbers), len(numbers), dtype=torch.float64)
+    for i, trace in enumerate(traces):
+        length = float(trace.square().sum())
+        for j, space in enumerate(spaces):
+            taken = float((space.mT @ trace).square().sum())
+            share[i, j] = max(0.0, 1.0 - taken / length) if i != j and length > 0 else 0.0
+    return Separability(
+        labels([located.scene.terms[n] for n in numbers]), share, torch.tensor(left, dtype=torch.float64)
     )

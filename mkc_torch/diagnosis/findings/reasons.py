@@ -15,16 +15,15 @@ from mkc_torch.diagnosis.environment import GoodnessOfFit
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["at_ends", "reasons_of", "wrong_turns"]
+__all__ = ["at_ends", "reasons_of"]
 
 _NOUGHT = 1e-3
 """Relative value below which a parameter is nearly 0."""
@@ -56,8 +55,8 @@ class _Trial:
 
 def at_ends(fit: FittedModel) -> tuple[str, ...]:
     """Return the parameters of the equations that were fitted to a bound."""
-    prepared = fit.model.prepared
-    if not isinstance(prepared, PreparedDynamics):
+    prepared = fit.model.prepared.dynamics
+    if prepared is None:
         return ()
     found = []
     for number, (name, known) in enumerate(prepared.known.items()):
@@ -71,11 +70,6 @@ def at_ends(fit: FittedModel) -> tuple[str, ...]:
     return tuple(found)
 
 
-def wrong_turns(prepared: PreparedSimulation) -> str:
-    """Return the fault of the recorded rotation; empty without a fault."""
-    return getattr(prepared, "wrong_turns", "")
-
-
 def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> tuple[str, ...]:
     """Return the reasons in sentences, the most likely first.
 
@@ -83,12 +77,12 @@ def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) ->
         fits: of the simulation without findings: the best one-step predictor, and its open-loop fit if any.
         follows: goodness of fit of each output.
     """
-    prepared = fits[0].model.prepared
-    if turns := wrong_turns(prepared):
-        return (turns,)
-    if not isinstance(prepared, PreparedDynamics):
+    known = fits[0].model.prepared
+    if known.faults:
+        return known.faults
+    if known.dynamics is None:
         return ("Check signs, units and the order of columns: they may be of another quantity.",)
-    prepared = prepared.observed(None)
+    prepared = known.dynamics.open_loop()
     sentences = _of_trials(prepared, fits, follows)
     ends = at_ends(fits[0])
     sentences += [

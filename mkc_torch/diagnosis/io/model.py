@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mkc_torch.diagnosis.correcting_model import CorrectingModel
 from mkc_torch.diagnosis.io.python_source import SourceError, python_source
-from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
-from mkc_torch.diagnosis.model.term import Term, context_at
+from mkc_torch.diagnosis.model.term import Driver, Term, context_at
+from mkc_torch.diagnosis.result import CorrectingModel
+from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
@@ -26,7 +25,8 @@ from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation.dynamics import Dynamics
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
-from mkc_torch.simulation.protocol import Change, CorrectableSimulation, Correction, Simulation
+from mkc_torch.simulation.ports import Change
+from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, Simulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -216,7 +216,7 @@ def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
     parameters = final.fit.parameters
-    of_recordings = {offset.name for offset in getattr(model.prepared, "own_offsets", ())}
+    of_recordings = {offset.name for offset in model.prepared.own_offsets}
     own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(
         model.prepared.name,

@@ -11,9 +11,8 @@ from torch import Tensor
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -117,8 +116,7 @@ def _fit(
         covariance=None,
         max_iter=60,
         tol=1e-7,
-        # a user's equations are many small operations
-        jacobian="reverse twice" if isinstance(model.prepared, PreparedDynamics) else "forward",
+        jacobian=model.prepared.jacobian,
     )
     there = model.begun_with(way.near(found.theta))
     residual = there.residual(found.theta).detach()

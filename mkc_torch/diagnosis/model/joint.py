@@ -17,8 +17,9 @@ from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.waveforms import apply_basis, outer_product
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
-from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation
+from mkc_torch.simulation.continuation import CompiledResidual, Continuation, is_plain
+from mkc_torch.simulation.ports import Answer, Change, FreeChange, Nearby
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -56,7 +57,7 @@ class JointModel:
         """The simulation's prior, padded with zero precision for the effects."""
         settled = self._settled
         prepared = self.prepared
-        known = prepared.prior_given(settled) if settled and isinstance(prepared, Clocked) else prepared.prior
+        known = prepared.prior_given(settled) if settled else prepared.prior
         if known is None or not self.terms:
             return known
         more = known.mean.new_zeros(self.size - self.base)
@@ -183,7 +184,7 @@ class JointModel:
 
     @cached_property
     def _compiled(self) -> CompiledResidual | None:
-        return compiled_residual(self.prepared, self._meaning, self.size)
+        return self.prepared.compiled(self._meaning, self.size)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the compiled residual; another process compiles it again."""

@@ -15,8 +15,8 @@ from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.no_first_fit import no_first_fit
-from mkc_torch.diagnosis.model.parallel import run_parallel
-from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start, with_strong_observer
@@ -33,9 +33,10 @@ __all__ = [
     "choose_input_hold",
     "estimate_noise",
     "first_samples",
-    "fit_baseline",
+    "fit_alone",
     "fit_with_process_noise",
-    "open_loop",
+    "has_process_noise",
+    "noise_of_fit",
     "refit_input_hold",
     "refit_noise",
     "refit_open_loop",
@@ -87,24 +88,25 @@ class ProcessNoiseFit:
         return 0 if self.noise is None else len(self.noise.selected.disturbances)
 
 
-def open_loop(prepared: PreparedSimulation) -> PreparedSimulation:
-    """Return the simulation in open loop."""
-    return prepared.observed(None) if isinstance(prepared, PreparedDynamics) else prepared
-
-
 def first_samples(prepared: PreparedSimulation) -> Tensor | None:
     """Mask the samples that determine a run's initial states; None for a simulation without states."""
-    if not isinstance(prepared, PreparedDynamics):
+    system = prepared.dynamics
+    if system is None:
         return None
-    index = torch.arange(len(prepared.time))
-    first = torch.where(prepared.begins, index, 0).cummax(0).values
-    return index - first < _FIRST * len(prepared.system.states)
+    index = torch.arange(len(system.time))
+    first = torch.where(system.begins, index, 0).cummax(0).values
+    return index - first < _FIRST * len(system.system.states)
 
 
 def has_process_noise(fit: FittedModel) -> bool:
     """Whether a fit is under more noise than the sensors' white noise."""
-    prepared = fit.model.prepared
-    return isinstance(prepared, PreparedDynamics) and prepared.observer is not None
+    return fit.model.prepared.observer is not None
+
+
+def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
+    """Return the noise model of a fit; None for a simulation without states."""
+    system = fit.model.prepared.dynamics
+    return None if system is None else noise_of(system, declared)
 
 
 def estimate_noise(
@@ -121,12 +123,12 @@ def estimate_noise(
         settings: of the noise.
         known: a similar noise, whose disturbances only get new sizes; None to select the disturbances.
     """
-    prepared, model = fit.model.prepared, fit.model
-    if not isinstance(prepared, PreparedDynamics):
+    model, system = fit.model, fit.model.prepared.dynamics
+    if system is None:
         return None
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
     return most_likely_noise(
-        prepared,
+        system,
         theta,
         changes,
         model.near,
@@ -137,7 +139,7 @@ def estimate_noise(
     )
 
 
-def fit_baseline(
+def fit_alone(
     prepared: PreparedSimulation,
     declared: Mapping[str, float],
     settings: NoiseSettings,
@@ -152,21 +154,22 @@ def fit_baseline(
         NoFitError: no start has a finite result; the message lists what was tried.
     """
     model, starts = JointModel(prepared), [prepared.start()]
-    if not isinstance(prepared, PreparedDynamics):
+    system = prepared.dynamics
+    if system is None:
         try:
             return fit_with_process_noise(_wider(fitted(model, starts[0]), settings), declared, settings, model=model)
         except NoFitError as error:
             raise NoFitError(no_first_fit(prepared)) from error
-    short = multiple_shooting_start(prepared, prepared.given)
+    short = multiple_shooting_start(system, system.given)
     starts += [] if short is None else [short]
     free = _best_open_loop(model, starts)
     if free is not None:
         keep(ProcessNoiseFit(free, free, None, len(starts)))
     if free is not None and _explains(free):
         return fit_with_process_noise(_wider(free, settings), declared, settings, more_starts=starts[1:], model=model)
-    others = other_starts(prepared, starts[0], _OTHER_STARTS)
-    guesses = (prepared.given, *others.starts)
-    works = [partial(multiple_shooting_start, prepared, guess, shortest=True) for guess in guesses]
+    others = other_starts(system, starts[0], _OTHER_STARTS)
+    guesses = (system.given, *others.starts)
+    works = [partial(multiple_shooting_start, system, guess, shortest=True) for guess in guesses]
     further = [start for start in run_parallel(works, prepared) if start is not None]
     more = [fit for fit in (free, _best_open_loop(model, [*others.starts, *further])) if fit is not None]
     free = _wider(max(more, key=lambda fit: fit.log_likelihood), settings) if more else None
@@ -224,8 +227,9 @@ def fit_with_process_noise(
     assert own is not None
     bound = None if free is None else free.bound
     works = [partial(_from_short, own, start, bound, declared, settings) for start in more_starts]
-    if more_starts and isinstance(own.prepared, PreparedDynamics):
-        works.append(partial(_from_given, own, own.prepared.given, bound, declared, settings))
+    system = own.prepared.dynamics
+    if more_starts and system is not None:
+        works.append(partial(_from_given, system, bound, declared, settings))
     if free is not None and not works:
         works = [partial(_under_noise, free, noise, declared, settings)]
     tried = run_parallel(works, own.prepared)
@@ -266,8 +270,6 @@ def refit_input_hold(
     Without the effects, another hold may have replaced them.
     """
     prepared = fit.model.prepared
-    if not isinstance(prepared, PreparedDynamics):
-        return fit
     for name, how in prepared.input_hold.items():
         for other in ("held", "linear"):
             if name in fixed or other == how:
@@ -277,16 +279,15 @@ def refit_input_hold(
                 under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
             except NoFitError:
                 continue
-            found = refit_noise(shape_fitted(under), noise_of(moved, declared), declared, settings)
+            found = refit_noise(shape_fitted(under), noise_of_fit(under, declared), declared, settings)
             if found.log_likelihood > fit.log_likelihood:
                 fit, prepared = found, found.model.prepared
-                assert isinstance(prepared, PreparedDynamics)
     return fit
 
 
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
     """Fit the same joint model in open loop; None if that loses the recording."""
-    prepared = open_loop(fit.model.prepared)
+    prepared = fit.model.prepared.open_loop()
     if prepared is fit.model.prepared:
         return fit
     model = JointModel(prepared, fit.model.terms, fit.model.near)
@@ -319,9 +320,7 @@ def _under_noise(
     for _ in range(_ROUNDS):
         if noise is None:
             break
-        prepared = fit.model.prepared
-        assert isinstance(prepared, PreparedDynamics)
-        model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+        model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
         try:
             fit = fitted(model, fit.parameters, fit.bound, graduate=False)
         except NoFitError:
@@ -343,9 +342,8 @@ def _from_short(
     settings: NoiseSettings,
 ) -> _Found | None:
     """Fit from parameters that predict over short horizons, along a strongly correcting observer."""
-    prepared = model.prepared
-    assert isinstance(prepared, PreparedDynamics)
-    observed = with_strong_observer(prepared, start, _STRONG)
+    system = model.prepared.dynamics
+    observed = None if system is None else with_strong_observer(system, start, _STRONG)
     if observed is None:
         return None
     strong = JointModel(observed, model.terms)
@@ -359,16 +357,14 @@ def _from_short(
 
 
 def _from_given(
-    model: JointModel,
-    start: Float[Tensor, " p"],
+    system: PreparedDynamics,
     bound: Float[Tensor, " m"] | None,
     declared: Mapping[str, float],
     settings: NoiseSettings,
 ) -> _Found | None:
     """Fit under the noise around a user's own values, because a missing effect can drive any fit without it away."""
-    prepared = model.prepared
-    assert isinstance(prepared, PreparedDynamics)
-    strong = with_strong_observer(prepared, start, _STRONG)
+    start = system.given
+    strong = with_strong_observer(system, start, _STRONG)
     if strong is None or bound is None:
         return None
     least, most = settings.disturbance_gain, settings.max_disturbances
@@ -376,7 +372,7 @@ def _from_given(
     if noise is None or noise.observer is None:
         return None
     try:
-        fit = fitted(JointModel(prepared.observed(noise.observer)), start, bound, graduate=False)
+        fit = fitted(JointModel(system.observed(noise.observer)), start, bound, graduate=False)
     except NoFitError:
         return None
     return _under_noise(fit, estimate_noise(fit, declared, settings), declared, settings)
@@ -393,9 +389,7 @@ def choose_input_hold(
         fixed: inputs whose hold is known.
         settings: of the noise.
     """
-    prepared = open_loop(base.fit.model.prepared)
-    if not isinstance(prepared, PreparedDynamics):
-        return base
+    prepared = base.fit.model.prepared.open_loop()
     for name, how in prepared.input_hold.items():
         others = [hold for hold in ("held", "linear") if hold != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
@@ -407,13 +401,11 @@ def choose_input_hold(
 
 def _with_sizes(base: ProcessNoiseFit) -> ProcessNoiseFit:
     """Return the fit with its trajectory as the guess of all states, including those that no output shows."""
-    known, near = base.fit.model.prepared, base.fit.model.near
-    assert isinstance(known, PreparedDynamics)
+    near = base.fit.model.near
 
     def moved(fit: FittedModel) -> FittedModel:
-        prepared = fit.model.prepared
-        assert isinstance(prepared, PreparedDynamics)
-        return replace(fit, model=JointModel(prepared.guessed(near), (), fit.model.near))
+        system = fit.model.prepared.dynamics
+        return fit if system is None else replace(fit, model=JointModel(system.guessed(near), (), fit.model.near))
 
     free = None if base.free is None else moved(base.free)
     return replace(base, free=free, fit=free if base.fit is base.free and free is not None else moved(base.fit))
@@ -422,13 +414,11 @@ def _with_sizes(base: ProcessNoiseFit) -> ProcessNoiseFit:
 def _holding(
     base: ProcessNoiseFit, name: str, how: str, declared: Mapping[str, float], settings: NoiseSettings
 ) -> ProcessNoiseFit | None:
-    known = base.fit.model.prepared
-    assert isinstance(known, PreparedDynamics)
-    prepared = known.with_input_hold({name: how})
+    prepared = base.fit.model.prepared.with_input_hold({name: how})
     free = None
     try:
         if base.free is not None:
-            model = JointModel(prepared.observed(None), (), base.free.model.near)
+            model = JointModel(prepared.open_loop(), (), base.free.model.near)
             free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
         if free is not None:
             running = replace(fit_with_process_noise(free, declared, settings), starts=base.starts)

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.quantum import rounding_of
-from mkc_torch.diagnosis.linearised.tangents import ModelTangents
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
-from mkc_torch.diagnosis.search.quick import COUNTS, COUNTS_NOT, price
+from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, price
+from mkc_torch.diagnosis.search.tangents import ModelTangents
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
@@ -224,8 +224,9 @@ def joint_likelihood(
 def _scene(
     base: FittedModel, terms: Sequence[Term], tangents: ModelTangents, counts: Tensor
 ) -> _LinearisedRecording | None:
-    prepared, model = base.model.prepared, base.model
-    assert isinstance(prepared, PreparedDynamics)
+    model, prepared = base.model, base.model.prepared.dynamics
+    if prepared is None:
+        return None
     flow = flow_of(prepared, base.parameters[: model.base], model.changes(base.parameters), model.near)
     if flow is None or not all(
         np.isfinite(values).all() for values in (flow.transition, flow.seen, flow.new, flow.shift)

@@ -1,28 +1,36 @@
-"""Joint fits, each under its own remaining noise, and the penalty of that noise."""
+"""Joint fits under their own remaining noise: its penalty, backward elimination, and open-loop fits of candidates."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
 
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect, without_term
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import estimate_noise
-from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.process_noise import estimate_noise, noise_of_fit
+from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, noise_of
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["noise_of_fit", "priced", "with_own_noise"]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["free_runs", "linear_gains", "needless_term", "priced", "with_own_noise", "without"]
 
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
     """Return the joint fit of a candidate, with its shape, under the most likely sizes of the remaining noise."""
     noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
-    prepared = fit.model.prepared
-    if noise is None or not isinstance(prepared, PreparedDynamics):
+    if noise is None:
         return shape_fitted(fit)
-    model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+    model = JointModel(fit.model.prepared.observed(noise.observer), fit.model.terms, fit.model.near)
     try:
         again = fitted(model, fit.parameters, fit.bound, graduate=False, fresh=True)
     except NoFitError:
@@ -32,14 +40,146 @@ def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Se
 
 def priced(fit: FittedModel, settings: Settings) -> float:
     """Return the log-likelihood less the penalty of the disturbances in a fit's noise."""
-    prepared = fit.model.prepared
-    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
+    observer = fit.model.prepared.observer
     return fit.log_likelihood - settings.noise.disturbance_gain * (
         0 if observer is None else len(observer.disturbances)
     )
 
 
-def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
-    """Return the noise model of a fit."""
-    prepared = fit.model.prepared
-    return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None
+def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> int | None:
+    """Return the number of an effect that does not pay its penalty given the others; None if all do.
+
+    The penalty of an effect is half the logarithm of the number of samples for each of its numbers and each fitted
+    number of its shape (Schwarz, Annals of Statistics 6, 1978, 461), plus the limit of separability.
+
+    Args:
+        fit: with several effects.
+        declared: known standard deviations of the outputs' white noise.
+        settings: thresholds.
+    """
+    count = len(fit.model.terms)
+    if count < 2:
+        return None
+    works = [partial(_loss, fit, number, declared, settings) for number in range(count)]
+    losses = run_parallel(works, fit.model.prepared, fit.model.terms)
+    weakest = min(range(count), key=losses.__getitem__)
+    return weakest if losses[weakest] < settings.naming.separable else None
+
+
+def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> float:
+    """Nats by which the fit without an effect is less likely, less the effect's penalty."""
+    less = without(fit, number, declared, settings)
+    if less is None:
+        return math.inf
+    numbers = fit.model.sizes[number] + len(fit.model.terms[number].effect.fitted_shape)
+    price = 0.5 * numbers * math.log(len(fit.residual))
+    return priced(fit, settings) - priced(less, settings) - price
+
+
+def without(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> FittedModel | None:
+    """Return the joint fit without one of its effects, under its remaining noise; None if it fails."""
+    start = without_term(fit, number)
+    try:
+        return with_own_noise(fitted(start.model, start.parameters, fit.bound, graduate=False), declared, settings)
+    except NoFitError:
+        return None
+
+
+PHYSICS = 8
+"""Number of effects that are fitted in open loop."""
+
+SHAPES = 2
+"""Number of initial shapes for each effect."""
+
+BEHIND_NATS = 50.0
+"""Fits farther behind the largest gain than this many nats are dropped, if also beyond the share below."""
+
+BEHIND_SHARE = 0.5
+"""Share of the largest gain by which a dropped fit is behind."""
+
+
+def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> list[tuple[int, FittedModel]]:
+    """Fit in open loop the candidates that gain most over the open-loop simulation.
+
+    Args:
+        free: the open-loop fit without a candidate.
+        terms: candidates.
+        settings: of the diagnosis.
+
+    Returns:
+        For each effect the number of its initial term, and its fit.
+    """
+    gains, sizes = linear_gains(free, terms, settings)
+    chosen = _chosen(gains, terms)
+    if not chosen:
+        return []
+    known = free.model.prepared, [terms[number] for number in chosen]
+    works = [partial(_fit, free, terms[number], sizes[number]) for number in chosen]
+    best: dict[Key, tuple[int, FittedModel]] = {}
+    for number, fit in zip(chosen, run_parallel(works, *known), strict=True):
+        key = terms[number].key
+        if key not in best or fit.log_likelihood > best[key][1].log_likelihood:
+            best[key] = number, fit
+    kept = _near([fit.log_likelihood - free.log_likelihood for _, fit in best.values()])
+    leading = [pair for pair, near in zip(best.values(), kept, strict=True) if near]
+    shaped = run_parallel([partial(shape_fitted, fit) for _, fit in leading], *known)
+    return [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
+
+
+def linear_gains(
+    free: FittedModel, terms: Sequence[Term], settings: Settings
+) -> tuple[list[float], list[Float[Tensor, " q"]]]:
+    """Return gains of candidates in the linearised model with white noise, and their sizes.
+
+    Args:
+        free: the fit to linearise at.
+        terms: candidates.
+        settings: of the diagnosis.
+
+    Returns:
+        Log-likelihood ratios in nats, 0 for a size whose sign the physics does not allow; and the sizes.
+    """
+    tangents = tangents_of(free.model, free.parameters, settings.noise, terms)
+    values, counts = free.pseudo(settings.noise)
+    weight = counts / free.d
+    y = (values * weight).flatten()
+    own = torch.linalg.qr((tangents.nuisance * weight.unsqueeze(-1)).flatten(0, 1))[0]
+    y = y - own @ (own.mT @ y)
+    power, samples = float(y.square().sum()), float(counts.sum())
+    gains, sizes = [], []
+    for term, columns in zip(terms, tangents.candidates, strict=True):
+        moved = (columns * weight.unsqueeze(-1)).flatten(0, 1)
+        moved = moved - own @ (own.mT @ moved)
+        scale = moved.norm(dim=0).clamp(min=1e-300)
+        size = -torch.linalg.lstsq(moved / scale, y.unsqueeze(-1), driver="gelsd").solution[:, 0] / scale
+        within = size.clamp(term.effect.lower, term.effect.upper)
+        left = float((y + moved @ within).square().sum())
+        better = math.isfinite(left) and left < power
+        gains.append(0.5 * samples * math.log(power / max(left, 1e-300)) if better else 0.0)
+        sizes.append(within)
+    return gains, sizes
+
+
+def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
+    """Return the leading effects, each at its shapes that gain most.
+
+    Far from the solution the linear gains are unreliable, so no leading effect is dropped because of its gain.
+    """
+    order = sorted(range(len(terms)), key=lambda number: -gains[number])
+    able = [number for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
+    keys = list(dict.fromkeys(terms[number].key for number in able))[:PHYSICS]
+    return [n for key in keys for n in [n for n in able if terms[n].key == key][:SHAPES]]
+
+
+def _near(gains: Sequence[float]) -> list[bool]:
+    """Whether each gain is near enough to the largest."""
+    largest = max(gains, default=0.0)
+    least = min(largest - BEHIND_NATS, (1.0 - BEHIND_SHARE) * largest)
+    return [gain >= least for gain in gains]
+
+
+def _fit(free: FittedModel, term: Term, size: Float[Tensor, " q"]) -> FittedModel:
+    model = free.model.with_term(term)
+    starts = (torch.cat([free.parameters, size]), torch.cat([free.parameters, torch.zeros_like(size)]))
+    fits = [fitted_with_effect(free, model, start, graduate=False) for start in starts]
+    return max(fits, key=lambda fit: fit.log_likelihood)

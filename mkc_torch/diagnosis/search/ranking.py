@@ -1,17 +1,146 @@
-"""Rank candidates: each effect at its best shape, by its penalised gain."""
+"""The order of candidates: the prior of their models, ties, and the ranking by penalised gains."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
-from mkc_torch.diagnosis.model.term import Key, continuous
-from mkc_torch.diagnosis.search.linearized import LinearizedSearch
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.ties import in_order
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous
+from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
+from mkc_torch.diagnosis.search.problem import LinearizedSearch
+from mkc_torch.diagnosis.settings import NamingSettings
+from mkc_torch.simulation.protocol import PreparedSimulation
 
-__all__ = ["Ranked", "ranked"]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ModelPrior", "Ranked", "alike", "best_first", "in_order", "ranked", "schwarz"]
+
+AKAIKE = 1.0
+"""Nats per number (Akaike's criterion)."""
+
+
+class ModelPrior:
+    """Penalties of candidates, in nats.
+
+    Args:
+        terms: all candidates; their drivers of known role are the reference for other columns.
+        prepared: the simulation of the recording.
+        settings: the penalties.
+    """
+
+    def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation, settings: NamingSettings) -> None:
+        drivers = {
+            id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, "position")
+        }
+        courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
+        self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
+        self._prepared = prepared
+        self._settings = settings
+
+    def penalty(self, term: Term, gain: float) -> float:
+        """Return the penalty of a candidate, to be subtracted from its gain before a comparison."""
+        share, give = 0.0, self._settings
+        fixed = self._of_form(term)
+        if term.effect.is_curve:
+            fixed, share = give.nameless, give.over_motion if term.driver is None else give.over_driver
+        if term.driver is not None and term.driver.role == ANY:
+            follows = self._alike(term.driver.values[:, 0]) > give.alike_columns
+            share += give.follower if follows else give.roleless
+        elif term.driver is None and term.effect.has_waveform and not term.effect.follows_signal:
+            course = term.effect.waveform(term.shape, term.context(self._prepared, None))
+            share += give.event if self._alike(course) > give.alike_event else 0.0
+        return fixed + share * max(gain, 0.0)
+
+    def score(self, fit: FittedModel, base: FittedModel) -> float:
+        """Return the gain in nats less Schwarz's penalty and the candidate's penalty."""
+        gain = fit.log_likelihood - base.log_likelihood
+        score = gain - schwarz(fit) * fit.model.sizes[-1]
+        return score - self.penalty(fit.model.terms[-1], gain)
+
+    def score_with_shape(self, fit: FittedModel, base: FittedModel) -> float:
+        """Return the score less Schwarz's penalty of the fitted shape numbers."""
+        return self.score(fit, base) - schwarz(fit) * _fitted_numbers(fit.model.terms[-1])
+
+    def by_innovations(self, first: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
+        """Return the nats by which ``other`` is preferred for coloured noise, which a joint fit takes for white.
+
+        Each fit is penalised for every number, and for a form that includes others as special cases. 0 if either
+        candidate has another penalty, because those are defined for likelihoods.
+        """
+        terms = [fit.model.terms[-1] for fit in (first, other)]
+        forms = [self._of_form(term) for term in terms]
+        if any(self.penalty(term, 1.0) > form for term, form in zip(terms, forms, strict=True)):
+            return 0.0
+        sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (first, other)]
+        return (
+            agreed_innovation_gain(first.residual, other.residual)
+            - price * (sizes[1] - sizes[0])
+            - (forms[1] - forms[0])
+        )
+
+    def _of_form(self, term: Term) -> float:
+        """Return the penalty of a form that includes named forms as special cases."""
+        return self._settings.is_generalisation if term.effect.is_generalisation else 0.0
+
+    def _alike(self, course: Float[Tensor, " N"]) -> float:
+        """Return the largest absolute correlation with a known driver."""
+        return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
+
+
+def _fitted_numbers(term: Term) -> int:
+    """Number of fitted shape numbers."""
+    return len({*continuous(term), *term.effect.fitted_shape})
+
+
+def schwarz(fit: FittedModel) -> float:
+    """Nats per number by Schwarz's criterion."""
+    return 0.5 * math.log(len(fit.residual))
+
+
+def alike(first: Driver, other: Driver) -> float:
+    """Return the absolute correlation of two drivers of first column each; 0 for other drivers."""
+    if first.values.shape[1] != 1 or other.values.shape[1] != 1:
+        return 0.0
+    return abs(float(_unit(first.values[:, 0]) @ _unit(other.values[:, 0])))
+
+
+def _unit(course: Tensor) -> Tensor:
+    centred = course - course.mean()
+    return centred / torch.linalg.vector_norm(centred).clamp(min=1e-300)
+
+
+_TIE = 1e-6
+"""Nats within which scores are equal: rounding changes them by 1e-12, a sample by 1e-3 and more."""
+
+
+def in_order(scores: Sequence[float], terms: Sequence[Term]) -> list[int]:
+    """Return places by descending score; among equal scores the candidate with the fewest shape numbers comes first.
+
+    A body that is always under water and a constant force have the same effect: the simpler name is reported.
+
+    Args:
+        scores: of each candidate, in nats.
+        terms: the candidates.
+    """
+
+    def key(place: int) -> tuple[float, int, int]:
+        score = scores[place]
+        return -round(score / _TIE) if math.isfinite(score) else -score, len(terms[place].shape), place
+
+    return sorted(range(len(terms)), key=key)
+
+
+def best_first(fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior) -> list[FittedModel]:
+    """Return joint fits by descending score."""
+    scores = [prefer.score(fit, base) for fit in fits]
+    return [fits[place] for place in in_order(scores, [fit.model.terms[-1] for fit in fits])]
 
 
 @dataclass(frozen=True)

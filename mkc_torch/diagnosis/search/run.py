@@ -1,43 +1,40 @@
-"""Locate and name: the strongest candidate at a fit, its p-value after the whole search, and its rivals."""
+"""The search under white or coloured noise with drift, and the screening after a finding."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from mkc_torch._parallel.pool import speculative
-from mkc_torch.diagnosis.linearised.candidates import Candidates, one_after_the_other
-from mkc_torch.diagnosis.linearised.drift import NoiseFit
-from mkc_torch.diagnosis.linearised.drift_residuals import drift_residuals
-from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
-from mkc_torch.diagnosis.linearised.tangents import ModelTangents, tangents_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
-from mkc_torch.diagnosis.model.parallel import common_parts
-from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.noise.drift import NoiseFit
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
-from mkc_torch.diagnosis.search.joint_refits import refitted, strongest
-from mkc_torch.diagnosis.search.linearized import LinearizedSearch, SearchProblem
-from mkc_torch.diagnosis.search.localised import localised_stretch
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.p_value import surrogate_p_value
-from mkc_torch.diagnosis.search.quick import any_pays
-from mkc_torch.diagnosis.search.ranking import Ranked, ranked
-from mkc_torch.diagnosis.search.rivals import by_joint_fits
-from mkc_torch.diagnosis.search.shape_refinement import refine_candidates, refined, with_spectrum
+from mkc_torch.diagnosis.search.estimate import drift_residuals
+from mkc_torch.diagnosis.search.joint_refits import by_joint_fits, refitted, strongest
+from mkc_torch.diagnosis.search.linearise import LinearisedSearch
+from mkc_torch.diagnosis.search.problem import (
+    LinearizedSearch,
+    SearchProblem,
+    refine_candidates,
+    refined,
+    with_spectrum,
+)
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, ranked
+from mkc_torch.diagnosis.search.significance import any_pays, localised_stretch, surrogate_p_value
+from mkc_torch.diagnosis.search.tangents import Candidates, ModelTangents, one_after_the_other, tangents_of
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SearchResult", "run_search"]
+__all__ = ["SearchResult", "run_search", "screening_p_value"]
 
 
 @dataclass(frozen=True)
@@ -120,40 +117,34 @@ def run_search(
         values=left.values - left.counts * added,
         counts=left.counts,
     )
-    naming = partial(_named, best, scene, left.noise.spectrum, prefer, level)
-    known = [base, best, *terms, *scene.parts, *common_parts(base.model.prepared, scene.terms)]
-    # another process names the effect while this process computes the p-value
-    with speculative([naming], known) as answer:
-        look = seen = scene.under()
-        p_value, beyond = (
-            (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
-        )
-        noise, tested_search = look.noise, look.linearised
-        if p_value <= level and beyond < settings.search.doubted:
-            for spectrum in look.linearised.plausible(settings.noise.plausible):
-                p_other, beyond_other = _judged(scene.under(spectrum), tried, surrogates, generator)
-                p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
-        stretch = None
-        if p_value <= level:
-            own = int(torch.where(look.possible, look.gains.log_p[:, 0], 0.0).argmin())
-            trace = scene.counts * (scene.tangents.candidates[own] @ look.estimate(own))
-            stretch = localised_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
-        if stretch is not None:
-            rest = scene.without(stretch).under()
-            p_other, beyond_other = (
-                (any_pays(rest, rest.possible[:tried]), math.inf)
-                if quick
-                else _judged(rest, tried, surrogates, generator)
-            )
+    look = seen = scene.under()
+    p_value, beyond = (
+        (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
+    )
+    noise, tested_search = look.noise, look.linearised
+    if p_value <= level and beyond < settings.search.doubted:
+        for spectrum in look.linearised.plausible(settings.noise.plausible):
+            p_other, beyond_other = _judged(scene.under(spectrum), tried, surrogates, generator)
             p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
-            tested_search = rest.linearised
-        ranking = ranked(look, prefer)
-        keep(SearchResult(best.model.terms[-1], best, p_value, beyond, ranking, noise, seen, tested_search))
-        if p_value <= level:
-            [named] = answer()
-            best, ranking, seen = named.fit, named.ranking, named.look
-            # if the named candidate's own p-value is large, another candidate passed the surrogates
-            p_value = max(p_value, seen.own_p(best.model.terms[-1]))
+    stretch = None
+    if p_value <= level:
+        own = int(torch.where(look.possible, look.gains.log_p[:, 0], 0.0).argmin())
+        trace = scene.counts * (scene.tangents.candidates[own] @ look.estimate(own))
+        stretch = localised_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
+    if stretch is not None:
+        rest = scene.without(stretch).under()
+        p_other, beyond_other = (
+            (any_pays(rest, rest.possible[:tried]), math.inf) if quick else _judged(rest, tried, surrogates, generator)
+        )
+        p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
+        tested_search = rest.linearised
+    ranking = ranked(look, prefer)
+    keep(SearchResult(best.model.terms[-1], best, p_value, beyond, ranking, noise, seen, tested_search))
+    if p_value <= level:
+        named = _named(best, scene, left.noise.spectrum, prefer, level)
+        best, ranking, seen = named.fit, named.ranking, named.look
+        # if the named candidate's own p-value is large, another candidate passed the surrogates
+        p_value = max(p_value, seen.own_p(best.model.terms[-1]))
     if p_value <= level:
         best, ranking = by_joint_fits(best, ranking, seen, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
@@ -276,3 +267,36 @@ def _settled(fit: FittedModel, base: FittedModel) -> FittedModel:
         return fit
     again = fitted_with_effect(base, fit.model, fit.parameters, graduate=False)
     return again if again.log_likelihood > fit.log_likelihood else fit
+
+
+def screening_p_value(
+    located: SearchResult, possible: Sequence[bool], surrogates: int, generator: torch.Generator, *, quick: bool = False
+) -> float:
+    """Return the p-value of the strongest further candidate, in the linearisation of the search for an effect.
+
+    Candidates, noise and mask are those of that search. The effect's tangents are projected out of everything, like
+    those of the simulation's parameters. Nothing is refitted.
+
+    Args:
+        located: the effect.
+        possible: whether each of its ``terms`` would be a further finding.
+        surrogates: number of surrogates.
+        generator: of the surrogates.
+        quick: draw none; test whether a candidate gains more than its penalty.
+
+    Returns:
+        0 if an effect acts through a trajectory: there refits can find what the linearisation does not.
+    """
+    scene, own = located.scene, located.fit.model.terms[-1]
+    if any(scene.is_nonlinear(term) for term in (*scene.terms, own)):
+        return 0.0
+    remaining = located.look.given(own, located.fit)
+    mask = torch.tensor(list(possible)) & remaining.possible
+    if not bool(mask.any()):
+        return 1.0
+    if quick:
+        return any_pays(remaining, mask)
+    noise = scene.settings.noise
+    return surrogate_p_value(
+        remaining.linearised, remaining.noise, remaining.gains, mask, surrogates, generator, noise
+    )[0]

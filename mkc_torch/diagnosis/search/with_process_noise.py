@@ -11,31 +11,27 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.goodness_of_fit import size_of
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.process_noise import (
     estimate_noise,
     has_process_noise,
+    noise_of_fit,
     refit_input_hold,
     refit_noise,
     refit_open_loop,
 )
-from mkc_torch.diagnosis.model.shaped import shape_fitted
-from mkc_torch.diagnosis.model.term import Key, Term, continuous
-from mkc_torch.diagnosis.search.free_runs import free_runs
+from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
-from mkc_torch.diagnosis.search.linearized import SearchProblem
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced, with_own_noise
-from mkc_torch.diagnosis.search.quick import price
-from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.own_noise import free_runs, priced, with_own_noise
+from mkc_torch.diagnosis.search.problem import SearchProblem
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.search.ties import in_order
+from mkc_torch.diagnosis.search.significance import price
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["search_with_process_noise"]
 
@@ -198,10 +194,8 @@ def _kind(term: Term) -> Kind:
 
 def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) -> FittedModel:
     """Return the joint fit of a candidate, under its remaining process noise by the search."""
-    prepared = base.model.prepared
-    assert isinstance(prepared, PreparedDynamics)
     begin = found.start(number)
-    smaller = prepared.observed(begin.observer)
+    smaller = base.model.prepared.observed(begin.observer)
     start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
     model = JointModel(smaller, (*base.model.terms, term), base.model.near)
     size_zero = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])
@@ -271,9 +265,8 @@ def _under_own_noise(
     """Return an open-loop fit under the noise around it; unchanged if that loses the recording."""
     noise = estimate_noise(running, declared, settings.noise)
     if noise is not None and noise.observer is not None:
-        prepared = running.model.prepared
-        assert isinstance(prepared, PreparedDynamics)
-        observed = JointModel(prepared.observed(noise.observer), running.model.terms, running.model.near)
+        prepared = running.model.prepared.observed(noise.observer)
+        observed = JointModel(prepared, running.model.terms, running.model.near)
         try:
             running = fitted(observed, running.parameters, base.bound, graduate=False, fresh=True)
         except NoFitError:

@@ -9,11 +9,9 @@ from typing import Literal
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
-from mkc_torch.diagnosis.findings.advice import nothing_shows
+from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
-from mkc_torch.diagnosis.findings.misfit import follows_all
-from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.diagnosis.stop import notices
+from mkc_torch.diagnosis.result import Diagnosis, Finding, notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.words.numbers import size
 

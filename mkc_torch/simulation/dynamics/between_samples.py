@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.protocol import SignalTimes
+from mkc_torch.simulation.ports import SignalTimes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -11,7 +11,7 @@ from mkc_torch.nonlinear import fit
 from mkc_torch.simulation.continuation import Continuation
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Changes, Nearby
+from mkc_torch.simulation.ports import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

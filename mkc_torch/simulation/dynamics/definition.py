@@ -7,10 +7,12 @@ from typing import Any
 
 from torch import Tensor
 
+from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.user_functions import check_names
+from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter, SimulationError
 
 __all__ = ["Dynamics"]
@@ -67,6 +69,8 @@ class Dynamics:
     step: float | None = None
     initial_window: float | None = None
     joins_experiments: bool = True
+    own_offsets: tuple[OwnOffset, ...] = ()
+    measured: frozenset[str] = frozenset()
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:
         """Return the rate of change of each state, by name or in the order of ``states``.
@@ -115,6 +119,10 @@ class Dynamics:
     @property
     def columns(self) -> frozenset[str]:
         return frozenset({"time", "experiment", *self.inputs, *self.outputs, *self.states})
+
+    @property
+    def joint_clock(self) -> Clock:
+        return "restart" if self.joins_experiments else "follow"
 
     def prepare(self, recording: Recording) -> PreparedDynamics:
         """Prepare the simulation of a recording; the column ``experiment`` separates its runs.

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter
 
 __all__ = ["Equations"]
@@ -19,6 +20,7 @@ class Equations(Protocol):
         name: name of the simulation in ``diagnosis.json``.
         states, inputs, outputs, parameters, initial, units, input_hold, restart_after, step, initial_window: see
             :class:`mkc_torch.simulation.Dynamics`.
+        own_offsets: offsets of outputs in single recordings, the last parameters.
     """
 
     @property
@@ -43,6 +45,8 @@ class Equations(Protocol):
     def step(self) -> float | None: ...
     @property
     def initial_window(self) -> float | None: ...
+    @property
+    def own_offsets(self) -> tuple[OwnOffset, ...]: ...
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]: ...
     def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]: ...

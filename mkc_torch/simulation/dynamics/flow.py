@@ -13,7 +13,7 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.observer import Observable
 from mkc_torch.simulation.dynamics.trajectory import slopes, transition_matrices
-from mkc_torch.simulation.protocol import Changes, Nearby
+from mkc_torch.simulation.ports import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -24,7 +24,7 @@ from mkc_torch.simulation.dynamics.noise_selection import (
 )
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
 from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
-from mkc_torch.simulation.protocol import Changes, Nearby
+from mkc_torch.simulation.ports import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float

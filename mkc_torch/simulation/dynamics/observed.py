@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
+from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.own_offsets import OwnOffset
-from mkc_torch.simulation.protocol import Changes
+from mkc_torch.simulation.parameter import Parameter
+from mkc_torch.simulation.ports import Changes, FreeChange, Port, SignalTimes
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -41,20 +43,67 @@ class ObservedDynamics:
     clean: Tensor
     inputs_at_rows: Tensor
     kinematic: Mapping[str, str]
+    known: Mapping[str, Parameter]
+    guess: Tensor
+    clock: SignalTimes
+    begins: Tensor
+    parameter_names: tuple[str, ...]
+
+    @property
+    def ports(self) -> Mapping[str, Port]:
+        """The ports at which effects act."""
+        raise NotImplementedError
+
+    prior: GaussianPrior | None = None
+    faults: tuple[str, ...] = ()
+    jacobian: Literal["reverse twice"] = "reverse twice"
+    """A user's equations are many small operations."""
 
     def parameters_of(self, theta: Tensor) -> Names:
         """The parameters of the equations by name."""
-        raise NotImplementedError
+        return Names(**dict(zip(self.known, theta[: len(self.known)].unbind(), strict=True)))
 
     def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
-        """Ports whose effect has internal states, and these states."""
-        raise NotImplementedError
+        """Ports whose effect has internal states, and these states.
+
+        An effect has them if it returns their rates too when its signal contains them.
+        """
+        found = {}
+        for name, port in self.ports.items():
+            # a change that does not depend on the signal has no memory
+            if port.memory and name in changes and not isinstance(changes[name], FreeChange):
+                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + len(port.memory))
+                if changes[name](seen).shape[1] > len(port.channels):
+                    found[name] = port.memory
+        return found
+
+    def with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
+        """The states with missing internal states appended, equal to another state or 0."""
+        n = len(self.system.states)
+        more = [
+            states[:, self.system.states.index(like)] if like else states.new_zeros(len(states))
+            for like in memories[states.shape[1] - n :]
+        ]
+        return torch.cat([states[:, : n + len(memories)], *(column.unsqueeze(-1) for column in more)], -1)
+
+    def time_since_start(self) -> Float[Tensor, " N"]:
+        """Time since the start of each sample's run, in s."""
+        first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
+        return self.time - self.time[first]
+
+    @property
+    def beginnings(self) -> int:
+        """Number of parameters of single runs or recordings: offsets and initial states; they come last."""
+        return len(self.parameter_names) - len(self.known) + len(self.own_offsets)
+
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:  # noqa: ARG002
+        """The prior, which no effect changes."""
+        return self.prior
 
     @property
     def own_offsets(self) -> tuple[OwnOffset, ...]:
         """Offsets of outputs in single recordings; they are the last of the equations' parameters."""
-        found: tuple[OwnOffset, ...] = getattr(self.system, "own_offsets", ())
-        return found
+        return self.system.own_offsets
 
     @property
     def disturbable(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, slopes
-from mkc_torch.simulation.protocol import Answer, Changes, Nearby
+from mkc_torch.simulation.ports import Answer, Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

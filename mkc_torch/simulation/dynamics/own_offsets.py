@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.dynamics.equations import Equations
-from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.own_offsets import OwnOffset, determined_offsets
 from mkc_torch.simulation.parameter import Parameter
 
 if TYPE_CHECKING:
-    from jaxtyping import Int
+    from jaxtyping import Float, Int
 
-__all__ = ["with_own_offsets"]
+__all__ = ["equations_with_offsets"]
 
 
 class _Offset:
@@ -51,25 +48,30 @@ class _Offset:
         return shown
 
 
-def with_own_offsets(
-    prepared: PreparedDynamics, recording: Int[Tensor, " N"], names: Sequence[str]
-) -> PreparedDynamics:
-    """Add an offset of each output in each recording, as far as the recordings determine it.
+def equations_with_offsets(
+    system: Equations,
+    outputs: Sequence[str],
+    run: Int[Tensor, " N"],
+    tangents: Float[Tensor, "N m p"],
+    recording: Int[Tensor, " N"],
+    names: Sequence[str],
+) -> Equations | None:
+    """Add an offset of each output in each recording; None where the recordings determine no offset.
 
     Args:
-        prepared: the simulation of several recordings.
-        recording: (N,), index of the recording of each sample.
+        system: the equations.
+        outputs: names of the m compared outputs.
+        run: number of the run of each sample.
+        tangents: derivatives of the residual by the parameters.
+        recording: index of the recording of each sample.
         names: names of the recordings.
     """
-    load_forward_mode()
-    theta = prepared.start()
-    near = prepared.trajectory(theta, {})
-    tangents = torch.func.jacfwd(lambda values: prepared.residual(values, {}, near))(theta)
     if not bool(tangents.isfinite().all()):
-        return prepared
-    found = determined_offsets(tangents, prepared.channels, recording, names)
+        return None
+    found = determined_offsets(tangents, outputs, recording, names)
     if not found:
-        return prepared
-    of_run = recording.new_zeros(int(prepared.run.max()) + 1).scatter(0, prepared.run, recording)
-    system: Any = _Offset(prepared.system, found, of_run)
-    return PreparedDynamics(system, prepared.recording, prepared.channels)
+        return None
+    of_run = recording.new_zeros(int(run.max()) + 1).scatter(0, run, recording)
+    extended: Any = _Offset(system, found, of_run)
+    equations: Equations = extended
+    return equations

@@ -14,7 +14,7 @@ from mkc_torch.effects.kinds import CELSIUS, kind_of
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
-from mkc_torch.simulation.protocol import Port, SignalSizes, SignalTimes
+from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
+from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
@@ -24,6 +24,7 @@ from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.first_parameters import first_parameters
 from mkc_torch.simulation.dynamics.observed import ObservedDynamics
 from mkc_torch.simulation.dynamics.observer import Observer
+from mkc_torch.simulation.dynamics.own_offsets import equations_with_offsets
 from mkc_torch.simulation.dynamics.ports import RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
@@ -32,12 +33,12 @@ from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, 
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
-from mkc_torch.simulation.protocol import Answer, Changes, FreeChange, Nearby, Port, SignalTimes
+from mkc_torch.simulation.ports import Answer, Changes, Nearby, Port, SignalTimes
 from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["PreparedDynamics"]
 
@@ -50,8 +51,6 @@ _NOUGHT = 1e-3
 
 class PreparedDynamics(ObservedDynamics):
     """A system of differential equations with its recording; implements the protocol of a prepared simulation."""
-
-    prior: GaussianPrior | None = None
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
         self.system, self.recording, self.channels = system, recording, outputs
@@ -157,6 +156,21 @@ class PreparedDynamics(ObservedDynamics):
         other.observer = observer
         return other
 
+    @property
+    def dynamics(self) -> PreparedDynamics:
+        return self
+
+    def open_loop(self) -> PreparedDynamics:
+        return self.observed(None)
+
+    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> PreparedDynamics:
+        load_forward_mode()
+        theta = self.start()
+        near = self.trajectory(theta, {})
+        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta)
+        system = equations_with_offsets(self.system, self.channels, self.run, tangents, recording, names)
+        return self if system is None else PreparedDynamics(system, self.recording, self.channels)
+
     @cached_property
     def ports(self) -> dict[str, Port]:
         """The ports: the rate of each state, exchanges between states of the same unit, each input, and the outputs."""
@@ -164,11 +178,6 @@ class PreparedDynamics(ObservedDynamics):
             self.system, self.recording, self.channels, self.kinematic, self.guess[self.rows], self.clock, self.run
         )
         return places.ports()
-
-    @property
-    def beginnings(self) -> int:
-        """Number of parameters of single runs or recordings: offsets and initial states; they come last."""
-        return len(self.parameter_names) - self._p + len(self.own_offsets)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
         return self.observed(None)._start.clone()
@@ -320,34 +329,6 @@ class PreparedDynamics(ObservedDynamics):
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
-    def time_since_start(self) -> Float[Tensor, " N"]:
-        """Time since the start of each sample's run, in s."""
-        first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
-        return self.time - self.time[first]
-
-    def with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
-        """The states with missing internal states appended, equal to another state or 0."""
-        n = len(self.system.states)
-        more = [
-            states[:, self.system.states.index(like)] if like else states.new_zeros(len(states))
-            for like in memories[states.shape[1] - n :]
-        ]
-        return torch.cat([states[:, : n + len(memories)], *(column.unsqueeze(-1) for column in more)], -1)
-
-    def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
-        """Ports whose effect has internal states, and these states.
-
-        An effect has them if it returns their rates too when its signal contains them.
-        """
-        found = {}
-        for name, port in self.ports.items():
-            # a change that does not depend on the signal has no memory
-            if port.memory and name in changes and not isinstance(changes[name], FreeChange):
-                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + len(port.memory))
-                if changes[name](seen).shape[1] > len(port.channels):
-                    found[name] = port.memory
-        return found
-
     def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
         """The function for the rates of the states, the effects' internal states and the lasting disturbances."""
         inputs = self._inputs(theta, changes)
@@ -422,9 +403,6 @@ class PreparedDynamics(ObservedDynamics):
         u = namespace(self.system.inputs, self.inputs_at_rows)
         values = self.system.sensor(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
-
-    def parameters_of(self, theta: Tensor) -> Names:
-        return Names(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
 
     def _check_functions(self) -> None:
         theta = self.time.new_tensor([parameter.value for parameter in self.known.values()])

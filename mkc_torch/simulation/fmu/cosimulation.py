@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.fmu.description import Description, FmuError, the_library
 from mkc_torch.simulation.paired import Paired, PairedCorrection, PreparedPaired
@@ -28,6 +29,8 @@ class Simulated:
 
     name = Paired.name
     joins_experiments = True
+    measured: frozenset[str] = frozenset()
+    joint_clock: Clock = "restart"
 
     def __init__(self, description: Description) -> None:
         self.description = description

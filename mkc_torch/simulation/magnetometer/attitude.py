@@ -20,7 +20,7 @@ from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
-from mkc_torch.simulation.protocol import Changes, Nearby, Port
+from mkc_torch.simulation.ports import Changes, Nearby, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -10,7 +10,7 @@ import torch
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.magnetometer.view import AXES
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.ports import Changes, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,7 +14,7 @@ from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, VECTOR, View
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.ports import Changes, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -14,7 +14,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON, SYMMETRIC
 from mkc_torch.simulation.magnetometer.parts import Surface, ellipsoid_of_a_part, sphere_of_all
 from mkc_torch.simulation.magnetometer.view import AXES, View, length_of, thinned
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.ports import Changes, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from mkc_torch.recording.join_recordings import Clock
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView
 from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
@@ -45,6 +46,10 @@ class Magnetometer:
     @property
     def joins_experiments(self) -> bool:
         return False
+
+    @property
+    def joint_clock(self) -> Clock:
+        return "follow"
 
     @property
     def columns(self) -> frozenset[str]:

@@ -17,7 +17,8 @@ from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
-from mkc_torch.simulation.protocol import Changes, ClosedForm, FreeChange, Nearby, Port
+from mkc_torch.simulation.ports import Changes, FreeChange, Nearby, Port
+from mkc_torch.simulation.protocol import ClosedForm
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -50,8 +51,6 @@ class View(ClosedForm):
     ports: dict[str, Port]
     strength: float
     bounds: tuple[Tensor, Tensor] | None = None
-    wrong_turns: str = ""
-    """Sentences about the fault of the turns used in the comparison; empty if there is no fault."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording

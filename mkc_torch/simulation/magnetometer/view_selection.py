@@ -55,7 +55,7 @@ def chosen_view(recording: Recording) -> NormView | AttitudeView | GyroView:
 def requested_view(recording: Recording, use: str) -> NormView | AttitudeView | GyroView:
     """The view ``use``: "attitude", "gyro" or "norm", the length.
 
-    The fault of turns with a far larger residual than the length's is in the view's ``wrong_turns``.
+    The fault of turns with a far larger residual than the length's is in the view's ``faults``.
 
     Raises:
         NotIdentifiableError: this view does not determine the sensor.
@@ -120,9 +120,9 @@ class _Compared(Generic[V]):
         return _warned(self.length, f"The {self.what} is left out and the field's length is compared alone: {fault}")
 
     def with_fault(self) -> V:
-        """The view, with the fault of its turns in ``wrong_turns``."""
+        """The view, with the fault of its turns in ``faults``."""
         fault = self.fault()
-        self.view.wrong_turns = fault[:1].upper() + fault[1:]
+        self.view.faults = (fault[:1].upper() + fault[1:],)
         return self.view
 
     def fault(self) -> str:

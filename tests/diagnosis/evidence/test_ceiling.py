@@ -9,14 +9,12 @@ import torch
 from scipy import stats
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.remaining import _answerable, remaining
+from mkc_torch.diagnosis.evidence.remaining import Ceiling, _answerable, ceiling, remaining
 from mkc_torch.diagnosis.evidence.smooth_curves import curves_of, legendre, smooth_tangents
-from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term, find_drivers
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, EvidenceSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer

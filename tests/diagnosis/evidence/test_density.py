@@ -8,7 +8,7 @@ from scipy import stats
 from mkc_torch import MKCDistribution, diagnose
 from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.fit import fit_density
-from mkc_torch.diagnosis.evidence.density import (
+from mkc_torch.diagnosis.evidence.residual_noise import (
     density_checks,
     density_warnings,
     kolmogorov,

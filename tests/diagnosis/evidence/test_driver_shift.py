@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.driver_shift import as_result, shifted
-from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
+from mkc_torch.diagnosis.evidence.timing import driver_shift_result, shifted
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import Driver, Term, find_drivers
 from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.run import run_search
 from mkc_torch.diagnosis.settings import DriverSettings, EvidenceSettings, Settings
@@ -44,7 +43,7 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
 def warning(shift):
     effect = next(e for e in CATALOGUE if e.id == "current_field")
     column = Driver(("load",), "current", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return as_result(shift, Term(effect, column, {}), EvidenceSettings()).warnings
+    return driver_shift_result(shift, Term(effect, column, {}), EvidenceSettings()).warnings
 
 
 @pytest.mark.e2e

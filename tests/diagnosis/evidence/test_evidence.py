@@ -11,14 +11,15 @@ import torch
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
-from mkc_torch.diagnosis.evidence.run import precompute, run_tests
+from mkc_torch.diagnosis.evidence.run import precompute, results_of_tests
 from mkc_torch.diagnosis.io.diagnosis_json import _json, json_schema
-from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
+from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
-from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -64,7 +65,7 @@ def done(case):
 
 @pytest.fixture(scope="module")
 def answers(case, done):
-    return run_tests(case, done)
+    return results_of_tests(case, done)
 
 
 def everything(answers):
@@ -136,7 +137,7 @@ def test_warnings_are_in_the_order_of_the_tests(answers):
 def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
     before = [(tensor, tensor.clone()) for tensor in tensors((case, done), {})]
     random = torch.random.get_rng_state()
-    again = run_tests(case, done)
+    again = results_of_tests(case, done)
     assert [result.rows for result in everything(again)] == [result.rows for result in everything(answers)]
     assert [_json(result.keys) for result in everything(again)] == [
         _json(result.keys) for result in everything(answers)
@@ -150,7 +151,7 @@ def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
 def test_the_order_of_the_parts_makes_no_difference(case, answers):
     works = precompute(case)
     backwards = [work() for work in reversed(works)][::-1]
-    again = run_tests(case, backwards)
+    again = results_of_tests(case, backwards)
     assert [_json([result.content, result.keys]) for result in everything(again)] == [
         _json([result.content, result.keys]) for result in everything(answers)
     ]
@@ -167,6 +168,6 @@ def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
 
     mine = [EvidenceTest(test, ahead), EvidenceTest(test, ahead, each_finding=True), EvidenceTest(test)]
     works = precompute(replace(case, seed=3), mine)
-    answers = run_tests(replace(case, seed=3), [work() for work in works], mine)
+    answers = results_of_tests(replace(case, seed=3), [work() for work in works], mine)
     assert [result.value[:2] for result in answers.of_all] == [((3, 0), 0), (None, 0)]
     assert [result.value[:2] for (result,) in answers.of_findings] == [((3, k), k) for k in range(len(case.found))]

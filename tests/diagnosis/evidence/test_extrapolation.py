@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.extrapolation import as_result, extrapolated
-from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
+from mkc_torch.diagnosis.evidence.prediction import extrapolated, extrapolation_result
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term, find_drivers
 from mkc_torch.diagnosis.result import Extrapolation
 from mkc_torch.diagnosis.settings import DriverSettings, EvidenceSettings
 from mkc_torch.effects import CATALOGUE
@@ -51,7 +50,7 @@ def held_beyond(fits, seed=0):
 def warning(found):
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     load = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return as_result(found, Term(effect, load, {}), EvidenceSettings()).warnings
+    return extrapolation_result(found, Term(effect, load, {}), EvidenceSettings()).warnings
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():

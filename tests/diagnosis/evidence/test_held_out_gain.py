@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
-from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Term, find_drivers
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -53,7 +52,7 @@ def evidence_without_small(fits):
     found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
 
     def without(*evidence):
-        return held_out_gain.without_finding(EvidenceContext(none, None, found, evidence, blocks, (), 0, Settings()))
+        return prediction.without_finding(EvidenceContext(none, None, found, evidence, blocks, (), 0, Settings()))
 
     return without, [held_out(fit, blocks) for fit in fits]
 
@@ -77,7 +76,7 @@ def test_an_effect_confirmed_alone_is_not_evaluated_again(evidence_without_small
 
 @pytest.mark.e2e
 def test_a_diagnosis_notes_that_a_finding_was_evaluated_given_the_others(monkeypatch):
-    monkeypatch.setattr(held_out_gain, "_confirmed", lambda *_: False)
+    monkeypatch.setattr(prediction, "_confirmed", lambda *_: False)
     current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))
     sensor = np.outer(current, [0.6, -0.5, 0.6]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
     effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]

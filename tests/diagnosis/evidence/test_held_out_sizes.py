@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of
-from mkc_torch.diagnosis.evidence.held_out_sizes import kept_blocks, sizes_of
+from mkc_torch.diagnosis.evidence.prediction import kept_blocks, sizes_of
 from mkc_torch.diagnosis.result import DivergedBlock
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 
@@ -98,8 +98,8 @@ def test_without_any_kept_block_there_are_no_sizes():
     assert [block.number for block in diverged] == list(range(1, COUNT + 1))
 
 
-def test_without_measured_outputs_only_nonfinite_residuals_diverge():
-    apart = SimpleNamespace(channels=("angle", "speed"))
+def test_without_a_measured_column_for_each_output_only_nonfinite_residuals_diverge():
     quiet = noise(0.1, 3.0)
+    apart = SimpleNamespace(channels=("angle", "speed"), measured=quiet[:, :1])
     assert kept_blocks(apart, (evidence(with_diverged(quiet, 3, 1e9)),), BLOCKS)[1] == [[]]
     assert kept_blocks(apart, (evidence(with_diverged(quiet, 3, torch.nan)),), BLOCKS)[1] == [[3]]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.evidence.intermittency import comes_and_goes, memory_of
+from mkc_torch.diagnosis.evidence.timing import comes_and_goes, memory_of
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.simulation import Magnetometer

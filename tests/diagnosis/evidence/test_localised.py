@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import localised
+from mkc_torch.diagnosis.evidence import rejected
 from mkc_torch.diagnosis.evidence.base import EvidenceContext
-from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 
@@ -20,7 +19,7 @@ CASE = EvidenceContext(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED))
 
 
 def evidence_for(term, stretch):
-    return localised.test(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
+    return rejected.localised_evidence(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
 
 
 @pytest.mark.parametrize(
@@ -35,4 +34,4 @@ def test_a_localised_candidate_is_named_with_its_times(effect, driver, name):
 
 def test_a_candidate_without_a_stretch_or_no_candidate_has_no_warning():
     assert evidence_for(Term(EFFECTS["offset_drift"], None, {}), None).warnings == ()
-    assert localised.test(CASE).warnings == ()
+    assert rejected.localised_evidence(CASE).warnings == ()

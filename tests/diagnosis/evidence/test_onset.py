@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.onset import _CRITICAL, onset_interval
+from mkc_torch.diagnosis.evidence.timing import _CRITICAL, onset_interval
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.linearized import SearchProblem
+from mkc_torch.diagnosis.search.problem import SearchProblem
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.whiteness import whiteness
+from mkc_torch.diagnosis.evidence.residual_noise import whiteness
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.simulation import Magnetometer

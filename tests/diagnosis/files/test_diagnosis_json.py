@@ -9,10 +9,9 @@ import torch
 pytest.importorskip("jsonschema")
 
 from mkc_torch.density import ChannelTails
-from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, intermittency, onset
+from mkc_torch.diagnosis.evidence import prediction, residual_noise, timing
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
@@ -22,9 +21,9 @@ from mkc_torch.diagnosis.result import (
     HeldOut,
     Reference,
     Region,
+    Stop,
 )
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.stop import Stop
 from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.factory import make_diagnosis, with_evidence
 
@@ -79,7 +78,8 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 
 def test_what_is_for_the_report_alone_is_not_written():
     diagnosis = with_finding(
-        make_diagnosis(1), extrapolation.as_result(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings())
+        make_diagnosis(1),
+        prediction.extrapolation_result(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings()),
     )
     assert written(diagnosis) == written(make_diagnosis(1))
 
@@ -96,7 +96,9 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
 
 def test_what_shifted_copies_of_a_driver_gain_is_written():
     (finding,) = written(
-        with_finding(make_diagnosis(1), driver_shift.as_result(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings()))
+        with_finding(
+            make_diagnosis(1), timing.driver_shift_result(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings())
+        )
     )["findings"]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
@@ -108,7 +110,7 @@ def test_what_an_equation_needs_is_written():
         "parameters": (parameter,), "event_times": (61.1, 77.8), "advice": "Do it.",
         "references": (Reference("current", 10.5, "A"),),
     }  # fmt: skip
-    said = intermittency.as_result(True), onset.as_result((60.9, 61.2))
+    said = timing.intermittency_result(True), timing.onset_result((60.9, 61.2))
     (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["event_times"] == [61.1, 77.8]
@@ -128,7 +130,7 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     tails = (ChannelTails(31.5, 0.041, 0.006),)
     noise = dataclasses.replace(made.noise, units={"drift": "µT"}, unit="µT", tails=tails)
     stored = written(
-        with_evidence(dataclasses.replace(made, noise=noise), density.as_result([check], EvidenceSettings()))
+        with_evidence(dataclasses.replace(made, noise=noise), residual_noise.as_result([check], EvidenceSettings()))
     )["noise"]
     assert (stored["unit"], stored["units"]) == ("µT", {"drift": "µT"})
     assert stored["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
@@ -146,7 +148,8 @@ def test_results_of_a_new_test_are_under_its_id_and_the_key_order_is_kept():
         content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
     )
     made = with_evidence(
-        with_finding(make_diagnosis(1), said, onset.as_result((1.0, 2.0)), intermittency.as_result(True)), said
+        with_finding(make_diagnosis(1), said, timing.onset_result((1.0, 2.0)), timing.intermittency_result(True)),
+        said,
     )
     content = written(made)
     held_out = {
@@ -213,7 +216,7 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
     held_out = HeldOut(0.1, (-math.inf, 0.2), 1.0, 0.9, "µT")
     (rival, *_) = diagnosis.findings[0].alternatives
     gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
-    said = held_out_gain.as_result(held_out, "")
+    said = prediction.held_out_gain_result(held_out, "")
     stored = written(with_finding(diagnosis, said, parameters=(errors,), alternatives=(gap,)))
     (finding,) = stored["findings"]
     assert stored["ceiling"] is None
@@ -251,7 +254,7 @@ def test_a_stopped_search_has_its_reason_and_the_skipped_steps():
 
 def test_missing_evidence_needs_its_reason():
     with pytest.raises(DiagnosisFileError, match="held_out_note"):
-        diagnosis_to_json(with_finding(make_diagnosis(1), held_out_gain.as_result(None, "")))
+        diagnosis_to_json(with_finding(make_diagnosis(1), prediction.held_out_gain_result(None, "")))
 
 
 def test_a_verdict_agrees_with_its_findings():

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("jsonschema")
 
 from mkc_torch.diagnosis.environment import NoiseEnvironment
-from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, validate
 from mkc_torch.diagnosis.result import DivergedBlock, EvidenceResult, HeldOut, ResidualSizes
 from tests.diagnosis.factory import (
@@ -126,7 +126,7 @@ def test_grades_shapes_and_sizes_of_each_output_are_written():
         (DivergedBlock(7, before=True, after=False),), 25,
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)
-    finding = nearest(with_evidence(made.findings[0], held_out_gain.as_result(held, "")))
+    finding = nearest(with_evidence(made.findings[0], prediction.held_out_gain_result(held, "")))
     (stored,) = written(dataclasses.replace(made, findings=(finding,)))["findings"]
     assert stored["grade"] == "nearest"
     assert stored["shape"] == {"free_curve_gain": 163.0, "p_value": 0.002, "formula": "0.0071 |x|^1.52 sign(x)"}

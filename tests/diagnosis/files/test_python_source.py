@@ -6,8 +6,8 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.python_source import SourceError
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.effects.base import Effect

@@ -9,8 +9,7 @@ import torch
 from mkc_torch.calibration.exports import EXPORTS, Destination, ExportError
 from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.io.sensor_correction import sensor_correction
-from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.effects.sensor import CurrentField, HardIronStep, MagneticPole, TemperatureOffset
 from mkc_torch.recording.recording import Recording
 from tests.calibration.exports import formulas

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from mkc_torch.diagnosis.evidence import intermittency
+from mkc_torch.diagnosis.evidence import timing
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
@@ -48,7 +48,7 @@ def test_a_location_specific_finding_is_not_for_other_recordings():
 
 def test_an_intermittent_cause_is_to_be_found_and_not_corrected():
     made = make_diagnosis(1, samples=50)
-    step = dataclasses.replace(with_evidence(made.findings[0], intermittency.as_result(True)), alternatives=())
+    step = dataclasses.replace(with_evidence(made.findings[0], timing.intermittency_result(True)), alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
     assert only.startswith("Look for a cause that is switched on and off")
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.disturbances import forcing_of, process_noise_of
+from mkc_torch.diagnosis.findings.noise import forcing_of, process_noise_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.simulation.dynamics.first_fit import strong_observer

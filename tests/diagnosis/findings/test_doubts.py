@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.doubts import far_from_plausible, shape_at_ends, times_plausible
+from mkc_torch.diagnosis.findings.finding import far_from_plausible, shape_at_ends, times_plausible
 from mkc_torch.diagnosis.findings.grading import grade_of
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.environment import Curve
-from mkc_torch.diagnosis.findings.formula import formulas
+from mkc_torch.diagnosis.findings.shape import formulas
 
 
 def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", unit="m/s²"):

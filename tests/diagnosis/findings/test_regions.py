@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
 from tests.diagnosis.line import Line
-from tests.diagnosis.linearised.test_tangents import Offset
+from tests.diagnosis.search.test_tangents import Offset
 from tests.diagnosis.test_dynamics_diagnosis import Pendulum
 
 OF = {effect.id: effect for effect in DYNAMICS}

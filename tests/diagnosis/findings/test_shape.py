@@ -12,8 +12,8 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.findings.shape import nearest_power, shape_of
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.diagnosis.model.drivers import find_drivers, role_of
+from mkc_torch.diagnosis.model.term import find_drivers, role_of
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.recording.recording import Recording
 

@@ -10,7 +10,7 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model import process_noise
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import fit_baseline
+from mkc_torch.diagnosis.model.process_noise import fit_alone
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
@@ -81,7 +81,7 @@ def room():
 )
 def test_a_first_fit_that_diverges_is_restarted_elsewhere(simulation, recording, expected):
     prepared = simulation.prepare(recording)
-    found = fit_baseline(prepared, {}, Settings().noise)
+    found = fit_alone(prepared, {}, Settings().noise)
     assert found.fit.parameters[:2].tolist() == pytest.approx(expected, rel=0.2)
 
 

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.effects import CATALOGUE, GainEffect
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line, diagonal_prior, full_prior

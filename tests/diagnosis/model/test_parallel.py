@@ -3,11 +3,9 @@
 import torch
 
 from mkc_torch._parallel.pool import Serializer
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.parallel import common_parts
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term, common_parts
 from mkc_torch.effects import GainEffect
 from mkc_torch.recording import Recording
 from mkc_torch.simulation import Dynamics

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.linearised.estimate import estimate
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shaped import ShapedModel, shape_fitted
+from mkc_torch.diagnosis.model.shapes import ShapedModel, candidate_terms, reach_of, shape_fitted
+from mkc_torch.diagnosis.search.estimate import estimate
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter

@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.linearized import SearchProblem
-from mkc_torch.diagnosis.search.shape_refinement import middle, with_spectrum
+from mkc_torch.diagnosis.search.problem import SearchProblem, middle, with_spectrum
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -78,7 +77,7 @@ def test_a_fit_without_shape_numbers_or_convergence_is_unchanged(burst, monkeypa
     def lost(*args, **kwargs):
         return dataclasses.replace(fitted_with_effect(*args, **kwargs), converged=False)
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.shape_refinement.fitted_with_effect", lost)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.problem.fitted_with_effect", lost)
     assert with_spectrum(best, look) is best
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.noise.innovations import agreed_innovation_gain, innovation_gain
+from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain, innovation_gain
 
 N = 1500
 

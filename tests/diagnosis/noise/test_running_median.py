@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import median_filter
 
-from mkc_torch.diagnosis.noise.running_median import running_median
+from mkc_torch.diagnosis.noise.outliers import running_median
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=40), st.integers(0, 39))

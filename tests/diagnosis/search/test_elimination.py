@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.search.elimination import needless_term, without
-from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced
+from mkc_torch.diagnosis.model.process_noise import noise_of_fit
+from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
 from tests.diagnosis.swing import candidates, fitted_swing

@@ -6,15 +6,9 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.search.free_runs import (
-    BEHIND_NATS,
-    BEHIND_SHARE,
-    SHAPES,
-    free_runs,
-    linear_gains,
-)
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.search.own_noise import BEHIND_NATS, BEHIND_SHARE, SHAPES, free_runs, linear_gains
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.recording import Recording
@@ -117,8 +111,8 @@ def test_each_leading_effect_is_fitted_from_its_best_shapes(monkeypatch):
         tried.append(term)
         return free
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs._fit", fit_of)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs.PHYSICS", 3)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.own_noise._fit", fit_of)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.own_noise.PHYSICS", 3)
     fit = free_fit(DRAG)
     terms = all_terms(fit)
     free_runs(fit, terms, Settings())

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.search.joint_likelihood import joint_likelihood
+from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid

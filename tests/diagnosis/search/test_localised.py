@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.search.localised import localised_stretch
+from mkc_torch.diagnosis.search.significance import localised_stretch
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, RATE, tumbling, turns

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
+from mkc_torch.diagnosis.search.ranking import ModelPrior
 from mkc_torch.diagnosis.settings import DriverSettings, NamingSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Dynamics

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.diagnosis.linearised.linear_search import SearchGains, log_survival
-from mkc_torch.diagnosis.search import p_value as module
-from mkc_torch.diagnosis.search.p_value import best_rank_p_value
+from mkc_torch.diagnosis.search import significance as module
+from mkc_torch.diagnosis.search.linear_search import SearchGains, log_survival
+from mkc_torch.diagnosis.search.significance import best_rank_p_value
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 DRAWS = 99

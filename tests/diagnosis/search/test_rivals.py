@@ -5,10 +5,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.search import rivals
-from mkc_torch.diagnosis.search.model_prior import ModelPrior
-from mkc_torch.diagnosis.search.ranking import Ranked
-from mkc_torch.diagnosis.search.rivals import by_joint_fits
+from mkc_torch.diagnosis.search import joint_refits
+from mkc_torch.diagnosis.search.joint_refits import by_joint_fits
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked
 from mkc_torch.diagnosis.settings import Settings
 
 NONLINEAR, POINTWISE = "rate", "sensor"
@@ -52,8 +51,8 @@ def judged(monkeypatch):
             fitted_keys.append(term.key)
             return fits[term.key]
 
-        monkeypatch.setattr(rivals, "_tried", tried)
-        monkeypatch.setattr(rivals, "run_parallel", lambda works, *_: [work() for work in works])
+        monkeypatch.setattr(joint_refits, "_tried", tried)
+        monkeypatch.setattr(joint_refits, "run_parallel", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
         scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, is_nonlinear=lambda term: term.port == NONLINEAR)
         found, new_ranking = by_joint_fits(

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.diagnosis.linearised.candidates import Candidates
-from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.joint_refits import _first_start
+from mkc_torch.diagnosis.search.linearise import linearise
 from mkc_torch.diagnosis.search.run import _settled, _with_tangents, run_search
+from mkc_torch.diagnosis.search.tangents import Candidates, tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError

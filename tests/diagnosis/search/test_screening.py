@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.search.run import run_search
-from mkc_torch.diagnosis.search.screening import screening_p_value
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
+from mkc_torch.diagnosis.search.run import run_search, screening_p_value
 from mkc_torch.diagnosis.settings import DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -21,7 +20,7 @@ from tests.simulation.tumbling import RATE, tumbling
 
 pytestmark = pytest.mark.e2e
 
-stepwise = importlib.import_module("mkc_torch.diagnosis.stepwise")
+stepwise = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")
 
 N = 2000
 TIME = np.arange(N) / RATE

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from mkc_torch.diagnosis.search.ties import in_order
+from mkc_torch.diagnosis.search.ranking import in_order
 
 PLAIN, SHAPED = SimpleNamespace(shape={}), SimpleNamespace(shape={"surface": 15.7, "draught": 3.9})
 

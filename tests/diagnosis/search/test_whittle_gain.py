@@ -5,11 +5,11 @@ import sys
 import pytest
 import torch
 
-from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
-from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
 from mkc_torch.diagnosis.noise.imputation import Imputation
 from mkc_torch.diagnosis.noise.spectrum import spectrum_of, whittle
-from mkc_torch.diagnosis.search.whittle_gain import own_spectrum_gains
+from mkc_torch.diagnosis.search.linear_search import LinearSearch
+from mkc_torch.diagnosis.search.linearise import LinearisedSearch
+from mkc_torch.diagnosis.search.significance import own_spectrum_gains
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 N, M = 800, 2

@@ -14,6 +14,7 @@ from mkc_torch.nonlinear import NoFitError
 from tests.diagnosis.swing import Pendulum, at_the_truth, candidates, fitted_swing, swung
 
 of_diagnosis = importlib.import_module("mkc_torch.diagnosis.diagnose")
+of_search = importlib.import_module("mkc_torch.diagnosis.pipeline.search")
 FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
 
 
@@ -90,7 +91,7 @@ def of_likelihood(value, size, shape=()):
     """A stub of an open-loop fit of 400 samples, with the fields that penalties need."""
     effect = types.SimpleNamespace(fitted_shape=shape)
     term = types.SimpleNamespace(effect=effect, key=("drag", (), "rate"))
-    model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=None)
+    model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=types.SimpleNamespace(observer=None))
     return types.SimpleNamespace(log_likelihood=value, model=model, residual=torch.zeros(400, 1), value=value)
 
 
@@ -115,7 +116,7 @@ def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_ef
 
 @pytest.mark.e2e
 def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
-    bases, original = [], of_diagnosis.first_step
+    bases, original = [], of_search.first_step
 
     def first_step(base, terms, *rest):
         bases.append(base)
@@ -123,7 +124,7 @@ def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
         better = dataclasses.replace(base) if len(bases) == 1 else None
         return dataclasses.replace(found, first=dataclasses.replace(found.first, without_candidate=better))
 
-    monkeypatch.setattr(of_diagnosis, "first_step", first_step)
+    monkeypatch.setattr(of_search, "first_step", first_step)
     messages = []
     found = of_diagnosis.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=messages.append)
     assert sum("more likely noise" in line for line in messages) == 1

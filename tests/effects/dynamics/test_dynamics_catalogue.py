@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.shapes import candidate_terms
+from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.effects.dynamics.unknown_near_ends import NUMBERS, UnknownNearEnds, curve_within
 from mkc_torch.simulation import Dynamics

@@ -5,8 +5,8 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis.io.model import DiagnosedModel
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS, PAIRED, lagged, played, shifted
 from mkc_torch.effects.paired.output_backlash import OutputBacklash, SeveralBacklash

@@ -9,8 +9,8 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.io.model import DiagnosedModel
-from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
+from mkc_torch.diagnosis.model.shapes import candidate_terms, reach_of
+from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole

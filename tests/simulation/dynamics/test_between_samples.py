@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.simulation.dynamics.between_samples import inputs_between, smooth_between
-from mkc_torch.simulation.protocol import SignalTimes
+from mkc_torch.simulation.ports import SignalTimes
 
 
 def clock_of(time, begins, share):

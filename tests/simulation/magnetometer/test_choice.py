@@ -131,7 +131,7 @@ def test_a_requested_view_is_used_and_has_the_fault_of_its_turns():
     table = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
     views = [Magnetometer(use=use).prepare(table) for use in ("attitude", "gyro", "norm")]
     assert [view.view for view in views] == ["attitude", "gyro", "norm"]
-    late, turned_round, none = (view.wrong_turns for view in views)
+    late, turned_round, none = ("".join(view.faults) for view in views)
     assert late.startswith("With the attitude")
     assert "seems to be late by 0.5 s" in late
     assert "with the length 0.5 µT" in turned_round
@@ -141,7 +141,7 @@ def test_a_requested_view_is_used_and_has_the_fault_of_its_turns():
 
 def test_correct_turns_have_no_fault():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **quaternions(turns(TIME)), **rates(body_rate(TIME)))
-    assert [Magnetometer(use=use).prepare(table).wrong_turns for use in ("attitude", "gyro")] == ["", ""]
+    assert [Magnetometer(use=use).prepare(table).faults for use in ("attitude", "gyro")] == [(), ()]
 
 
 @pytest.mark.e2e

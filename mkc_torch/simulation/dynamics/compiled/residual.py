@@ -28,7 +28,7 @@ from mkc_torch.simulation.dynamics.compiled.functions import CompiledObserverJum
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
 from mkc_torch.simulation.dynamics.trajectory import Jump, Rate, Trajectory, linearised_later
-from mkc_torch.simulation.protocol import Answer, Nearby
+from mkc_torch.simulation.ports import Answer, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -24,7 +24,7 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
 )
 from mkc_torch.simulation.dynamics.observer import Observer, ObserverJump
 from mkc_torch.simulation.dynamics.trajectory import Grid
-from mkc_torch.simulation.protocol import Changes
+from mkc_torch.simulation.ports import Changes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

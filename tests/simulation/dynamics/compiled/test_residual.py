@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from mkc_torch._support.forward_mode import forward_tangents
-from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.effects.base import Effect, GainEffect
 from mkc_torch.effects.context import Quantity
 from mkc_torch.effects.dynamics import DYNAMICS

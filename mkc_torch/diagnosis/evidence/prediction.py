@@ -1,0 +1,226 @@
+"""Prediction as evidence: of held-out blocks, and of high values of a driver from low values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval, held_out, scored
+from mkc_torch.diagnosis.goodness_of_fit import size_of
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.result import DivergedBlock, Extrapolation, HeldOut, ResidualSizes
+from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool
+
+__all__ = [
+    "extrapolated",
+    "extrapolation_evidence",
+    "extrapolation_of_finding",
+    "extrapolation_result",
+    "held_out_gain_evidence",
+    "kept_blocks",
+    "sizes_of",
+    "without_finding",
+]
+
+_RANGE = 1.0
+"""Residual, in ranges of the recorded output, beyond which a sample has diverged."""
+
+_MOST_DIVERGED = 0.2
+"""Share of diverged samples above which a block has diverged; a few outliers are no divergence."""
+
+
+def kept_blocks(
+    prepared: PreparedSimulation, models: Sequence[Evidence], blocks: HeldOutBlocks
+) -> tuple[Bool[Tensor, " N"], list[list[int]]]:
+    """Return the samples of blocks in which no model diverges, and each model's diverged blocks, from 0."""
+    known = prepared.measured
+    count = int(blocks.block.max()) + 1
+    kept = torch.ones_like(blocks.block, dtype=torch.bool)
+    diverged = []
+    for model in models:
+        residual = model.residual
+        if known.shape == residual.shape:
+            reach = _RANGE * (known.amax(0) - known.amin(0))
+            out = ~(residual.abs() <= reach) & (reach > 0)
+        else:
+            out = ~residual.isfinite()
+        many = torch.zeros(count).index_add(0, blocks.block, out.any(-1).float())
+        size = torch.zeros(count).index_add(0, blocks.block, torch.ones(len(out)))
+        gone = many > _MOST_DIVERGED * size
+        diverged.append(gone.nonzero().squeeze(-1).tolist())
+        kept &= ~gone[blocks.block]
+    return kept, diverged
+
+
+def sizes_of(
+    prepared: PreparedSimulation, units: Sequence[str], before: Evidence, after: Evidence, blocks: HeldOutBlocks
+) -> tuple[dict[str, ResidualSizes], tuple[DivergedBlock, ...]]:
+    """Return each output's residual before and after, in its unit, and the diverged blocks, which are excluded."""
+    kept, (lost_before, lost_after) = kept_blocks(prepared, (before, after), blocks)
+    diverged = tuple(
+        DivergedBlock(block + 1, block in lost_before, block in lost_after)
+        for block in sorted({*lost_before, *lost_after})
+    )
+    if not bool(kept.any()):
+        return {}, diverged
+    size_before, size_after = size_of(before.residual[kept]), size_of(after.residual[kept])
+    return {
+        name: ResidualSizes(float(size_before[k]), float(size_after[k]), units[k])
+        for k, name in enumerate(prepared.channels)
+    }, diverged
+
+
+_GIVEN_OTHERS = "Scored given the other findings; without them, it is masked."
+_TOO_SHORT = "a side of the step is shorter than two held-out blocks"
+
+
+def without_finding(case: EvidenceContext) -> Evidence | None:
+    """Score the final model without the finding, if later findings may have masked its gain."""
+    if not case.overlaid or _confirmed(case):
+        return None
+    return held_out(case.without_and_with[0], case.blocks)
+
+
+def _confirmed(case: EvidenceContext) -> bool:
+    """Whether held-out blocks confirm the finding without the later findings."""
+    before, after = case.pairs[case.number] if case.pairs else case.held_out[case.number : case.number + 2]
+    difference = after.log_likelihood - before.log_likelihood
+    return gain_interval(difference, case.blocks.block, torch.Generator().manual_seed(case.seed))[1][0] > 0.0
+
+
+def held_out_gain_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Return the log-likelihood gain with its interval, and the residuals before and after."""
+    if not _long_enough(case, case.number):
+        return held_out_gain_result(None, _TOO_SHORT)
+    before, after = case.held_out[case.number : case.number + 2]
+    worse, better = case.pairs[case.number] if case.pairs else (before, after)
+    note = ""
+    if case.ahead is not None:
+        before, after, note = case.ahead, case.held_out[-1], _GIVEN_OTHERS
+        worse, better = before, after
+    gain, interval = gain_interval(better.log_likelihood - worse.log_likelihood, case.blocks.block, _draws(case))
+    outputs, diverged = sizes_of(case.prepared, case.units, before, after, case.blocks)
+    only = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
+    sizes = (case.rms(before), case.rms(after)) if only is None else (only.before, only.after)
+    count, decides = int(case.blocks.block.max()) + 1, not case.located.with_noise
+    held = HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, diverged, count, decides)
+    return held_out_gain_result(held, note)
+
+
+def held_out_gain_result(held: HeldOut | None, note: str) -> EvidenceResult:
+    """Return the gain, or the reason why it was not measured."""
+    return EvidenceResult("held_out", (held, note), keys={"held_out": held, "held_out_note": note})
+
+
+def _long_enough(case: EvidenceContext, number: int) -> bool:
+    """Whether both sides of a finding's onset can be held out."""
+    onset, time = case.found[number].term.shape.get("onset"), case.prepared.time
+    if onset is None:
+        return True
+    shorter = min(int((time < onset).sum()), int((time >= onset).sum()))
+    return shorter >= 2 * len(time) // (int(case.blocks.block.max()) + 1)
+
+
+def _draws(case: EvidenceContext) -> torch.Generator:
+    """Return the generator after the draws of the previous findings."""
+    generator = torch.Generator().manual_seed(case.seed)
+    for number in range(case.number):
+        if _long_enough(case, number):
+            gain_interval(case.held_out[0].log_likelihood, case.blocks.block, generator)
+    return generator
+
+
+_BLOCKS, _FEWEST = 25, 5
+"""Blocks of the bootstrap, and the minimum number of blocks with high values."""
+
+
+def extrapolation_of_finding(case: EvidenceContext) -> Extrapolation | None:
+    return extrapolated(*case.without_and_with, case.term, case.seed, case.settings.evidence)
+
+
+def extrapolation_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Score the finding at high values of its driver; warn if it makes the prediction clearly worse."""
+    return extrapolation_result(case.ahead, case.term, case.settings.evidence)
+
+
+def extrapolation_result(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
+    if extrapolation is None:
+        return EvidenceResult("extrapolation")
+    low, high = extrapolation.confidence_interval
+    verb = "improves the prediction" if low > 0.0 else "degrades the prediction" if high < 0.0 else "is not significant"
+    gain = _in_words(extrapolation)
+    row = Row("beyond its range", f"fitted at low values of its driver, it {verb} at high values: {gain}", False)
+    sentence = (
+        f"{term.effect.id} does not extrapolate: fitted to the {100.0 * settings.low_share:.0f} % of samples where "
+        f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
+        "beyond the range recorded."
+    )
+    return EvidenceResult("extrapolation", extrapolation, warnings=(sentence,) if high < 0.0 else (), rows=(row,))
+
+
+def _in_words(extrapolation: Extrapolation) -> str:
+    """Format the gain with its interval, to two digits of its standard error.
+
+    Example:
+        >>> _in_words(Extrapolation(-0.0212, (-0.12, 0.09)))
+        '-0.021 nats per sample (95 %: -0.120 to 0.090)'
+    """
+    low, high = extrapolation.confidence_interval
+    places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
+    gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
+    return f"{gain:+.{places}f} nats per sample (95 %: {low:.{places}f} to {high:.{places}f})"
+
+
+def extrapolated(
+    without: FittedModel, fit: FittedModel, term: Term, seed: int, settings: EvidenceSettings
+) -> Extrapolation | None:
+    """Fit with and without an effect to low values of its driver, and compare the scores at high values.
+
+    A driver of several columns is high if it is far from its mean. The shapes of effects and the bound are fixed.
+
+    Args:
+        without: the model without the effect.
+        fit: the model with the effect.
+        term: the effect.
+        seed: of the block bootstrap.
+        settings: definition of low values.
+
+    Returns:
+        None without a recorded driver, if its low values hardly vary (a switch), or if the high values are in too few
+        blocks.
+    """
+    reach = _reach(term)
+    if reach is None:
+        return None
+    low = reach <= torch.quantile(reach, settings.low_share)
+    high = ~low
+    block = (torch.arange(len(reach)) * _BLOCKS).div(len(reach), rounding_mode="floor")[high]
+    seen, block = block.unique_consecutive(return_inverse=True)
+    spread = float(reach[low].max() - reach[low].min())
+    if spread < settings.low_spread * float(reach.max() - reach.min()) or len(seen) < _FEWEST:
+        return None
+    before, after = (_score(model, low)[high] for model in (without, fit))
+    gain, interval = gain_interval(after - before, block, torch.Generator().manual_seed(seed))
+    return Extrapolation(gain, interval)
+
+
+def _reach(term: Term) -> Tensor | None:
+    if term.driver is None:
+        return None
+    values = term.driver.values
+    return values[:, 0] if values.shape[1] == 1 else torch.linalg.vector_norm(values, dim=-1)
+
+
+def _score(fit: FittedModel, rows: Tensor) -> Tensor:
+    found = fitted(fit.model, fit.parameters, fit.bound, rows=rows.to(fit.residual.dtype), graduate=False)
+    return scored(found.residual, found.sigma, found.d, found.bound)

@@ -1,0 +1,352 @@
+"""Tests of the residual as noise: its density and its whiteness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.effective_size import effective_size
+from mkc_torch.density.distribution import MKCDistribution
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row, Table
+from mkc_torch.diagnosis.result import DensityCheck
+from mkc_torch.diagnosis.settings import EvidenceSettings
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = [
+    "Whiteness",
+    "as_result",
+    "density_checks",
+    "density_evidence",
+    "density_warnings",
+    "kolmogorov",
+    "student_cdf",
+    "student_fit",
+    "whiteness",
+    "whiteness_evidence",
+]
+
+_FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
+"""Candidate degrees of freedom."""
+
+_ROUNDS, _NODES = 30, 2001
+"""EM iterations of a Student-t's scale, and nodes of the integral of its density."""
+
+_AT_ONCE = 10_000
+"""Batch size of the distribution function, which integrates over tens of nodes per sample."""
+
+_COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "critical distance", "")
+_DENSITY_NOTE = (
+    "Kolmogorov distance of the residuals from the fitted density, and from the most likely Student-t; 0 is a perfect "
+    "fit. The critical distance has level {chance:.1g}."
+)
+
+
+def density_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Test the density of each channel; warn if a Student-t is clearly closer."""
+    fit = case.final.fit
+    channels, settings = case.prepared.channels, case.settings.evidence
+    return as_result(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
+
+
+def as_result(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> EvidenceResult:
+    # the tail of Kolmogorov's distribution
+    chance = 2.0 * math.exp(-2.0 * settings.density_off**2)
+    table = Table(
+        "Is the density right?",
+        _COLUMNS,
+        tuple(_density_in_words(check) for check in checks),
+        _DENSITY_NOTE.format(chance=chance),
+    )
+    content = [
+        {
+            "channel": check.channel,
+            "distance": check.distance,
+            "student_t_distance": check.student_distance,
+            "degrees_of_freedom": check.degrees_of_freedom,
+            "allowed": check.allowed,
+        }
+        for check in checks
+    ]
+    return EvidenceResult(
+        "density",
+        tuple(checks),
+        keys={"noise": {"density_check": content}},
+        warnings=density_warnings(checks),
+        table=table,
+    )
+
+
+def _density_in_words(check: DensityCheck) -> tuple[str, ...]:
+    """Format the distances of a channel and their conclusion.
+
+    Example:
+        >>> _density_in_words(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
+        ('norm', '0.021', '0.034 (4 degrees of freedom)', '0.05', 'not significant')
+    """
+    verdict = "a Student-t is closer" if check.closer else "not significant"
+    if not check.closer and check.distance > check.allowed:
+        verdict = "significant, but a Student-t is not clearly better"
+    freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
+    student = f"{check.student_distance:.2g} ({freedom})"
+    return check.channel, f"{check.distance:.2g}", student, f"{check.allowed:.2g}", verdict
+
+
+def density_checks(
+    residual: Float[Tensor, "N m"],
+    sigma: Float[Tensor, " m"],
+    d: Float[Tensor, " m"],
+    bound: Float[Tensor, " m"],
+    channels: Sequence[str],
+    settings: EvidenceSettings,
+) -> tuple[DensityCheck, ...]:
+    """Return the Kolmogorov distances of each channel's residuals, with outliers, from their density and a Student-t.
+
+    The density's distribution function (probability-integral transform) makes the absolute residuals uniform if the
+    density is correct. A Student-t around zero is closer if the density's distance exceeds the critical distance for
+    the effective number of samples, and the Student-t is more likely, at half the distance, and below the critical
+    distance.
+
+    Args:
+        residual: of the final model.
+        sigma, d, bound: of the density.
+        channels: their names.
+        settings: critical distance and ratio of the distances.
+
+    Example:
+        >>> order = torch.randperm(4000, generator=torch.Generator().manual_seed(0)).double()
+        >>> cauchy = torch.tan(torch.pi * ((order + 0.5) / 4000 - 0.5)).unsqueeze(-1)
+        >>> sigma, d, bound = (torch.tensor([v], dtype=torch.float64) for v in (3.0, 1.0, 2000.0))
+        >>> (check,) = density_checks(cauchy, sigma, d, bound, ["norm"], EvidenceSettings())
+        >>> check.degrees_of_freedom, check.closer
+        (1.0, True)
+    """
+    size = residual.abs()
+    density = MKCDistribution(sigma, d, bound, validate_args=False)
+    uniform = torch.cat([2.0 * density.cdf(part) - 1.0 for part in size.split(_AT_ONCE)])
+    # beyond the domain: the value at its edge
+    likelihood = density.log_prob(torch.minimum(size, bound)).mean(0)
+    found = []
+    for k, channel in enumerate(channels):
+        distance = kolmogorov(uniform[:, k])
+        allowed = settings.density_off / math.sqrt(effective_size(uniform[:, k]))
+        freedom, scale, other = student_fit(residual[:, k])
+        near = kolmogorov(student_cdf(size[:, k] / scale, freedom))
+        close = near < min(settings.student_closer * distance, allowed)
+        closer = distance > allowed and other > float(likelihood[k]) and close
+        found.append(DensityCheck(channel, distance, near, freedom, allowed, closer))
+    return tuple(found)
+
+
+def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
+    """Return a warning for channels whose residuals a Student-t describes clearly better than the density.
+
+    Outliers that neither describes cause no warning.
+
+    Example:
+        >>> density_warnings([DensityCheck("norm", 0.12, 0.01, 2.0, 0.05, True)])[0].partition(":")[0]
+        'The density does not describe the residuals of norm'
+    """
+    misfit = [check for check in checks if check.closer]
+    if not misfit:
+        return ()
+    worst = max(misfit, key=lambda check: check.distance)
+    return (
+        f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
+        f"Kolmogorov distance is {worst.distance:.2g}, that of a Student-t with {worst.degrees_of_freedom:g} degrees "
+        f"of "
+        f"freedom {worst.student_distance:.2g}. A misfit of the tail is not evidence of physics.",
+    )
+
+
+def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
+    """Return the Kolmogorov distance of a sample from the uniform distribution on [0, 1].
+
+    Example:
+        >>> round(kolmogorov(torch.tensor([0.1, 0.3, 0.5, 0.9])), 2)
+        0.25
+    """
+    ordered = uniform.sort().values
+    N = len(ordered)
+    below = torch.arange(N, dtype=ordered.dtype) / N
+    return float(torch.maximum(ordered - below, below + 1.0 / N - ordered).max())
+
+
+def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:
+    """Return degrees of freedom, scale and mean log-likelihood of the most likely Student-t around zero.
+
+    Scale by the EM algorithm of Lange, Little & Taylor, "Robust statistical modeling using the t distribution",
+    JASA 84 (1989).
+    """
+    freedom = error.new_tensor(_FREEDOM).unsqueeze(-1)
+    square = error.square()
+    least = torch.finfo(error.dtype).tiny  # all residuals may be zero
+    variance = square.median().clamp(min=least).expand(len(freedom), 1)
+    for _ in range(_ROUNDS):
+        weight = (freedom + 1.0) / (freedom + square / variance)
+        variance = (weight * square).mean(-1, keepdim=True).clamp(min=least)
+    likelihood = (
+        torch.lgamma(0.5 * (freedom + 1.0))
+        - torch.lgamma(0.5 * freedom)
+        - 0.5 * torch.log(math.pi * freedom * variance)
+        - 0.5 * (freedom + 1.0) * torch.log1p(square / (freedom * variance)).mean(-1, keepdim=True)
+    )
+    best = int(likelihood.argmax())
+    return _FREEDOM[best], float(variance[best].sqrt()), float(likelihood[best])
+
+
+def student_cdf(size: Float[Tensor, " N"], freedom: float) -> Float[Tensor, " N"]:
+    """Return the probability that the absolute value of a Student-t of unit scale is at most ``size``.
+
+    With ``x = √ν tan θ`` it is the integral of ``cos^(ν-1)``, by the trapezoidal rule.
+
+    Example:
+        >>> student_cdf(torch.tensor([1.0, 12.706], dtype=torch.float64), 1.0)
+        tensor([0.5000, 0.9500], dtype=torch.float64)
+    """
+    angle = torch.linspace(0.0, 0.5 * math.pi, _NODES, dtype=size.dtype)
+    density = torch.cos(angle).clamp(min=0.0) ** (freedom - 1.0)
+    total = torch.cat([density.new_zeros(1), torch.cumulative_trapezoid(density, angle)])
+    place = torch.atan(size / math.sqrt(freedom)) / angle[-1] * (_NODES - 1)
+    left = place.long().clamp(max=_NODES - 2)
+    return torch.lerp(total[left], total[left + 1], place - left) / total[-1]
+
+
+_FIRST = 20
+"""Number of lags of the portmanteau statistic."""
+
+_FARTHEST = 0.25
+"""Largest lag that is tested on its own, as a share of the recording."""
+
+_TITLE = "Whiteness of the residual"
+_NOTE = (
+    "Autocorrelation of the final model's residual, without rejected samples: the last significant lag, the "
+    "correlation "
+    "of neighbours, and the p-value of the first {lags} lags together. The level is {level:.2g}."
+)
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Whiteness of a channel: the last significant lag in samples, 0 if white.
+
+    ``neighbours`` is the correlation at lag 1, ``p_value`` that of the first ``lags`` lags together.
+    """
+
+    lag: int
+    neighbours: float
+    p_value: float
+    lags: int
+
+
+def whiteness_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Test each channel of the final fit's pseudo-residual."""
+    settings = case.settings.evidence
+    values, counts = case.final.fit.pseudo(case.settings.noise)
+    time = case.prepared.time
+    step = 1.0 if case.prepared.recording.time is None else float(time.diff().median())
+    unit = "samples" if case.prepared.recording.time is None else "s"
+    channels = {
+        name: whiteness(column, used, settings)
+        for name, column, used in zip(case.prepared.channels, values.unbind(-1), counts.unbind(-1), strict=True)
+    }
+    content = [
+        {"channel": name, "white": found.lag == 0, **asdict(found), "lag": step * found.lag}
+        for name, found in channels.items()
+    ]
+    rows = tuple(
+        (
+            name,
+            f"{step * found.lag:.3g} {unit}" if found.lag else "white",
+            f"{found.neighbours:.2f}",
+            f"{found.p_value:.2g}" if found.p_value >= 1e-4 else "< 0.0001",
+        )
+        for name, found in channels.items()
+    )
+    table = Table(
+        _TITLE,
+        ("channel", "correlated up to", "correlation of neighbours", "p-value"),
+        rows,
+        _NOTE.format(lags=next(iter(channels.values())).lags, level=settings.white_level),
+    )
+    return EvidenceResult(
+        "whiteness",
+        channels,
+        content={"unit": unit, "channels": content},
+        rows=(Row("residual", _in_words(channels, step, unit)),),
+        table=table,
+    )
+
+
+def _in_words(channels: Mapping[str, Whiteness], step: float, unit: str) -> str:
+    """Return the channel with the longest correlation, and the number of white channels.
+
+    Example:
+        >>> white, coloured = Whiteness(0, 0.01, 0.4, 20), Whiteness(20, 0.8, 0.0, 20)
+        >>> _in_words({"norm": white}, 0.02, "s"), _in_words({"norm": coloured}, 0.02, "s")
+        ('white', 'correlated up to 0.4 s')
+        >>> _in_words({"x": white, "y": coloured}, 1.0, "samples")
+        'y correlated up to 20 samples; 1 of 2 channels white'
+    """
+    name, longest = max(channels.items(), key=lambda item: item[1].lag)
+    if longest.lag == 0:
+        return "white"
+    reach = f"correlated up to {step * longest.lag:.3g} {unit}"
+    if len(channels) == 1:
+        return reach
+    white = sum(found.lag == 0 for found in channels.values())
+    return f"{name} {reach}; {white or 'none'} of {len(channels)} channels white"
+
+
+def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings: EvidenceSettings) -> Whiteness:
+    """Test whether a series with masked samples is white.
+
+    It is rejected by the portmanteau statistic of the first autocorrelations, or by an autocorrelation at any lag, with
+    Bartlett's standard error, which includes the previous lags.
+
+    Ljung & Box, "On a measure of lack of fit in time series models", Biometrika 65 (1978); with missing samples,
+    Stoffer & Toloi, Statistics & Probability Letters 13 (1992). Bartlett, J. R. Stat. Soc. Suppl. 8 (1946).
+
+    Args:
+        values: the series; 0 for masked samples.
+        counts: mask, 0 or 1.
+        settings: level of the test.
+
+    Example:
+        >>> draws = torch.randn(2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> sums, mask, usual = draws[1:] + draws[:-1], torch.ones_like(draws), EvidenceSettings()
+        >>> whiteness(draws, mask, usual).lag, whiteness(sums, mask[1:], usual).lag
+        (0, 1)
+    """
+    N = len(values)
+    farthest = max(int(_FARTHEST * N), 1)
+    centred = counts * (values - values.sum() / counts.sum().clamp(min=1.0))
+    products, pairs = (_lagged_sums(count.double())[: farthest + 1] for count in (centred, counts))
+    pairs = pairs.round().clamp(min=1.0)
+    variance = products[0] / pairs[0]
+    if float(variance) <= 0.0:
+        return Whiteness(0, 0.0, 1.0, min(_FIRST, farthest))
+    correlation = (products / pairs / variance)[1:]
+    square = correlation.square()
+    first = min(_FIRST, farthest)
+    statistic = (pairs[1 : first + 1] * square[:first]).sum()
+    p_value = float(torch.special.gammaincc(0.5 * statistic.new_tensor(first), 0.5 * statistic))
+    error = ((1.0 + 2.0 * (square.cumsum(0) - square)) / pairs[1:]).sqrt()
+    size = correlation.abs() / error
+    most = float(torch.special.ndtri(torch.tensor(1.0 - 0.25 * settings.white_level / farthest, dtype=torch.float64)))
+    beyond = (size > most).nonzero().flatten().tolist()
+    if not beyond and p_value <= 0.5 * settings.white_level:
+        beyond = [int(size[:first].argmax())]
+    return Whiteness(beyond[-1] + 1 if beyond else 0, float(correlation[0]), p_value, first)
+
+
+def _lagged_sums(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Return the lagged products of a series, summed over samples."""
+    N = len(values)
+    return torch.fft.irfft(torch.fft.rfft(values, n=2 * N).abs().square(), n=2 * N)[:N]

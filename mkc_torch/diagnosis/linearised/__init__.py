@@ -1,1 +1,0 @@
-"""The linearised problem: tangents, the search over candidates, and drift of the sensors."""

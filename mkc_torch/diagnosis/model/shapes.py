@@ -1,0 +1,226 @@
+"""Shapes of effects: the grid of candidates, and joint fits that include shape numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Driver, Term
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Shape
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.ports import Change, Nearby, Port, SignalSizes
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ShapedModel", "candidate_terms", "described", "finer", "reach_of", "shape_fitted", "within_a_sample"]
+
+_STEPS = 8
+"""Grid points of a shape number to either side of its value, and the factor by which its range shrinks each round."""
+
+
+def candidate_terms(
+    prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
+) -> tuple[Term, ...]:
+    """Return each effect that has a port in the simulation, with each of its drivers and each shape of its grid."""
+    terms = []
+    for effect in effects:
+        places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
+        # an effect without roles, or with an optional driver, is also tried without a driver
+        alone = not effect.roles or effect.driver_optional
+        fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
+        shapes = effect.shapes(prepared.time)
+        terms += [
+            Term(effect, driver, shape, "" if at == effect.port else at)
+            for at in places
+            for driver in fitting
+            for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
+        ]
+    return tuple(term for term in terms if not within_a_sample(term, prepared))
+
+
+def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:
+    """Whether a candidate only changes what an input does between two samples."""
+    inside = prepared.time.diff()
+    step = float(inside[inside > 0].median()) if bool((inside > 0).any()) else 0.0
+    return term.effect.within_a_sample(term.shape, step)
+
+
+def _fits(effect: Effect, name: str, port: Port) -> bool:
+    """Whether an effect acts at a port."""
+    known = set(port.parts)
+    return effect.port in (name, port.kind) and set(effect.needs) <= known and known.isdisjoint(effect.excludes)
+
+
+def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:
+    """Return a shape in units, from shares of the signal at the port or of the driver."""
+    if not effect.relative:
+        return shape
+    known = dict(port.sizes)
+    if driver is not None:
+        known["driver"] = SignalSizes.of(torch.linalg.vector_norm(driver.values, dim=-1))
+    sizes = {part: values._asdict() for part, values in known.items()}
+    return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
+
+
+def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float, float]]:
+    """Return the lower and upper limits, in units, of the numbers of a shape that are fitted together with γ.
+
+    Raises:
+        ValueError: the effect names a number that its shape does not have, or an empty range.
+    """
+    if not term.effect.fitted_shape:
+        return {}
+    port, reach = prepared.ports[term.port], term.effect.fitted_shape
+    for name, (low, high) in reach.items():
+        if name not in term.shape or not low < high:
+            raise ValueError(
+                f"Expected `fitted_shape` of {term.effect.id} to hold numbers of its shape ({', '.join(term.shape)}) "
+                f"with a lower and a greater upper limit but got `{name}`: ({low}, {high}); correct it or "
+                "leave it out."
+            )
+    of_length, length = term.effect.continuous, float(prepared.time[-1] - prepared.time[0])
+    ends = [
+        absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port, term.driver) for k in (0, 1)
+    ]
+    lower, upper = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
+    return {name: (lower[name], upper[name]) for name in reach}
+
+
+def _drives(driver: Driver, effect: Effect) -> bool:
+    """Whether a driver has one of an effect's roles; a curve without a name accepts any single column."""
+    return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
+
+
+def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:
+    """Return the effect with one number of its shape varied, over 1/8 of its range either way, less in later rounds.
+
+    Args:
+        term: the effect.
+        name: of the number, one of the effect's continuous numbers.
+        time: of the recording.
+        rounds: how often the range was narrowed before.
+    """
+    low, high = (share * float(time[-1] - time[0]) for share in term.effect.continuous[name])
+    offset = float(time[0]) if name == "onset" else 0.0
+    value = term.shape[name]
+    reach = (high - low) / _STEPS ** (rounds + 1)
+    values = {min(max(value + reach * k / _STEPS, low + offset), high + offset) for k in range(-_STEPS, _STEPS + 1)}
+    return tuple(replace(term, shape={**term.shape, name: v}) for v in sorted(values))
+
+
+def described(effect: Effect, shape: Shape) -> str:
+    """Return the reported numbers of a shape as text.
+
+    Example:
+        >>> from mkc_torch.effects.sensor.offset_drift import OffsetDrift
+        >>> described(OffsetDrift(), {"middle": 12.345, "width": 0.5})
+        'middle 12.35 s, width 0.5 s'
+    """
+    numbers = {name: value for name, value in shape.items() if effect.reports(name)}
+    units = {name: effect.shape_units.get(name, "") for name in numbers}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g} {units[name]}".rstrip() for name, value in numbers.items())
+
+
+class ShapedModel(JointModel):
+    """A joint model whose last parameters are shape numbers of its effects; positive numbers enter as logarithms.
+
+    Args:
+        model: the joint model.
+        reach: for each effect, the limits (lower, upper) of each shape number by name.
+    """
+
+    def __init__(self, model: JointModel, reach: Sequence[Mapping[str, tuple[float, float]]]) -> None:
+        super().__init__(model.prepared, model.terms, model.near)
+        self._reach = tuple(reach)
+        lower = [low for limits in reach for low, _ in limits.values()]
+        self._positive = torch.tensor([low > 0.0 for low in lower], dtype=torch.bool)
+
+    @classmethod
+    def of(cls, model: JointModel) -> ShapedModel:
+        """Include all shape numbers that can be fitted."""
+        return cls(model, [reach_of(term, model.prepared) for term in model.terms])
+
+    @property
+    def joint(self) -> int:
+        """Number of parameters without the shape numbers."""
+        return super().size
+
+    @property
+    def size(self) -> int:
+        return self.joint + sum(map(len, self._reach))
+
+    @property
+    def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]]:
+        ends = [end for reach in self._reach for end in reach.values()]
+        shapes = self._free(self.prepared.time.new_tensor(ends).reshape(-1, 2).mT).mT
+        known = super().bounds
+        if known is None:
+            free = shapes.new_full((self.joint,), torch.inf)
+            known = -free, free
+        return torch.cat([known[0], shapes[:, 0]]), torch.cat([known[1], shapes[:, 1]])
+
+    def start(self, parameters: Float[Tensor, " q"]) -> Float[Tensor, " p"]:
+        """Return the joint model's parameters followed by the shape numbers."""
+        values = [term.shape[name] for term, reach in zip(self.terms, self._reach, strict=True) for name in reach]
+        return torch.cat([parameters, self._free(parameters.new_tensor(values))])
+
+    def per_effect(self, values: Sequence[Any]) -> list[dict[str, Any]]:
+        """Split values of the shape numbers into one mapping per effect, by name."""
+        left = iter(values)
+        return [{name: next(left) for name in reach} for reach in self._reach]
+
+    def shaped(self, parameters: Float[Tensor, " p"]) -> tuple[Term, ...]:
+        """Return the effects with the shapes of these parameters, as differentiable tensors."""
+        free = parameters[self.joint :]
+        values = torch.where(self._positive, torch.where(self._positive, free, 0.0).exp(), free)
+        fitted = self.per_effect(values.unbind())
+        return tuple(replace(t, shape={**t.shape, **new}) for t, new in zip(self.terms, fitted, strict=True))
+
+    def spread(self, values: Sequence[float], errors: Float[Tensor, " s"]) -> Float[Tensor, " s"]:
+        """Return standard errors of the shape numbers from those of their parameters."""
+        return torch.where(self._positive, errors * errors.new_tensor(values), errors)
+
+    def _free(self, values: Float[Tensor, "*a s"]) -> Float[Tensor, "*a s"]:
+        return torch.where(self._positive, torch.where(self._positive, values, 1.0).log(), values)
+
+    def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
+        return JointModel(self.prepared, self.shaped(parameters)).changes(parameters[: self.joint])
+
+    def begun_with(self, near: Nearby | None) -> ShapedModel:
+        return ShapedModel(JointModel(self.prepared, self.terms, near), self._reach)
+
+
+def shape_fitted(fit: FittedModel) -> FittedModel:
+    """Refit with the shape numbers free.
+
+    Args:
+        fit: at the most likely parameters for its present shapes.
+
+    Returns:
+        The fit at the most likely shapes; the same fit if no number can be fitted, or no result is more likely.
+    """
+    model = ShapedModel.of(fit.model)
+    if model.size == model.joint:
+        return fit
+    try:
+        both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
+        terms = [_with_plain_shape(term) for term in model.shaped(both.parameters)]
+        moved = JointModel(model.prepared, terms, both.model.near)
+        again = fitted(moved, both.parameters[: model.joint], fit.bound, graduate=False)
+    except NoFitError:
+        return fit
+    return again if again.log_likelihood > fit.log_likelihood else fit
+
+
+def _with_plain_shape(term: Term) -> Term:
+    """Return the term with plain numbers as its shape."""
+    return replace(term, shape={name: float(value) for name, value in term.shape.items()})

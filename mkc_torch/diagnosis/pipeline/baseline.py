@@ -1,0 +1,55 @@
+"""The second stage of a diagnosis: fit the simulation without findings, under its most likely noise."""
+
+from __future__ import annotations
+
+import torch
+
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, choose_input_hold, fit_alone
+from mkc_torch.diagnosis.pipeline.partial import PartialResult
+from mkc_torch.diagnosis.pipeline.prepare import Problem
+from mkc_torch.diagnosis.search.estimate import with_smaller_step
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+__all__ = ["fit_baseline"]
+
+
+def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:
+    """Fit the simulation without findings, with a step of integration on which the fit does not depend.
+
+    Args:
+        problem: the input of the diagnosis.
+        known: receives the fits.
+        prepared: the simulation with another step of integration; None for that of the problem.
+
+    Raises:
+        NoFitError: no start has a finite result.
+        ValueError: a channel whose residual is constant.
+    """
+    prepared = problem.prepared if prepared is None else prepared
+    options = known.options
+    declared, noise = options.declared, options.settings.noise
+    while True:
+        known.restart()
+        problem.progress("fitting the simulation alone")
+        baseline = fit_alone(prepared, declared, noise, known.keep_baseline)
+        baseline = choose_input_hold(baseline, declared, options.fixed, noise)
+        known.keep_baseline(baseline, with_noise=True)
+        _refuse_no_noise(baseline.fit, problem.where)
+        finer = with_smaller_step(baseline.fit, noise)
+        if finer is None:
+            return baseline
+        prepared = finer
+
+
+def _refuse_no_noise(base: FittedModel, where: str) -> None:
+    """Raise ValueError for a channel whose residual is constant: no noise is left to test an effect against."""
+    same = (base.residual == base.residual[:1]).all(0)
+    nothing = base.d.square() < torch.finfo(base.d.dtype).tiny
+    exact = (same | nothing).tolist()
+    names = [name for name, is_exact in zip(base.model.prepared.channels, exact, strict=True) if is_exact]
+    if names:
+        raise ValueError(
+            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so no noise is left "
+            "to test effects against. Leave it out of the compared channels, or record it with its noise."
+        )

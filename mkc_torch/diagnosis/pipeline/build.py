@@ -1,0 +1,424 @@
+"""Build the diagnosis: the verdict, the findings with their evidence, and the notes on the search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+
+from mkc_torch._parallel.deadline import within
+from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
+from mkc_torch.diagnosis.evidence.rejected import called
+from mkc_torch.diagnosis.evidence.remaining import nameless
+from mkc_torch.diagnosis.evidence.run import EvidenceReport
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.finding import finding_of, separability
+from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
+from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
+from mkc_torch.diagnosis.findings.reasons import reasons_of
+from mkc_torch.diagnosis.findings.shape import shape_of
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
+from mkc_torch.diagnosis.io.model import model_of
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
+from mkc_torch.diagnosis.model.shapes import described
+from mkc_torch.diagnosis.model.term import Drivers, Term
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
+from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch
+from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
+from mkc_torch.diagnosis.search.estimate import FinalEstimate
+from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
+from mkc_torch.recording.unit_warnings import unit_warnings
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+
+__all__ = [
+    "DiagnosisInputs",
+    "FitAssessment",
+    "assess",
+    "assess_baseline",
+    "build_diagnosis",
+    "impossible_rotations",
+    "noise_environment",
+    "verdict_of",
+    "with_search_notes",
+]
+
+_LOST = -1.0
+"""Smallest explained share of an output in the mean over the outputs."""
+
+
+@dataclass(frozen=True)
+class FitAssessment:
+    """Goodness of fit without and with the findings, and the remaining noise.
+
+    Attributes:
+        follows: goodness of fit of the simulation without findings, by output.
+        corrected: goodness of fit with the findings, by output.
+        noise: the remaining noise of differential equations; None for other simulations.
+        lost: True if no finding can make the fit good: the recorded rotations are wrong.
+    """
+
+    follows: tuple[GoodnessOfFit, ...]
+    corrected: tuple[GoodnessOfFit, ...]
+    noise: StateSpaceNoise | None
+    lost: bool = False
+
+    def unfit(self, settings: EvidenceSettings) -> bool:
+        """Whether the simulation explains too little of the variation, both without and with its findings.
+
+        An output that runs away counts against the others: an effect can tie one output to an input, and lose another.
+        """
+        if self.lost:
+            return True
+        if not poor_fits(self.follows, settings.followed):
+            return False
+        shares = [pooled(fits, _LOST) for fits in (self.follows, self.corrected) if fits]
+        return not shares or max(shares) < settings.useful
+
+
+def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
+    """Return the goodness of fit of the simulation without findings, by output."""
+    free = base.free
+    prepared = base.fit.model.prepared if free is None else free.model.prepared
+    floor = None if base.noise is None else base.noise.selected.sensor.tolist()
+    return goodness_of_fit(prepared, None if free is None else free.residual, declared, floor)
+
+
+def impossible_rotations(base: ProcessNoiseFit) -> bool:
+    """Whether a search is pointless: the recorded rotations are impossible."""
+    return bool(base.fit.model.prepared.faults)
+
+
+def assess(
+    base: ProcessNoiseFit, final: FittedModel, declared: Mapping[str, float], noise: NoiseSettings
+) -> FitAssessment:
+    """Assess the simulation without and with the findings.
+
+    Args:
+        base: the fit without findings.
+        final: the fit with all findings, under the remaining process noise.
+        declared: known standard deviations of the outputs' white noise.
+        noise: settings.
+    """
+    follows = assess_baseline(base, declared)
+    left = base.noise if not final.model.terms else estimate_noise(final, declared, noise)
+    corrected: tuple[GoodnessOfFit, ...] = ()
+    if final.model.terms:
+        free = refit_open_loop(final)
+        floor = [fit.noise_floor for fit in follows]
+        corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared, floor)
+    return FitAssessment(follows, corrected, left, bool(final.model.prepared.faults))
+
+
+def noise_environment(
+    base: ProcessNoiseFit, final: FittedModel, known: FitAssessment, *, unfit: bool
+) -> NoiseEnvironment:
+    """Return the goodness of fit and the noise for the report."""
+    prepared = final.model.prepared.dynamics
+    reasons: tuple[str, ...] = ()
+    if unfit:
+        fits = [base.fit] if base.free is None else [base.fit, base.free]
+        reasons = reasons_of(fits, known.follows)
+    if prepared is None or known.noise is None:
+        return NoiseEnvironment(known.follows, reasons, starts=base.starts)
+    model, theta = final.model, final.parameters
+    noise = sized_noise(prepared, theta[: model.base], model.changes(theta), model.near, known.noise)
+    return NoiseEnvironment(
+        known.follows,
+        reasons,
+        process_noise_of(prepared, noise),
+        dict(prepared.input_hold),
+        () if unfit else forcing_of(final, noise),
+        base.starts,
+    )
+
+
+def verdict_of(
+    known: FitAssessment,
+    findings: Sequence[Finding],
+    *,
+    structure: bool,
+    white: bool,
+    settings: EvidenceSettings,
+) -> Verdict:
+    """Return the verdict.
+
+    Args:
+        known: the assessed fits.
+        findings: with their grades.
+        structure: whether there is structure beyond the findings: a significant candidate, or a smooth remainder.
+        white: whether the residual is white.
+        settings: thresholds.
+    """
+    if known.unfit(settings):
+        return "unfit"
+    disturbances = () if known.noise is None else known.noise.selected.disturbances
+    # with a finding, a sensor's own slow error counts as noise
+    disturbed_state = any(disturbance.at_rate or not findings for disturbance in disturbances)
+    above = [
+        fit
+        for fit in (known.corrected if findings else known.follows)
+        if fit.floor_source == "declared" and fit.residual > settings.above_floor * fit.noise_floor
+    ]
+    clean = white and not disturbed_state and not structure and not above
+    if not findings:
+        follows = not poor_fits(known.follows, settings.followed)
+        return "adequate" if clean and follows else "unexplained"
+    named = all(finding.grade in ("left_out", "small") for finding in findings)
+    return "explained" if named and clean else "unexplained"
+
+
+_MOMENT_S = 1.0
+"""Time limit in seconds for each optional part of a stopped diagnosis."""
+
+_HINTED = 0.15
+"""p-value up to which the strongest candidate is mentioned although it is not a finding."""
+
+
+_DROPPED = ("unconfirmed", "nearest")
+"""Grades of findings that are dropped if their size is 0 within its standard error."""
+
+
+@dataclass(frozen=True)
+class DiagnosisInputs:
+    """Everything that a diagnosis is built from, except the results of the tests.
+
+    Attributes:
+        simulation: as given by the user.
+        drivers: the recorded columns that can drive an effect, and warnings about the others.
+        terms: the candidates.
+        base: the fitted simulation without findings, with its noise.
+        final: the fit with all findings, under the remaining process noise.
+        options: of the search.
+        cut: whether there was a further finding beyond the limit.
+        stop: why the search was stopped before its end, and what was not done.
+    """
+
+    simulation: Simulation
+    drivers: Drivers
+    terms: tuple[Term, ...]
+    base: ProcessNoiseFit
+    final: FittedModel
+    options: SearchOptions
+    cut: bool
+    stop: Stop | None = None
+
+    @property
+    def in_short(self) -> bool:
+        """Whether slow parts are left out."""
+        return self.options.quick or self.stop is not None
+
+
+def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosis:
+    """Build the diagnosis, with its verdict and advice.
+
+    Args:
+        whole: the inputs.
+        answers: results of the tests of evidence, and their context.
+    """
+    case, prepared, options = answers.case, answers.case.prepared, whole.options
+    first, final, settings = case.first, case.final, options.settings
+    known = _assessment(whole)
+    unfit = known.unfit(settings.evidence)
+    tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
+    without_size = [finding for finding in tried if finding.grade in _DROPPED and is_zero_within_error(finding)]
+    findings = tuple(finding for finding in tried if finding not in without_size)
+    diagnosis = Diagnosis(
+        recording=prepared.recording.name,
+        simulation=prepared.name,
+        samples=len(prepared.time),
+        level=options.level,
+        noise=noise_summary(final, settings.noise),
+        candidates_tried=0 if first is None and whole.stop is not None else len(whole.terms),
+        surrogates=0 if options.quick else options.surrogates,
+        seed=options.seed,
+        p_value=_p_value(first, whole),
+        verdict="adequate",
+        findings=findings,
+        baseline=case.spread(case.held_out[0]),
+        corrected=case.spread(case.held_out[-1]),
+        advice=(),
+        warnings=(
+            *notices(whole.stop, quick=options.quick),
+            *prepared.recording.warnings,
+            *unit_warnings(prepared.recording),
+            *prepared.warnings,
+            *whole.drivers.warnings,
+            *_time_warnings(prepared),
+            *answers.warnings,
+            *(_no_size(finding) for finding in without_size),
+            *(doubt for finding in findings for doubt in finding.doubts),
+        ),
+        candidates=_candidates(first),
+        separability=separability(first) if first else _nothing_to_separate(),
+        traces=_traces(prepared, whole.drivers, case.base, final),
+        model=model_of(final, whole.simulation),
+        evidence=answers.of_all,
+        environment=_environment(whole, known, unfit=unfit),
+        quick=options.quick,
+        stop=whole.stop,
+    )
+    there = first is not None and first.p_value <= options.level and not findings
+    structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
+    # for differential equations the noise model includes the correlation already
+    white = known.noise is not None or _white(diagnosis)
+    verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
+    if whole.stop is not None and verdict != "unfit":
+        verdict = "unexplained"  # the rest of the search might have found more
+    diagnosis = replace(diagnosis, verdict=verdict)
+    return replace(diagnosis, advice=advice_of(diagnosis))
+
+
+def _finding(
+    found: Sequence[SearchResult], number: int, final: FinalEstimate, whole: DiagnosisInputs, answers: EvidenceReport
+) -> Finding:
+    """Return a finding with its evidence, shape check and grade."""
+    quick = whole.options.quick
+    finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
+    if whole.in_short:
+        return replace(finding, grade=grade_in_short(finding))
+    shape = None
+    if whole.final.model.prepared.dynamics is not None:
+        shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
+    grade = grade_of(finding)
+    if shape is not None and shape.curve is not None:
+        grade = "nearest"
+    return replace(finding, grade=grade, shape=shape)
+
+
+def _assessment(whole: DiagnosisInputs) -> FitAssessment:
+    """Assess the fits; after a stop only as far as the time limit of a part allows."""
+    settings, declared = whole.options.settings.noise, whole.options.declared
+    if whole.stop is None:
+        return assess(whole.base, whole.final, declared, settings)
+    known = within(_MOMENT_S, partial(assess, whole.base, whole.final, declared, settings))
+    if known is not None:
+        return known
+    # the goodness of fit with the findings is unknown, so the verdict cannot be unfit
+    follows = () if whole.final.model.terms else assess_baseline(whole.base, declared)
+    return FitAssessment(follows, (), None, impossible_rotations(whole.base))
+
+
+def _environment(whole: DiagnosisInputs, known: FitAssessment, *, unfit: bool) -> NoiseEnvironment:
+    if whole.stop is None:
+        return noise_environment(whole.base, whole.final, known, unfit=unfit)
+    noise = within(_MOMENT_S, partial(noise_environment, whole.base, whole.final, known, unfit=unfit))
+    return NoiseEnvironment(known.follows, starts=whole.base.starts) if noise is None else noise
+
+
+def _p_value(first: SearchResult | None, whole: DiagnosisInputs) -> float | None:
+    """The p-value of the strongest candidate; None without surrogates."""
+    if whole.options.quick or (first is None and whole.stop is not None):
+        return None
+    return 1.0 if first is None else first.p_value
+
+
+def _significance(p_value: float | None) -> str:
+    return "its likelihood gain exceeds its penalty" if p_value is None else f"p = {p_value:.2g} after the whole search"
+
+
+def _no_size(finding: Finding) -> str:
+    return (
+        f"{finding.effect}: {_significance(finding.p_value)}, but in the open-loop fit its size is 0 within its "
+        "standard error, so it does not count as a finding."
+    )
+
+
+def _white(diagnosis: Diagnosis) -> bool:
+    """Whether the residual is white."""
+    channels = next((result.value for result in diagnosis.evidence if result.test == "whiteness"), None)
+    return not channels or all(channel.lag == 0 for channel in channels.values())
+
+
+def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis:
+    """Add warnings about rejected candidates, and about why the search ended."""
+    more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
+    if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
+        more += _short_of_the_level(search.first, diagnosis.level)
+    if search.given_up:
+        more.append(
+            f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
+            "further fit has no finite trajectory. Other physics may be missing too."
+        )
+    if search.cut:
+        more.append(
+            f"There is more structure beyond the {len(search.found)} findings, the limit; raise `max_findings` to find "
+            "it."
+        )
+    return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
+
+
+def _candidates(first: SearchResult | None) -> tuple[CandidateScore, ...]:
+    if first is None:
+        return ()
+    return tuple(
+        CandidateScore(
+            first.scene.terms[r.number].effect.id,
+            first.scene.terms[r.number].columns,
+            described(first.scene.terms[r.number].effect, first.scene.terms[r.number].shape),
+            r.gain,
+            math.sqrt(2.0 * max(r.gain, 0.0)),
+            first.scene.terms[r.number].at,
+            r.gap,
+        )
+        for r in first.ranking
+    )
+
+
+def _nothing_to_separate() -> Separability:
+    return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+
+
+def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
+    shape = described(located.term.effect, located.term.shape)
+    what = f"{called(located.term)} ({shape})" if shape else called(located.term)
+    return (
+        f"{what}: {_significance(None if quick else located.p_value)}, but it does not predict held-out blocks better, "
+        "so it does not count as a finding."
+    )
+
+
+def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
+    """Describe the best candidate above the level, and how long a recording would decide about it."""
+    if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
+        return []
+    shape = described(first.term.effect, first.term.shape)
+    what = f"{called(first.term)} ({shape})" if shape else called(first.term)
+    return [
+        f"{what} would explain the residual best, but measurement and process noise gain as much by chance: p = "
+        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide whether it "
+        "is real."
+    ]
+
+
+def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:
+    if prepared.recording.time is not None:
+        return ()
+    return (
+        "The recording has no column `time`: sample numbers replace seconds, and samples are taken as evenly spaced.",
+    )
+
+
+def _traces(prepared: PreparedSimulation, drivers: Drivers, base: FittedModel, final: FinalEstimate) -> Traces:
+    shown = {
+        name: driver.values[:, k] + driver.reference[k]
+        for driver in drivers.drivers
+        for k, name in enumerate(driver.columns)
+    }
+    units = {name: unit for driver in drivers.drivers for name, unit in zip(driver.columns, driver.units, strict=True)}
+    return Traces(
+        time=prepared.time,
+        has_time=prepared.recording.time is not None,
+        before=base.residual,
+        after=final.fit.residual,
+        weight=final.fit.weights,
+        channels=prepared.channels,
+        unit=prepared.unit,
+        drivers=shown,
+        driver_units=units,
+    )

@@ -1,0 +1,291 @@
+"""Check the arguments of a diagnosis and join its recordings to one table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from mkc_torch._support.arguments import checked_number, checked_whole, format_value, refuse_other_type
+from mkc_torch._support.arrays import is_frame
+from mkc_torch.diagnosis.settings import Settings, quick_settings
+from mkc_torch.effects.base import Effect
+from mkc_torch.recording.given_columns import EXPERIMENT
+from mkc_torch.recording.join_recordings import join_recordings, recording_names, refuse_no_recording
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+
+__all__ = [
+    "Problem",
+    "SearchOptions",
+    "checked_effects",
+    "checked_input_hold",
+    "checked_noise",
+    "joined",
+    "prepare",
+    "subject_of",
+    "with_own_offsets",
+]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """The options of :func:`diagnose`.
+
+    ``judged`` is True if held-out blocks test the candidates.
+    """
+
+    level: float
+    surrogates: int
+    max_findings: int
+    seed: int
+    settings: Settings
+    declared: Mapping[str, float] = field(default_factory=dict)
+    fixed: Mapping[str, str] = field(default_factory=dict)
+    quick: bool = False
+    judged: bool = True
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The checked input of a diagnosis.
+
+    Attributes:
+        simulation: as given by the user.
+        prepared: the simulation together with the recording.
+        effects: the catalogue.
+        options: of the search.
+        recordings: names of the recordings that are diagnosed together; empty for a single recording.
+        run_counts: number of runs in each of these recordings.
+        progress: called with the name of each stage.
+    """
+
+    simulation: Simulation
+    prepared: PreparedSimulation
+    effects: tuple[Effect, ...]
+    options: SearchOptions
+    recordings: tuple[str, ...]
+    run_counts: tuple[int, ...]
+    progress: Callable[[str], object]
+
+    @property
+    def where(self) -> str:
+        """Name of the recording, as the beginning of an error message."""
+        return subject_of(self.prepared.recording)
+
+
+def prepare(
+    simulation: Simulation,
+    recording: Recording | Sequence[Recording],
+    effects: Sequence[Effect],
+    options: SearchOptions,
+    time_limit: float | None,
+    progress: Callable[[str], object],
+) -> Problem:
+    """Check the arguments of :func:`mkc_torch.diagnose`, and prepare the simulation with the recording.
+
+    Raises:
+        TypeError, ValueError, MissingColumnError: see :func:`mkc_torch.diagnose`.
+    """
+    refuse_no_simulation(simulation)
+    several = () if isinstance(recording, Recording) else tuple(recording)
+    recording, names = joined(simulation, recording)
+    effects = checked_effects(effects)
+    check_numbers(options.level, options.surrogates, options.max_findings, options.seed)
+    check_limits(options.quick, time_limit)
+    refuse_no_settings(options.settings)
+    settings = quick_settings(options.settings) if options.quick else options.settings
+    _refuse_few(len(recording), "samples", recording, settings)
+    progress("reading the recording")
+    prepared = simulation.prepare(recording)
+    _refuse_few(len(prepared.time), "usable samples", recording, settings)
+    prepared = with_own_offsets(prepared, several)
+    options = replace(
+        options,
+        settings=settings,
+        declared=checked_noise(options.declared, prepared.channels),
+        fixed=checked_input_hold(options.fixed, tuple(prepared.input_hold)),
+        # a quick look at differential equations tests nothing on held-out blocks
+        max_findings=min(options.max_findings, 1) if _unjudged(options, prepared) else options.max_findings,
+        judged=not _unjudged(options, prepared),
+    )
+    prepared = prepared.with_input_hold(options.fixed)
+    counts = run_counts(several) if names else ()
+    return Problem(simulation, prepared, effects, options, names, counts, progress)
+
+
+def _unjudged(options: SearchOptions, prepared: PreparedSimulation) -> bool:
+    return options.quick and prepared.dynamics is not None
+
+
+def subject_of(recording: Recording) -> str:
+    """Return the name of a recording as the beginning of an error message; empty for a recording without a name."""
+    return f"{recording.name}: " if recording.name else ""
+
+
+def _refuse_few(count: int, what: str, recording: Recording, settings: Settings) -> None:
+    fewest = settings.search.fewest_samples
+    if count < fewest:
+        advice = " Record longer." if what == "samples" else ""
+        raise ValueError(
+            f"{subject_of(recording)}{count} {what} are too few for a diagnosis; it needs {fewest} at least.{advice}"
+        )
+
+
+def refuse_no_simulation(simulation: object) -> None:
+    if not isinstance(simulation, type) and all(hasattr(simulation, name) for name in ("columns", "prepare")):
+        return
+    remedy = "pass a simulation, such as Magnetometer()"
+    if isinstance(simulation, type):
+        remedy = f"create an instance, {simulation.__name__}()"
+    elif isinstance(simulation, Recording):
+        remedy = "pass the simulation first, diagnose(simulation, recording)"
+    elif isinstance(simulation, str):
+        remedy += f", or use the command line, mkc diagnose REC.csv --simulation {simulation} --output DIR"
+    raise TypeError(f"Expected argument `simulation` to be a Simulation but got {format_value(simulation)}; {remedy}.")
+
+
+def checked_effects(effects: object) -> tuple[Effect, ...]:
+    if isinstance(effects, str) or not isinstance(effects, Iterable):
+        raise TypeError(
+            f"Expected argument `effects` to be a sequence of Effects but got {format_value(effects)}; pass a tuple "
+            "such as mkc_torch.effects.CATALOGUE, or () for no effects."
+        )
+    # an iterator would be empty the second time
+    checked = tuple(effects)
+    for effect in checked:
+        _refuse_no_effect(effect)
+    return checked
+
+
+def _refuse_no_effect(effect: object) -> None:
+    roles: object = effect.roles if isinstance(effect, Effect) else ()
+    if isinstance(effect, type):
+        remedy = f"create an instance, {effect.__name__}()"
+    elif isinstance(effect, str):
+        remedy = f"select it from mkc_torch.effects.CATALOGUE, [e for e in CATALOGUE if e.id == {effect!r}]"
+    elif not isinstance(effect, Effect):
+        remedy = "derive it from mkc_torch.effects.Effect"
+    elif not effect.id:
+        remedy = "give it an `id`, its name in diagnosis.json"
+    elif isinstance(roles, str):
+        remedy = f"its roles are names, ({roles!r},)"
+    else:
+        return
+    raise TypeError(f"Expected argument `effects` to hold Effects but got {format_value(effect)}; {remedy}.")
+
+
+def refuse_no_settings(settings: object) -> None:
+    advice = "pass Settings(), or dataclasses.replace(Settings(), naming=NamingSettings(separable=8.0))"
+    refuse_other_type("settings", settings, Settings, "Settings", advice)
+
+
+def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -> None:
+    checked_number("level", level, 0.0, 1.0, advice="0.05 is usual")
+    checked_whole("surrogates", surrogates, 0, "99 is usual")
+    checked_whole("max_findings", max_findings, 0, "3 is usual")
+    checked_whole("seed", seed)
+    if surrogates < math.ceil(1.0 / level - 1.0 - 1e-9):
+        raise ValueError(
+            f"Expected argument `surrogates` to be at least {math.ceil(1.0 / level - 1.0 - 1e-9)} at level {level}, "
+            f"because no p-value can be smaller than 1 / (surrogates + 1), but got {surrogates}."
+        )
+
+
+def check_limits(quick: object, time_limit: object) -> None:
+    """Raise for a ``quick`` that is not a bool, or a time limit that is not a positive number."""
+    refuse_other_type("quick", quick, bool, "bool", "True for a quick look without p-values")
+    if time_limit is not None:
+        checked_number("time_limit", time_limit, 0.0, advice="pass seconds, such as 60, or None for no limit")
+
+
+BETWEEN = ("held", "linear", "smooth")
+"""Input holds between two samples."""
+
+
+def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
+    """Return the declared standard deviations of the sensors' white noise, by output.
+
+    Example:
+        >>> checked_noise({"angle": 0.005}, ["angle", "rate"])
+        {'angle': 0.005}
+        >>> checked_noise({"x": 0.005}, ["angle"])
+        Traceback (most recent call last):
+        ValueError: Expected argument `noise` to name outputs of this simulation but got `x`; they are `angle`.
+    """
+    return {
+        name: checked_number(f"noise[{name!r}]", size, advice="the standard deviation of that sensor's white noise")
+        for name, size in _of_known("noise", noise, outputs, "outputs", '{"angle": 0.005}').items()
+    }
+
+
+def checked_input_hold(input_hold: object, inputs: Sequence[str]) -> dict[str, str]:
+    """Return the declared input holds of differential equations, by input.
+
+    Example:
+        >>> checked_input_hold({"torque": "held"}, ["torque"])
+        {'torque': 'held'}
+    """
+    found = {}
+    for name, hold in _of_known(
+        "input_hold", input_hold, inputs, "inputs in the equations", '{"torque": "held"}'
+    ).items():
+        if not isinstance(hold, str) or hold not in BETWEEN:
+            raise ValueError(
+                f"Expected argument `input_hold` of `{name}` to be one of {', '.join(BETWEEN)} but got {hold!r}."
+            )
+        found[name] = hold
+    return found
+
+
+def _of_known(argument: str, given: object, names: Sequence[str], what: str, example: str) -> dict[str, object]:
+    """Return a mapping whose names the simulation knows; None gives an empty mapping."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise TypeError(f"Expected argument `{argument}` to be a dict such as {example} but got {format_value(given)}.")
+    for name in given:
+        if name not in names:
+            known = f"they are {', '.join(f'`{known_name}`' for known_name in names)}" if names else "it has none"
+            raise ValueError(
+                f"Expected argument `{argument}` to name {what} of this simulation but got `{name}`; {known}."
+            )
+    return dict(given)
+
+
+def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -> tuple[Recording, tuple[str, ...]]:
+    """Return one recording of all that were given, and their names; no names for a single recording.
+
+    Raises:
+        TypeError: neither a recording nor a list or tuple of recordings.
+        RecordingError: no recording, or columns, units or labels that differ.
+    """
+    if isinstance(recording, Recording) or is_frame(recording) or not isinstance(recording, (list, tuple)):
+        refuse_no_recording("recording", recording)
+        assert isinstance(recording, Recording)
+        return recording, ()
+    for number, item in enumerate(recording):
+        refuse_no_recording(f"recording[{number}]", item)
+    whole = join_recordings(recording, simulation.joint_clock)
+    return whole, recording_names(recording) if len(recording) > 1 else ()
+
+
+def run_counts(recordings: Sequence[Recording]) -> tuple[int, ...]:
+    """Return the number of runs in each recording."""
+    return tuple(len(recording.experiments()) for recording in recordings)
+
+
+def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recording]) -> PreparedSimulation:
+    """Return the simulation with separate offsets of its outputs for each recording.
+
+    A simulation without such offsets, such as the magnetometer's, is returned unchanged.
+    """
+    whole = prepared.recording
+    if len(recordings) < 2 or EXPERIMENT not in whole:
+        return prepared
+    counts = torch.tensor(run_counts(recordings))
+    of_experiment = torch.arange(len(recordings)).repeat_interleave(counts)
+    recording, names = of_experiment[whole[EXPERIMENT].long()], recording_names(recordings)
+    return prepared.with_own_offsets(recording, names)

@@ -1,0 +1,412 @@
+"""Stepwise search: one search after another, each with the previous findings in the model."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+
+from mkc_torch.diagnosis.evidence.common_cause import course_without, located_cause
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, on_all
+from mkc_torch.diagnosis.findings.finding import ended_shapes
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_noise
+from mkc_torch.diagnosis.model.shapes import within_a_sample
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
+from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
+from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
+from mkc_torch.diagnosis.search.ranking import alike
+from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
+from mkc_torch.diagnosis.search.with_process_noise import search_with_process_noise
+from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
+from mkc_torch.nonlinear import NoFitError
+
+
+def _holds(
+    located: SearchResult,
+    before: Evidence,
+    after: Evidence,
+    blocks: HeldOutBlocks,
+    seed: int,
+    settings: ConfirmationSettings,
+    *,
+    first: bool,
+) -> bool:
+    """Whether a candidate counts as a finding.
+
+    Held-out blocks weigh samples as if their noise was white, and can miss a clear effect in coloured noise. So a first
+    finding, which has passed the surrogates, needs one of three: a positive gain on the blocks; no clear loss there, if
+    it is clearly beyond all surrogates; or a gain above its number of parameters once the noise is whitened. If noise
+    and physics were selected together, the blocks can only reject a first finding, because process noise predicts one
+    step ahead as well. A further finding may also fit the misfit of the previous finding's shape, so the blocks have to
+    confirm it, or show a positive gain if it is far beyond all surrogates.
+    """
+    difference = after.log_likelihood - before.log_likelihood
+    gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    if first and located.with_noise:
+        return high >= 0.0
+    if first:
+        plain = located.beyond > settings.beyond_doubt and high > 0.0
+        price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
+        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
+    return low > 0.0 or (gain > 0.0 and located.beyond > settings.further)
+
+
+@dataclass(frozen=True)
+class StepwiseSearch:
+    """The stepwise search so far.
+
+    Attributes:
+        first: result of the first search.
+        found: the findings.
+        unconfirmed: the last candidate that held-out blocks did not confirm.
+        blocks: the held-out blocks.
+        evidence: of the simulation without findings, and after each finding.
+        left: candidates that remain to be searched; empty once the search is over.
+        pairs: evidence without and with each finding under the same process noise, by which it was confirmed.
+        given_up: why the next search failed; empty if it did not.
+        cut: whether there was a further finding beyond the limit.
+    """
+
+    first: SearchResult | None
+    found: tuple[SearchResult, ...]
+    unconfirmed: SearchResult | None
+    blocks: HeldOutBlocks
+    evidence: tuple[Evidence, ...]
+    left: tuple[Term, ...]
+    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
+    given_up: str = ""
+    cut: bool = False
+
+    @property
+    def parts(self) -> tuple[object, ...]:
+        """Everything that the next search needs."""
+        fits = [located.fit for located in self.found]
+        pairs = [evidence for pair in self.pairs for evidence in pair]
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
+
+
+Keep = Callable[[StepwiseSearch], object]
+"""A callback that receives the search so far, in case it is stopped."""
+
+
+def _kept_nowhere(_: StepwiseSearch) -> None:
+    """Ignore the search so far."""
+
+
+def first_step(
+    base: FittedModel,
+    terms: tuple[Term, ...],
+    options: SearchOptions,
+    generator: torch.Generator,
+    free: FittedModel | None = None,
+    keep: Keep = _kept_nowhere,
+) -> StepwiseSearch:
+    """Run the first search; its candidate is a finding if held-out blocks confirm it.
+
+    ``keep`` is called with the search so far.
+    """
+    prepared = base.model.prepared
+    correlation = max(correlation_time(series) for series in base.pseudo(options.settings.noise)[0].unbind(1))
+    confirmation = options.settings.confirmation
+    blocks = blocks_of(len(base.residual), math.ceil(correlation), confirmation, first_samples(prepared))
+    first = None
+    so_far = StepwiseSearch(None, (), None, blocks, (), terms)
+    keep(so_far)
+    if terms:
+        first = _located(
+            base, terms, options, generator, free=free, keep=lambda first: keep(replace(so_far, first=first))
+        )
+    keep(replace(so_far, first=first))
+    evidence = _evidence(base, blocks, options)
+    first_step = StepwiseSearch(first, (), None, blocks, (evidence,), terms)
+    keep(first_step)
+    if first is None:
+        return first_step
+    try:
+        taken = _accept(first_step, base, first, options)
+    except NoFitError:  # a fit to a part of the recording has no finite trajectory
+        taken = replace(first_step, left=(), unconfirmed=first)
+    keep(taken)
+    if taken.found:
+        return _in_two_steps(first_step, taken, options, generator)
+    if options.quick:
+        return taken
+    cause = located_cause(base, first, options.level, options.surrogates)
+    if cause is None:
+        return taken
+    after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+    # after a free course, little structure remains
+    return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
+
+
+def next_step(
+    search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = _kept_nowhere
+) -> StepwiseSearch:
+    """Run the next search with the findings in the model; skip it if the screening shows nothing."""
+    if _is_screened_out(search, options):
+        return replace(search, left=())
+    fit = search.found[-1].fit
+    try:
+        taken = _accept(search, fit, _located(fit, search.left, options, generator, parts=False), options)
+        keep(taken)
+        return _in_two_steps(search, taken, options, generator)
+    except NoFitError as error:
+        return replace(search, left=(), given_up=str(error))  # keep the previous findings
+
+
+def _located(
+    fit: FittedModel,
+    terms: tuple[Term, ...],
+    options: SearchOptions,
+    generator: torch.Generator,
+    *,
+    parts: bool = True,
+    free: FittedModel | None = None,
+    keep: Callable[[SearchResult], object] = lambda _: None,
+) -> SearchResult:
+    if has_process_noise(fit):
+        return search_with_process_noise(
+            fit,
+            terms,
+            level=options.level,
+            surrogates=options.surrogates,
+            generator=generator,
+            declared=options.declared,
+            fixed=options.fixed,
+            free=free,
+            settings=options.settings,
+            quick=options.quick,
+            keep=keep,
+        )
+    return run_search(
+        fit,
+        terms,
+        level=options.level,
+        surrogates=options.surrogates,
+        generator=generator,
+        settings=options.settings,
+        parts=parts and not options.quick,
+        quick=options.quick,
+        keep=keep,
+    )
+
+
+def _is_screened_out(search: StepwiseSearch, options: SearchOptions) -> bool:
+    """Whether the screening p-value after the last finding is too large for a further finding."""
+    return _further_p_value(search, options) > max(options.settings.confirmation.screening_level, options.level)
+
+
+def _further_p_value(search: StepwiseSearch, options: SearchOptions) -> float:
+    """The p-value of the screening after the last finding."""
+    last, settings = search.found[-1], options.settings
+    near = _near(last.fit, settings)
+    others = [all(not _same(term, known.term, near, settings) for known in search.found) for term in last.scene.terms]
+    generator = torch.Generator().manual_seed(options.seed)
+    return screening_p_value(last, others, settings.confirmation.screening_draws, generator, quick=options.quick)
+
+
+def _evidence(fit: FittedModel, blocks: HeldOutBlocks, options: SearchOptions) -> Evidence:
+    """Evidence of a fit on held-out blocks, or on all samples if the blocks are not used."""
+    return held_out(fit, blocks) if options.judged else on_all(fit)
+
+
+def _shows_more(search: StepwiseSearch, options: SearchOptions) -> bool:
+    """Whether the screening shows a further finding; False if it cannot see any (p-value 0)."""
+    return not options.quick and 0.0 < _further_p_value(search, options) <= options.level
+
+
+def _accept(
+    search: StepwiseSearch,
+    previous: FittedModel,
+    located: SearchResult,
+    options: SearchOptions,
+    after: Evidence | None = None,
+) -> StepwiseSearch:
+    """Add a located candidate if it counts as a finding.
+
+    ``after`` is its evidence if that is not the evidence of its fit.
+    """
+    over = replace(search, left=())
+    if located.p_value > options.level or options.max_findings == 0:
+        return over
+    before = search.evidence[-1]
+    if after is None:
+        after = _evidence(located.fit, search.blocks, options)
+
+    def holds(fit: FittedModel, evidence: Evidence) -> bool:
+        candidate = replace(located, fit=fit)
+        return _holds(
+            candidate,
+            before,
+            evidence,
+            search.blocks,
+            options.seed,
+            options.settings.confirmation,
+            first=not search.found,
+        )
+
+    same = None if located.with_noise else _under_the_same(previous, located.fit)
+    paired = (
+        after
+        if same is None
+        else _better_supported(before, (held_out(same, search.blocks), after), search.blocks, options.seed)
+    )
+    if within_a_sample(located.term, located.fit.model.prepared) or not holds(located.fit, paired):
+        return replace(over, unconfirmed=located)
+    if len(search.found) == options.max_findings:
+        return replace(over, cut=True)
+    fit, simpler = located.fit, after
+    if located.with_noise:
+        fit = simpler_by_price(located.fit, options.declared, options.settings)
+        simpler = after if fit is located.fit else _evidence(fit, search.blocks, options)
+    else:
+        fit, simpler = simplified(located.fit, after, search.blocks, holds, options.settings.naming)
+    paired = simpler if same is None or fit is not located.fit else paired
+    after = simpler
+    found = (*search.found, replace(located, fit=fit))
+    near = _near(located.fit, options.settings)
+    left = tuple(t for t in search.left if not _same(t, located.term, near, options.settings))
+    pairs = (*search.pairs, (before, paired))
+    taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
+    if located.with_noise:
+        taken = _eliminated(taken, options)
+    found = taken.found
+    full = len(found) == options.max_findings and not _shows_more(taken, options)
+    return replace(taken, left=()) if full else taken
+
+
+def _in_two_steps(
+    before: StepwiseSearch, after: StepwiseSearch, options: SearchOptions, generator: torch.Generator
+) -> StepwiseSearch:
+    """Replace the last finding by a simpler effect and a further finding if the two together score as well.
+
+    A form with more numbers can stand for two effects: friction that falls with speed for dry friction and drag. So can
+    a shape parameter that ended at a bound: a power of the speed near 0 for dry friction and drag.
+
+    Args:
+        before: the search without the last finding.
+        after: the search with it.
+        options: of the diagnosis.
+        generator: of the surrogates.
+    """
+    settings = options.settings
+    if options.quick or len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
+        return after
+    last = after.found[-1]
+    near = _simpler_rivals(last)
+    if not near:
+        return after
+    simple = max(near, key=lambda fit: priced(fit, settings))
+    try:
+        further = _located(simple, after.left, options, generator, parts=False)
+    except NoFitError:
+        return after
+    if further.p_value > options.level or _score(further.fit, settings) < _score(last.fit, settings):
+        return after
+    first = replace(last, fit=simple, term=simple.model.terms[-1])
+    evidence = held_out(simple, before.blocks)
+    step = replace(
+        after,
+        found=(*before.found, first),
+        evidence=(*before.evidence, evidence),
+        pairs=(*before.pairs, (before.evidence[-1], evidence)),
+    )
+    both = _accept(step, simple, further, options)
+    return both if len(both.found) > len(after.found) else after
+
+
+def _simpler_rivals(last: SearchResult) -> list[FittedModel]:
+    """Return the compared fits of simpler effects that may stand for a part of a finding."""
+    effect, port = last.term.effect, last.term.port
+    if effect.reduces_to is not None:
+        return [fit for fit in last.compared if fit.model.terms[-1].effect.id == effect.reduces_to.id]
+    if not ended_shapes(last.term, last.fit.model.prepared):
+        return []
+    rivals = [fit for fit in last.compared if fit.model.terms[-1].port == port]
+    return [fit for fit in rivals if _numbers(fit) < _numbers(last.fit) and not fit.model.terms[-1].effect.is_curve]
+
+
+def _numbers(fit: FittedModel) -> int:
+    """Number of fitted sizes and shape parameters of the effects."""
+    return fit.model.size + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
+
+
+def _score(fit: FittedModel, settings: Settings) -> float:
+    """Log-likelihood less the penalty of the noise, and Schwarz's penalty of the effects' sizes and shapes."""
+    return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * _numbers(fit)
+
+
+def _eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
+    """Remove findings that the other findings make needless, and refit the remaining model."""
+    declared, settings = options.declared, options.settings
+    while len(search.found) > 1:
+        final = search.found[-1].fit
+        number = needless_term(final, declared, settings)
+        fit = None if number is None else without(final, number, declared, settings)
+        if number is None or fit is None:
+            break
+        kept = [finding for place, finding in enumerate(search.found) if place != number]
+        fits = [fit]
+        while len(fits[0].model.terms) > 1:
+            less = without(fits[0], len(fits[0].model.terms) - 1, declared, settings)
+            if less is None:
+                return search
+            fits.insert(0, less)
+        found = tuple(replace(old, fit=new, term=new.model.terms[-1]) for old, new in zip(kept, fits, strict=True))
+        evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
+        search = replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)))
+    return search
+
+
+def _better_supported(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:
+    """Return the evidence with the larger lower limit of the gain.
+
+    The finding is tested under the process noise of the model without it, and under the process noise that remains with
+    it. The first noise absorbs as much of the finding as it can; under the second, few samples can dominate.
+    """
+
+    def least(after: Evidence) -> float:
+        difference = after.log_likelihood - before.log_likelihood
+        return gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))[1][0]
+
+    return max(ways, key=least)
+
+
+def _under_the_same(previous: FittedModel, fit: FittedModel) -> FittedModel | None:
+    """Refit a finding under the process noise of the fit without it, for comparison; None if the noise is equal."""
+    if not has_process_noise(previous) or fit.model.prepared is previous.model.prepared:
+        return None
+    model = JointModel(previous.model.prepared, fit.model.terms, previous.model.near)
+    try:
+        return fitted(model, fit.parameters, previous.bound, graduate=False)
+    except NoFitError:
+        return None
+
+
+def _near(fit: FittedModel, settings: Settings) -> float:
+    """Seconds within which two steps count as the same step."""
+    time = fit.model.prepared.time
+    return settings.confirmation.near * float(time[-1] - time[0])
+
+
+def _same(term: Term, found: Term, near: float, settings: Settings) -> bool:
+    """Whether a candidate repeats the found effect, or is a curve over its driver.
+
+    A step more than ``near`` seconds away is another step; a closer step would only correct the shape of the first.
+    """
+    if "onset" in term.shape and "onset" in found.shape:
+        return abs(term.shape["onset"] - found.shape["onset"]) < near
+    if term.key == found.key or (term.effect.is_curve and term.columns == found.columns):
+        return True
+    # a column that correlates with a found driver would only share its amplitude
+    if term.driver is None or found.driver is None:
+        return False
+    return alike(term.driver, found.driver) > settings.naming.alike_columns

@@ -1,0 +1,123 @@
+"""Further searches after a finding: a search that fails changes nothing of the findings."""
+
+import importlib
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation import Dynamics
+
+stepwise = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")
+
+
+ANYWAY = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
+"""Settings that allow several findings for a simulation with a poor fit."""
+
+EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
+
+
+class Sled(Dynamics):
+    states = ("place", "speed")
+    inputs = ("force",)
+    parameters = {"damping": 0.5}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"place": x.speed, "speed": u.force - p.damping * x.speed}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    time = torch.arange(0.0, 10.0, 0.04, dtype=torch.float64)
+    force = torch.sin(1.3 * time) + torch.sin(0.31 * time)
+    place, speed, places = 0.0, 0.0, []
+    for now in force.tolist():
+        places.append(place)
+        for _ in range(8):
+            speed += 0.005 * (now - 0.5 * speed - 0.8 * place**3)
+            place += 0.005 * speed
+    noise = 0.002 * torch.randn(len(time), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
+
+
+@pytest.fixture
+def diagnosed(recording, monkeypatch):
+    """Return a function that diagnoses with a replaced second search."""
+
+    def run(second_search):
+        searches, first = [], []
+        located = stepwise._located
+
+        def search(base, terms, *others, **options):
+            searches.append(base)
+            if len(searches) == 1:
+                first.append(located(base, terms, *others, **options))
+                return first[0]
+            return second_search(base, first[0])
+
+        monkeypatch.setattr(stepwise, "_located", search)
+        monkeypatch.setattr(stepwise, "_is_screened_out", lambda *_: False)
+        return diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY), searches
+
+    return run
+
+
+@pytest.mark.e2e
+def test_a_failed_search_keeps_the_findings(diagnosed):
+    def fails(*_):
+        raise NoFitError("No slope by damping.")
+
+    diagnosis, searches = diagnosed(fails)
+    assert len(searches) == 2
+    assert len(diagnosis.findings) == 1
+    assert any("No slope by damping." in warning for warning in diagnosis.warnings)
+
+
+@pytest.mark.e2e
+def test_errors_of_an_effect_are_raised(diagnosed):
+    def broken(*_):
+        raise ValueError("the effect's own")
+
+    with pytest.raises(ValueError, match="the effect's own"):
+        diagnosed(broken)
+
+
+@pytest.mark.slow
+def test_a_diverging_search_does_not_change_the_findings(diagnosed, recording):
+    def diverging(base, first):
+        base.model.residual(1.01 * base.parameters)
+        return replace(first, p_value=1.0)
+
+    (plain, *_) = diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY).findings
+    diagnosis, searches = diagnosed(diverging)
+    assert len(searches) == 2
+    (finding,) = diagnosis.findings
+    # equal up to rounding; the second search moves the parameters by 1 %
+    for found, expected in zip(finding.parameters, plain.parameters, strict=True):
+        assert found == replace(expected, value=found.value, standard_error=found.standard_error)
+        assert found.value == pytest.approx(expected.value, rel=1e-9)
+        assert found.standard_error == pytest.approx(expected.standard_error, rel=1e-9)
+
+
+@pytest.mark.e2e
+def test_candidates_of_an_impossible_sign_are_no_findings(recording):
+    diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
+    assert len(diagnosis.findings) == 1  # further candidates have an impossible sign
+    assert not any("failed" in warning for warning in diagnosis.warnings)
+
+
+@pytest.mark.e2e
+def test_an_effect_that_makes_the_fit_diverge_is_found_from_the_initial_values(recording):
+    """Without its spring the sled is fitted with a damping of thousands, where a spring has the wrong size."""
+    diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
+    assert diagnosis.environment.goodness_of_fit[0].explained < 0.5
+    (finding,) = diagnosis.findings
+    assert finding.effect == "cubic_stiffness"
+    (stiffness,) = finding.parameters
+    assert stiffness.value == pytest.approx(0.8, rel=0.05)
+    assert diagnosis.model is not None
+    assert float(diagnosis.model.theta[0]) == pytest.approx(0.5, rel=0.05)

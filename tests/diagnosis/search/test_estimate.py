@@ -1,0 +1,78 @@
+"""The final step of generalised least squares."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.search.estimate import estimate, within_bounds
+from mkc_torch.diagnosis.search.tangents import tangents_of
+from mkc_torch.diagnosis.settings import NoiseSettings
+from tests.diagnosis.line import Line
+
+
+class Cliff(Line):
+    """A line that is finite at the fitted parameters only."""
+
+    known = None
+
+    def residual(self, theta, changes):
+        left = super().residual(theta, changes)
+        if self.known is None or torch.equal(theta.detach(), self.known):
+            return left
+        return left * torch.nan
+
+
+def test_the_step_is_smaller_than_the_errors():
+    line = Line(600)
+    fit = fitted(JointModel(line), line.start())
+    found = estimate(fit, NoiseSettings())
+    moved = (found.fit.parameters - fit.parameters).abs()
+    assert bool((moved > 0).any())
+    assert bool((moved < found.standard_error).all())
+    torch.testing.assert_close(found.fit.residual, found.fit.model.residual(found.fit.parameters))
+
+
+def test_a_step_to_a_residual_that_is_not_finite_is_rejected(monkeypatch):
+    line = Cliff(600)
+    fit = fitted(JointModel(line), line.start())
+    monkeypatch.setattr("mkc_torch.diagnosis.search.estimate.tangents_of", tangents_before(line))
+    found = estimate(fit, NoiseSettings())
+    assert torch.equal(found.fit.parameters, fit.parameters)
+    assert bool(found.fit.residual.isfinite().all())
+
+
+def tangents_before(line):
+    """Return the tangents of the plain line; afterwards the line is finite only where it was fitted."""
+
+    def then_not_finite(model, parameters, settings):
+        found = tangents_of(model, parameters, settings)
+        line.known = parameters.detach().clone()
+        return found
+
+    return then_not_finite
+
+
+@given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, 6), width=st.floats(0.01, 3.0))
+def test_parameters_inside_their_bounds_take_their_conditional_estimates(seed, size, width):
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(size, size + 2, generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT
+    parameters, step = torch.zeros(size, dtype=torch.float64), 3.0 * root[:, 0]
+    lower, upper = parameters - width, parameters + width
+    moved, left = within_bounds(parameters, step, covariance, (lower, upper))
+    ends = parameters - moved
+    assert bool(((ends >= lower - 1e-12) & (ends <= upper + 1e-12)).all())
+    free = (ends > lower + 1e-9) & (ends < upper - 1e-9)
+    # the gradient of (step - moved)ᵀ covariance⁻¹ (step - moved) is 0 in the free directions
+    gradient = torch.linalg.solve(covariance, step - moved)
+    assert float((gradient * covariance.diagonal().sqrt())[free].abs().sum()) < 1e-6
+    assert bool((left.diagonal() <= covariance.diagonal() + 1e-9).all())
+    assert float(left.diagonal()[~free].abs().sum()) < 1e-6 * float(covariance.diagonal().sum())
+
+
+def test_a_step_within_the_bounds_is_unchanged():
+    step, covariance = torch.tensor([0.3, -0.2]), torch.tensor([[1.0, 0.9], [0.9, 1.0]])
+    found = within_bounds(torch.zeros(2), step, covariance, (torch.full((2,), -1.0), torch.ones(2)))
+    torch.testing.assert_close(found, (step, covariance))
