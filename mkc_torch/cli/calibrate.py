@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mkc_torch.cli.console import (
+    DOUBTFUL,
     FAILURES,
     complain,
     err,
@@ -90,7 +91,8 @@ def calibrate(
 
     A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
 
-    The exit code is 0 if every recording was calibrated, and 1 otherwise.
+    The exit code is 0 if every recording was calibrated, 1 if one was not, and 3 if all were but a result is doubtful:
+    the correction reduces no scatter, or a third of the samples was rejected.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
@@ -110,7 +112,7 @@ def calibrate(
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.calibration.exports import Destination
         from mkc_torch.cli.calibration_files import CalibrationRequest, calibrations_of, read_calibration
-        from mkc_torch.cli.calibration_summary import show
+        from mkc_torch.cli.calibration_results import show_results
     keep_memory()
     earth = None
     if place is not None and date is not None:
@@ -136,24 +138,19 @@ def calibrate(
         to=Destination(instance, device_id),
         earth=earth,
     )
-    console, total, failed, left = out(), 0, 0, list(recordings)
+    console, total, failed, doubtful, left = out(), 0, 0, 0, list(recordings)
     with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
-            for subject, outcome in calibrations_of(path, output / path.stem, request, force=force, step=step):
-                total += 1
-                with step.aside():
-                    if isinstance(outcome, Exception):
-                        failed += 1
-                        complain(subject, outcome)
-                        continue
-                    show(console, outcome.calibration, outcome.files, outcome.differences, outcome.notes)
-                    for refused in outcome.refused:
-                        complain(subject, refused)
-                    failed += bool(outcome.refused)
+            results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
+            with step.aside():
+                counts = show_results(console, path, results)
+            total += len(results)
+            failed += counts.failed
+            doubtful += counts.doubtful
             left.remove(path)
             step(None)
     if total > 1 and failed:
         things = "recordings" if total == len(recordings) else "sensors"
         what = "not done in full" if request.exports or request.old else "not calibrated"
         err().print(f"mkc: {failed} of {total} {things} were {what}.", soft_wrap=True)
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if failed else DOUBTFUL if doubtful else 0)

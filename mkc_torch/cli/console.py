@@ -36,6 +36,9 @@ from mkc_torch._words.terms import term
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """Errors of bad input, a full disk or a numerical breakdown."""
 
+DOUBTFUL = 3
+"""Exit code of a result that was written, but must be looked at before it is used."""
+
 _PIPE_WIDTH = 100
 """Columns of text that is not printed on a terminal."""
 

@@ -34,6 +34,7 @@ from mkc_torch.diagnosis.parts import (
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
 from mkc_torch.diagnosis.stop import Stop
+from mkc_torch.recording.disturbance import RejectedInterval
 
 __all__ = [
     "Alternative",
@@ -80,6 +81,7 @@ class Diagnosis:
         baseline, corrected: scores of the simulation without and with the findings, on held-out blocks.
         advice: what to do or to record next, in sentences that name effects by their ids.
         warnings: sentences of the same form.
+        notes: how the recording was read, a sentence each.
         candidates: the candidates of the search, best first.
         separability: of the leading candidates.
         traces: the residuals.
@@ -128,13 +130,14 @@ class Diagnosis:
     recordings: tuple[str, ...] = ()
     quick: bool = False
     stop: Stop | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"
         return f"Diagnosis({self.recording!r} against {self.simulation!r}: {self.verdict}; {found})"
 
     def _repr_html_(self) -> str:
-        sentences = (*self.advice, *self.warnings)
+        sentences = (*self.advice, *self.warnings, *self.notes)
         return as_html(self.recording, self.simulation, self.verdict, self.findings, sentences, stop=self.stop)
 
     @property
@@ -153,6 +156,11 @@ class Diagnosis:
         """Columns along which smooth structure remains after the findings."""
         smooth: SmoothCorrection | None = value_of(self.evidence, "remaining")
         return () if smooth is None else smooth.columns
+
+    @property
+    def rejected_intervals(self) -> tuple[RejectedInterval, ...]:
+        """Intervals in which most samples were rejected, such as a disturbance of the measurement."""
+        return value_of(self.evidence, "rejected", ())
 
     @property
     def density_checks(self) -> tuple[DensityCheck, ...]:

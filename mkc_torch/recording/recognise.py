@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, meaning, split_unit
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
@@ -274,7 +275,9 @@ def _without_derived(
     kinds = {number: re.sub(r"_?\d+$", "", topics[number].name) for number, _ in found}
     gone = {number for number, kind in kinds.items() if _DERIVED.get(kind) in kinds.values()}
     warnings = tuple(
-        f"Topic `{topics[number].name}` is left out: it is derived from `{_DERIVED[kinds[number]]}`, which is read."
+        Note(
+            f"Topic `{topics[number].name}` is left out: it is derived from `{_DERIVED[kinds[number]]}`, which is read."
+        )
         for number in sorted(gone)
     )
     return [(number, group) for number, group in found if number not in gone], warnings

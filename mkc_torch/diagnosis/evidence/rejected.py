@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -13,7 +14,7 @@ from mkc_torch.recording.disturbance import RejectedInterval, disturbed_interval
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["rejected_warning", "test"]
+__all__ = ["rejected_intervals", "rejected_warning", "test"]
 
 _MOST_LISTED = 3
 """Largest number of intervals that are listed, the longest."""
@@ -23,13 +24,19 @@ def test(case: EvidenceContext) -> EvidenceResult:
     """Return a warning with the intervals; none for a recording without times."""
     if case.prepared.recording.time is None:
         return EvidenceResult("rejected")
+    intervals = rejected_intervals(case.prepared.time, case.final.fit.weights, case.settings)
     return EvidenceResult(
-        "rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights, case.settings)
+        "rejected",
+        intervals,
+        keys={"rejected_intervals": [list(interval) for interval in intervals]},
+        warnings=rejected_warning(intervals),
     )
 
 
-def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings) -> tuple[str, ...]:
-    """Return a warning with the longest intervals of rejected samples; empty if there are none.
+def rejected_intervals(
+    time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings
+) -> tuple[RejectedInterval, ...]:
+    """Return the intervals in which most samples are rejected, without short bursts.
 
     Args:
         time: in s.
@@ -40,12 +47,16 @@ def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], s
         >>> import torch
         >>> time = torch.arange(1000) / 50.0
         >>> weights = torch.where((time > 4.0) & (time < 7.0), 0.0, 1.0).unsqueeze(-1)
-        >>> rejected_warning(time, weights, Settings())
+        >>> rejected_warning(rejected_intervals(time, weights, Settings()))
         ('Most samples were rejected from 4.0 to 7.0 s. ...',)
     """
-    stretches = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
-    long = [interval for interval in stretches if _length(interval) >= settings.evidence.disturbed]
-    found = sorted(long, key=_length, reverse=True)
+    intervals = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
+    return tuple(interval for interval in intervals if _length(interval) >= settings.evidence.disturbed)
+
+
+def rejected_warning(intervals: Sequence[RejectedInterval]) -> tuple[str, ...]:
+    """Return a warning with the longest intervals of rejected samples; empty if there are none."""
+    found = sorted(intervals, key=_length, reverse=True)
     if not found:
         return ()
     text = ", ".join(f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED]))

@@ -80,6 +80,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
+        "notes": d.notes,
     }
     content = _with_evidence(content, d.evidence, json_schema())
     _refuse_not_finite(content)

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.note import Note
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.recording.recording import Recording
+from mkc_torch.recording.time_order import note_if_few
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -92,7 +94,10 @@ def find_drivers(
         values, complaint = _usable(name, recording[name], settings)
         repeated = None if values is None else _repeated(values, recording, measured, settings)
         if repeated is not None:
-            values, complaint = None, [f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing."]
+            values, complaint = (
+                None,
+                [Note(f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing.")],
+            )
         warnings += complaint
         if values is not None:
             usable[name] = values
@@ -133,10 +138,11 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
     share = float(finite.double().mean())
     if share < settings.fewest_finite:
         found = "no finite values" if share == 0 else f"only {share:.0%} finite values"
-        return None, [f"Column `{name}` has {found} and is left out."]
-    warnings = []
+        return None, [Note(f"Column `{name}` has {found} and is left out.")]
+    warnings: list[str] = []
     if share < 1.0:
-        warnings.append(f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time.")
+        lacking = f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time."
+        warnings.append(note_if_few(lacking, int((~finite).sum()), len(values)))
         values = _filled(values, finite)
     wild = _wild(values, settings)
     if bool(wild.any()):
@@ -149,7 +155,7 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
         values = _filled(values, ~wild)
     spread = float(values.amax() - values.amin())
     if spread <= 1e-12 * float(values.abs().amax()):
-        return None, [*warnings, f"Column `{name}` is constant and can drive nothing."]
+        return None, [*warnings, Note(f"Column `{name}` is constant and can drive nothing.")]
     return values, warnings
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import RecordingError, counted
 from mkc_torch.recording.formats.text_cells import SEPARATORS, WHITE, cells_of, count_of, is_value, separator_of
 from mkc_torch.recording.formats.text_lines import Line
@@ -70,11 +71,10 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
     skipped_comments = [line for line in comments if line.number not in head.lines]
     if skipped_comments:
         number = counted(len(skipped_comments), "comment line")
-        warnings.append(f"{number} skipped, the first {_shown(skipped_comments[0])}.")
+        warnings.append(Note(f"{number} skipped, the first {_shown(skipped_comments[0])}."))
     if head.above:
-        warnings.append(
-            f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
-        )
+        above = f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
+        warnings.append(Note(above))
     if not rows:
         why = f" {' '.join(skipped)}" if skipped else ""
         raise RecordingError(
@@ -227,7 +227,7 @@ def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[li
         Line(line.number, line.text.rstrip(" ").removesuffix(separator)) if end and n == count else line
         for line, end, n in zip(lines, ends, counts, strict=True)
     ]
-    return trimmed, count - 1, [f"Every row ends with an extra {SEPARATORS[separator]}."]
+    return trimmed, count - 1, [Note(f"Every row ends with an extra {SEPARATORS[separator]}.")]
 
 
 def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[int, ...], list[str]]:
@@ -286,19 +286,18 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
 def _skip_warnings(
     restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None
 ) -> list[str]:
-    warnings = []
+    warnings: list[str] = []
     if restarts and at:
         numbers = ", ".join(str(line.number) for line in restarts[:5]) + (", …" if len(restarts) > 5 else "")
-        warnings.append(
-            f"The header is repeated in line{'s' if len(restarts) > 1 else ''} {numbers}, as after a restart of the "
-            "logger."
-        )
+        lines = f"line{'s' if len(restarts) > 1 else ''} {numbers}"
+        warnings.append(Note(f"The header is repeated in {lines}, as after a restart of the logger."))
     if cut:
-        warnings.append(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}.")
+        warnings.append(Note(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}."))
     if between:
-        warnings.append(f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}.")
+        skipped = f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}."
+        warnings.append(Note(skipped))
     if last is not None:
-        warnings.append(f"The last line is cut short and left out, {_shown(last)}.")
+        warnings.append(Note(f"The last line is cut short and left out, {_shown(last)}."))
     return warnings
 
 

@@ -17,6 +17,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
+from mkc_torch.report.words.verdict import calibration_verdict, is_doubtful
 
 __all__ = ["Comparison", "calibration_report", "refusal_report"]
 
@@ -65,8 +66,8 @@ def calibration_report(
     return render(
         "calibration.html.j2",
         c=calibration,
-        # warnings on the file, such as a gap in time, do not question the result
-        doubtful=len(calibration.warnings) > len(usable.warnings),
+        doubtful=is_doubtful(calibration),
+        verdict=calibration_verdict(calibration),
         enough=ENOUGH_INFORMATION,
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,

@@ -9,6 +9,7 @@ from typing import Literal
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
+from mkc_torch.diagnosis.evidence.rejected import rejected_warning
 from mkc_torch.diagnosis.findings.advice import nothing_shows
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
 from mkc_torch.diagnosis.findings.misfit import follows_all
@@ -16,6 +17,7 @@ from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.diagnosis.stop import notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.words.numbers import size
+from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
     "Tone",
@@ -49,7 +51,12 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences, the findings by grade."""
+    """Return the verdict in one or two sentences, the findings by grade; a disturbed measurement comes first."""
+    disturbance = disturbed(diagnosis.rejected_intervals)
+    return f"{disturbance} {_verdict(diagnosis)}" if disturbance else _verdict(diagnosis)
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.environment)):
         return term("verdict.unfit")
@@ -154,7 +161,7 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
-    """Return the warnings, those on a finding or its driver first, with names for effect ids.
+    """Return the warnings by weight, with names for effect ids: a disturbance, then those on a finding or its driver.
 
     The notices of a quick look and of a stopped search are not included.
     """
@@ -163,7 +170,10 @@ def warned(diagnosis: Diagnosis) -> list[str]:
     first = notices_first(d)
     ordered = sorted(
         [warning for warning in d.warnings if warning not in first],
-        key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)),
+        key=lambda sentence: (
+            sentence not in rejected_warning(d.rejected_intervals),
+            doubted.isdisjoint(re.findall(r"\w+", sentence)),
+        ),
     )
     return [capital(with_names(sentence, ids, _kinds(d))) for sentence in ordered]
 
