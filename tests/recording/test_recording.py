@@ -666,9 +666,8 @@ def test_real_magnetometer_recordings_are_read_whole(name, samples, columns, fir
     in_order = recording.finite().sorted_by_time()
     assert (in_order.time.diff() > 0).all()
     dropped = samples - len(in_order)
-    assert dropped == 0 or any(
-        f"Dropped {dropped} of {samples}" in warning for warning in (*in_order.notes, *in_order.warnings)
-    )
+    sentences = (*in_order.notes, *in_order.warnings)
+    assert dropped == 0 or any(f"Dropped {dropped} of {samples}" in sentence for sentence in sentences)
 
 
 def test_a_real_table_of_several_runs_is_separated_by_its_labels():
