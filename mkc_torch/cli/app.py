@@ -14,6 +14,7 @@ from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.challenge import challenge
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
+from mkc_torch.cli.doctor import doctor
 from mkc_torch.cli.export import export
 from mkc_torch.cli.inspect import inspect
 from mkc_torch.cli.new import new_effect, new_simulation
@@ -35,7 +36,6 @@ app = typer.Typer(
     cls=_Commands,
     help="Find the physics that a simulation lacks; calibrate sensors; correct recordings. `mkc demo` needs no file.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -58,12 +58,13 @@ def _all_commands(
     """Options of ``mkc`` itself."""
 
 
-app.command()(diagnose)
-app.command()(calibrate)
-app.command()(apply)
-app.command()(export)
-app.command()(inspect)
-app.command()(challenge)
-app.command()(demo)
-app.command()(new_simulation)
-app.command()(new_effect)
+app.command(short_help="Find the physics that a simulation lacks.")(diagnose)
+app.command(short_help="Calibrate a magnetometer or an accelerometer.")(calibrate)
+app.command(short_help="Correct a recording with a calibration or a model.")(apply)
+app.command(short_help="Write a calibration for an autopilot, ROS or C.")(export)
+app.command(short_help="Show what a file holds, and which commands take it.")(inspect)
+app.command(short_help="Test the diagnosis on recordings with concealed physics.")(challenge)
+app.command(short_help="Try all of it on simulated sensors; needs no file.")(demo)
+app.command(short_help="Show what is installed, and what is missing.")(doctor)
+app.command(short_help="Write a template for your own simulation.")(new_simulation)
+app.command(short_help="Write a template for your own effect.")(new_effect)

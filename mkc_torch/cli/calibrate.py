@@ -44,7 +44,9 @@ def calibrate(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs.")
     ],
-    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")] = Path(
+        "results"
+    ),
     columns: Annotated[
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="Names of the columns in the file: mag_x=mx,mag_y=my,mag_z=mz"),

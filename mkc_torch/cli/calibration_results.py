@@ -36,7 +36,7 @@ def show_results(console: Console, path: Path, results: Sequence[tuple[str, Cali
         show_sensors(console, path.stem, [_result(subject, outcome) for subject, outcome in results])
     else:
         for found in done:
-            show(console, found.calibration, found.files, found.differences, found.notes)
+            show(console, found.calibration, found.files, found.differences, found.notes, path)
     for subject, outcome in results:
         for error in [outcome] if isinstance(outcome, Exception) else outcome.refused:
             complain(subject, error)

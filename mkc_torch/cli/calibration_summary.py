@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -45,10 +46,11 @@ def show(
     files: Sequence[Path],
     compared: Differences | None = None,
     notes: Sequence[str] = (),
+    source: Path | None = None,
 ) -> None:
-    """Print a summary of a calibration, its differences from an earlier one, and its files.
+    """Print a summary of a calibration, its differences from an earlier one, the next command and its files.
 
-    ``notes`` are remarks on the exports.
+    ``notes`` are remarks on the exports, ``source`` is the recording.
     """
     console.print()
     console.print(_headline(c.name or c.recording or term("label.recording"), c))
@@ -57,6 +59,9 @@ def show(
     _print_rows(console, [*_facts(c), *note_rows(c.notes, _REPORT, console.width - _LABEL - 3)])
     if compared is not None:
         _show_differences(console, compared)
+    if files and source is not None:
+        command = f"mkc apply {shlex.quote(str(files[0]))} {shlex.quote(str(source))} --output corrected.csv"
+        console.print(Text(f"{term('label.to_do'):<{_LABEL + 3}}{command}"), soft_wrap=True)
     _print_files(console, files)
 
 

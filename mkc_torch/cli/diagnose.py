@@ -51,13 +51,15 @@ def diagnose(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs")
     ],
-    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")] = Path(
+        "results"
+    ),
     simulation: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
             help=f"Simulation to compare with: {', '.join(SIMULATIONS)} (default for a magnetometer's recording), "
-            "FILE.py:CLASS or MODEL.fmu. The code in the file is run.",
+            "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The code in the file is run.",
         ),
     ] = None,
     simulator_output: Annotated[

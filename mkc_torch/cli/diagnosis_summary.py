@@ -29,7 +29,7 @@ _REPORT = "report.html"
 _STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
 
 
-def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
+def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.RunPaths | None = None) -> None:
     """Print the summary of a diagnosis and the files that hold it."""
     d = diagnosis
     console.print()
@@ -45,7 +45,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
         if len(d.findings) > 1:
             console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
-    console.print(_facts(_of_all(d, console.width - _LABEL - 3)))
+    console.print(_facts(_of_all(d, paths, console.width - _LABEL - 3)))
     for file in files:
         # outside the table, so that a long path is not broken and can be copied
         console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
@@ -115,7 +115,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield _striking("label.doubtful"), typeset(f.plausibility) or term("evidence.no_plausible_size")
 
 
-def _of_all(diagnosis: Diagnosis, width: int) -> Iterator[tuple[str, str]]:
+def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
         for change in unseen.residual_of_all(d):
@@ -136,7 +136,7 @@ def _of_all(diagnosis: Diagnosis, width: int) -> Iterator[tuple[str, str]]:
         yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield term("label.to_do"), sentence
-    command = top.apply_command(d)
+    command = top.apply_command(d, paths)
     if command:
         yield term("label.to_do"), command
     for _, warning in warning_rows(top.warned(d), _REPORT):

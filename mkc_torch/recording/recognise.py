@@ -221,12 +221,18 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
         unit = "tesla" if parent == _ROS and any(part in topic.table.names for part in _OF_ROS) else ""
         units = {axis: own or unit for axis, (_, own) in axes.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
-    if len(axes) == 3 and (px4 or is_about_magnetometer(known) or all(_is_magnetic(unit) for _, unit in axes.values())):
+    sure = px4 or is_about_magnetometer(known) or all(_is_magnetic(unit) for _, unit in axes.values())
+    if len(axes) == 3 and (sure or _has_no_header(topic)):
         units = {axis: _unit_of(topic, name, unit) for axis, (name, unit) in axes.items()}
         if is_px4_message(topic.table.names):
             units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
     return groups
+
+
+def _has_no_header(topic: Topic) -> bool:
+    """Whether a table is three columns of numbers without names, as loggers of a single sensor write them."""
+    return topic.table.names == ["x", "y", "z"] and any("has no header" in note for note in topic.warnings)
 
 
 def _is_magnetic(unit: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
@@ -422,8 +423,10 @@ def _whole(numbers: np.ndarray) -> np.ndarray:
 
 
 def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:
-    where = f"{recording}: " if recording else ""
+    where, present = f"{recording}: " if recording else "", list(present)
+    like = {column.casefold(): column for column in present}
+    nearest = like[(get_close_matches(name.casefold(), like, 1, 0.5) or [next(iter(like), "")])[0]] if like else "..."
     return MissingColumnError(
-        f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name "
-        f'with `--columns {name}=...` (in Python `columns={{"{name}": "..."}}`).'
+        f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name, "
+        f'such as `--columns {name}={nearest}` (in Python `columns={{"{name}": "{nearest}"}}`).'
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,6 +39,8 @@ def calibration_report(
     note: str = "",
     comparison: Sequence[Comparison] = (),
     against: Differences | None = None,
+    source: str = "NEW.csv",
+    result: str = "calibration.json",
 ) -> str:
     """Return the page of a calibration and its recording.
 
@@ -47,6 +50,7 @@ def calibration_report(
         note: a sentence for the top of the page, for example that the data are simulated.
         comparison: other results, or the truth, for comparison.
         against: differences from an older calibration.
+        source, result: paths of the recording and of the calibration, for the proposed commands.
 
     Returns:
         HTML with inline figures.
@@ -71,6 +75,8 @@ def calibration_report(
         enough=ENOUGH_INFORMATION,
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
+        source=shlex.quote(source),
+        result=shlex.quote(result),
         comparison=comparison,
         in_known_unit=is_known(calibration.unit),
         against=against,

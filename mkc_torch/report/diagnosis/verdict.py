@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
@@ -20,6 +21,7 @@ from mkc_torch.report.words.numbers import size
 from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
+    "RunPaths",
     "Tone",
     "apply_command",
     "headline",
@@ -31,6 +33,21 @@ __all__ = [
     "unexplained_place",
     "warned",
 ]
+
+
+class RunPaths(NamedTuple):
+    """Paths and options of a run, for the commands that are proposed.
+
+    Attributes:
+        recording: the diagnosed file.
+        model: the model.json.
+        options: options for ``mkc apply``, such as ``--simulation`` with the class.
+    """
+
+    recording: str
+    model: str
+    options: tuple[str, ...]
+
 
 Tone = Literal["good", "found", "faint", "open"]
 """Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
@@ -195,8 +212,11 @@ def _ids(diagnosis: Diagnosis) -> set[str]:
     return {effect for effect in found | {c.effect for c in d.candidates} if "_" in effect}
 
 
-def apply_command(diagnosis: Diagnosis) -> str:
-    """Return the command that corrects another recording; empty if no finding transfers."""
+def apply_command(diagnosis: Diagnosis, paths: RunPaths | None = None) -> str:
+    """Return the command that corrects a recording; empty if no finding transfers.
+
+    ``paths`` are those of the run; None if they are unknown.
+    """
     d = diagnosis
     if not any(transfers(f) for f in d.findings):
         return ""
@@ -204,4 +224,8 @@ def apply_command(diagnosis: Diagnosis) -> str:
         "magnetometer": " --output corrected.csv",
         "simulated": " --simulator-output NEW_SIM.csv --output corrected.csv",
     }.get(d.simulation, f" --simulation FILE.py:{plain(d.simulation) or 'CLASS'} --output simulated.csv")
-    return f"mkc apply model.json NEW.csv{own}"
+    if paths is None:
+        return f"mkc apply model.json NEW.csv{own}"
+    output = "corrected.csv" if d.simulation in ("magnetometer", "simulated") else "simulated.csv"
+    options = " ".join(map(shlex.quote, (*paths.options, "--output", output)))
+    return f"mkc apply {shlex.quote(paths.model)} {shlex.quote(paths.recording)} {options}"
