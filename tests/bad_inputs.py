@@ -171,7 +171,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "`--name` of a file with two": ("calibrate", "@mag0_mag1.csv", "--output", "@out", "--name", "mast"),
     "`--field-strength -1`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "-1"),
     "`--field-strength nan`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "nan"),
-    "`--place` without `--date`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
+    "`--place` without `--recorded-on`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
     "`--export mavlink`": ("calibrate", "@rec.csv", "--output", "@out", "--export", "mavlink"),
     "`--compare-with` another JSON": ("calibrate", "@rec.csv", "--output", "@out", "--compare-with", "@none.json"),
     "a calibration that is cut": ("apply", "@cut.json", "@rec.csv", "--output", "@out.csv"),

@@ -83,10 +83,14 @@ def calibrate(
     place: Annotated[
         str | None,
         typer.Option(
-            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m; with --date this sets the field's length."
+            metavar="LAT,LON[,ALT]",
+            help="Where it was recorded, in ° and m; with --recorded-on this sets the field's length.",
         ),
     ] = None,
-    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded; needs --place.")] = None,
+    date: Annotated[
+        str | None,
+        typer.Option("--recorded-on", metavar="YYYY-MM-DD", help="When it was recorded; needs --place."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Calibrate a magnetometer: estimate offset, gains and cross-axis coupling while the sensor is turned.
@@ -102,7 +106,9 @@ def calibrate(
     if name is not None and (not name.strip() or len(recordings) > 1):
         raise typer.BadParameter("--name names one sensor: give it with one REC, and not empty.")
     if (place is None) != (date is None):
-        raise typer.BadParameter("--place and --date need each other, because the field changes from year to year.")
+        raise typer.BadParameter(
+            "--place and --recorded-on need each other, because the field changes from year to year."
+        )
     if sensor is not None and quantity is Quantity.accel:
         raise typer.BadParameter("--sensor names a magnetometer; leave it out with --quantity accel.")
     exports = checked_exports("--export", export or [], instance, device_id)
@@ -121,7 +127,7 @@ def calibrate(
         try:
             earth = earth_field(*parsed_place(place), parsed_date(date))
         except (ValueError, ImportError) as error:
-            raise typer.BadParameter(f"--place {place} --date {date}: {error}") from None
+            raise typer.BadParameter(f"--place {place} --recorded-on {date}: {error}") from None
     try:
         old = None if compare_with is None else read_calibration(compare_with)
     except FAILURES as error:

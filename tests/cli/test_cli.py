@@ -514,9 +514,9 @@ def test_a_full_disk_behind_stdout_is_reported_in_a_line(good, tmp_path):
 
 def test_place_date_and_sensor_are_checked_in_one_sentence(good, tmp_path):
     out = ("--output", tmp_path / "out")
-    refused(mkc("calibrate", good, *out, "--place", "48,11"), "--date", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48", "--date", "2026-01-01"), "LAT,LON", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1.1.26"), "YYYY-MM-DD", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1999-01-01"), "2015-01-01", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11"), "--recorded-on", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48", "--recorded-on", "2026-01-01"), "LAT,LON", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11", "--recorded-on", "1.1.26"), "YYYY-MM-DD", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11", "--recorded-on", "1999-01-01"), "2015-01-01", code=2)
     refused(mkc("calibrate", good, *out, "--sensor", "sonar"), "sonar")
     refused(mkc("calibrate", good, *out, "--quantity", "accel"), "no column `accel_x`")
