@@ -159,8 +159,15 @@ class Diagnosis:
 
     @property
     def rejected_intervals(self) -> tuple[RejectedInterval, ...]:
-        """Intervals in which most samples were rejected, such as a disturbance of the measurement."""
-        return value_of(self.evidence, "rejected", ())
+        """Intervals in which most samples were rejected, such as a disturbance of the measurement.
+
+        If no finding is confirmed, these are the intervals of the simulation without findings.
+        """
+        rejected = value_of(self.evidence, "rejected")
+        if rejected is None:
+            return ()
+        confirmed = any(finding.grade != "unconfirmed" for finding in self.findings)
+        return rejected.final if confirmed else rejected.before or rejected.final
 
     @property
     def density_checks(self) -> tuple[DensityCheck, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
@@ -14,21 +14,34 @@ from mkc_torch.recording.disturbance import RejectedInterval, disturbed_interval
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["rejected_intervals", "rejected_warning", "test"]
+__all__ = ["RejectedByFit", "rejected_intervals", "rejected_warning", "test"]
 
 _MOST_LISTED = 3
 """Largest number of intervals that are listed, the longest."""
+
+
+class RejectedByFit(NamedTuple):
+    """Intervals in which most samples are rejected.
+
+    Attributes:
+        final: by the fit with all findings.
+        before: by the simulation without findings, which an unconfirmed finding may cover.
+    """
+
+    final: tuple[RejectedInterval, ...]
+    before: tuple[RejectedInterval, ...]
 
 
 def test(case: EvidenceContext) -> EvidenceResult:
     """Return a warning with the intervals; none for a recording without times."""
     if case.prepared.recording.time is None:
         return EvidenceResult("rejected")
-    intervals = rejected_intervals(case.prepared.time, case.final.fit.weights, case.settings)
+    intervals, before = (
+        rejected_intervals(case.prepared.time, fit.weights, case.settings) for fit in (case.final.fit, case.base)
+    )
     return EvidenceResult(
         "rejected",
-        intervals,
-        keys={"rejected_intervals": [list(interval) for interval in intervals]},
+        RejectedByFit(intervals, before),
         warnings=rejected_warning(intervals),
     )
 

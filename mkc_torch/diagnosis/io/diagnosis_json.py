@@ -81,6 +81,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "advice": d.advice,
         "warnings": d.warnings,
         "notes": d.notes,
+        "rejected_intervals": d.rejected_intervals,
     }
     content = _with_evidence(content, d.evidence, json_schema())
     _refuse_not_finite(content)

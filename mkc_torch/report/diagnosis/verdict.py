@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
-from mkc_torch.diagnosis.evidence.rejected import rejected_warning
 from mkc_torch.diagnosis.findings.advice import nothing_shows
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
 from mkc_torch.diagnosis.findings.misfit import follows_all
@@ -33,6 +32,10 @@ __all__ = [
     "unexplained_place",
     "warned",
 ]
+
+
+_MOST_REJECTED = "Most samples were rejected"
+"""Beginning of the warning about a disturbed measurement."""
 
 
 class RunPaths(NamedTuple):
@@ -188,7 +191,7 @@ def warned(diagnosis: Diagnosis) -> list[str]:
     ordered = sorted(
         [warning for warning in d.warnings if warning not in first],
         key=lambda sentence: (
-            sentence not in rejected_warning(d.rejected_intervals),
+            not sentence.startswith(_MOST_REJECTED),
             doubted.isdisjoint(re.findall(r"\w+", sentence)),
         ),
     )
