@@ -116,7 +116,7 @@ def doctor() -> None:
 
 
 def _devices() -> str:
-    """Return the devices that torch can use besides the processor."""
+    """Return the GPUs that torch can use."""
     import torch
 
     found = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
