@@ -31,6 +31,13 @@ class _Commands(TyperGroup):
             option.default = False  # pydantic validates None; importing it takes longer than all other imports
         return option
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        params = super().get_params(ctx)
+        for param in params:
+            if param.name in ("install_completion", "show_completion"):
+                param.default = False  # as above
+        return params
+
 
 app = typer.Typer(
     cls=_Commands,
