@@ -106,7 +106,9 @@ def repaired(kind: str) -> Callable[[Path], str]:
         recording = Recording.read(folder / "rec.csv")
         if not recording.magnetometer().isfinite().all():
             raise WrongAnswerError(f"{kind}: {recording}")
-        return next(sentence for sentence in recording.warnings if EXPECTED_WARNINGS[kind] in sentence)
+        return next(
+            sentence for sentence in (*recording.warnings, *recording.notes) if EXPECTED_WARNINGS[kind] in sentence
+        )
 
     return said
 
@@ -171,7 +173,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "`--name` of a file with two": ("calibrate", "@mag0_mag1.csv", "--output", "@out", "--name", "mast"),
     "`--field-strength -1`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "-1"),
     "`--field-strength nan`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "nan"),
-    "`--place` without `--date`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
+    "`--place` without `--recorded-on`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
     "`--export mavlink`": ("calibrate", "@rec.csv", "--output", "@out", "--export", "mavlink"),
     "`--compare-with` another JSON": ("calibrate", "@rec.csv", "--output", "@out", "--compare-with", "@none.json"),
     "a calibration that is cut": ("apply", "@cut.json", "@rec.csv", "--output", "@out.csv"),

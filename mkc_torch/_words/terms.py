@@ -200,7 +200,6 @@ TERMS: dict[str, str] = {
     "number.and_more": "{first} and {count} more",
     "number.more": "{first}, … {count} more",
     "number.more_rows": "… {count} more rows",
-    "number.more_warnings": "{count} more; see the report",
     "number.more_parameters": "and more, see the report",
     # noise
     "noise.white": "white",

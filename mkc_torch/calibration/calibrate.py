@@ -217,10 +217,11 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
         disturbed_unit="row" if usable.time is None else "s",
         coverage=found,
         warnings=(
-            *usable.warnings,
             *(sentence for sentence in (size, time_warning(usable)) if sentence),
             *_warnings(fit, found, length - radius, float(rejected.double().mean())),
+            *usable.warnings,
         ),
+        notes=usable.notes,
         used=usable,
         tails=_tails(usable, (length / radius).square() - 1.0),
     )

@@ -408,13 +408,13 @@ class EllipsoidFit(Fitted):
             if MAX_STANDARD_ERROR < error < math.inf:
                 even = error <= _UNEVEN * wide**2
                 what = "there is too much noise in" if even else "too few directions are covered for"
-                less = "" if self.finish else '; finish="maximum_likelihood" has a smaller bias'
                 raise not_identifiable(
                     f"{_problem(index, len(errors) > 1)}Not identifiable: {what} points that scatter about the "
                     f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. Including the bias by that scatter, "
                     f"the centre or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
-                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %{less}.",
+                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
                     directions[index],
+                    covered=_LESS_NOISE,
                 )
 
     def _refuse_scattered(self, field: Tensor, scatter: Tensor) -> None:
@@ -427,6 +427,13 @@ class EllipsoidFit(Fitted):
                 f"more than {100.0 * self.max_scatter:.0f} %, like the noise of a sensor that hardly turns. Turn the "
                 "sensor through all directions."
             )
+
+
+_LESS_NOISE = (
+    "All directions are covered, so more turns do not help. Record with less noise: away from motors and wires, more "
+    "slowly, or with averaged samples."
+)
+"""Advice if noise, and not the motion, makes the result uncertain."""
 
 
 def _problem(index: int, several: bool) -> str:

@@ -28,8 +28,13 @@ def middle_of(points: Tensor) -> Tensor:
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
-def not_identifiable(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiableError:
-    """Make the error, with coverage and missing directions; ``seen`` is a sentence about their origin."""
+def not_identifiable(
+    message: str, vectors: Tensor, *, seen: str = "", covered: str = "Turn the sensor through all directions."
+) -> NotIdentifiableError:
+    """Make the error, with coverage and missing directions.
+
+    ``seen`` is a sentence about their origin, ``covered`` the advice if no direction is missing.
+    """
     flat = vectors.detach().reshape(-1, 3)
     directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
     if len(directions) == 0:
@@ -38,11 +43,7 @@ def not_identifiable(message: str, vectors: Tensor, *, seen: str = "") -> NotIde
     if "Turn the sensor" not in message:
         missing = "; ".join(str(g) for g in found.gaps)
         turn = "Turn the sensor so that the field points there too."
-        message += (
-            f" Directions not covered: {missing}.{seen} {turn}"
-            if missing
-            else " Turn the sensor through all directions."
-        )
+        message += f" Directions not covered: {missing}.{seen} {turn}" if missing else f" {covered}"
     return NotIdentifiableError(message, found, directions)
 
 

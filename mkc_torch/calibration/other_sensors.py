@@ -53,6 +53,7 @@ def as_magnetometer(recording: Recording) -> Recording:
         name=recording.name,
         units=dict.fromkeys(MAG, unit),
         warnings=recording.warnings,
+        notes=recording.notes,
         labels={name: values for name, values in recording.labels.items() if name in kept},
     )
     finite = table.finite(*MAG)

@@ -18,7 +18,7 @@ __all__ = ["disturbed_places", "numbered", "places"]
 _ROW = "row of the recording"
 """Name of the internal column of row numbers."""
 
-_ROWS_A_SECOND = 50.0
+ROWS_A_SECOND = 50.0
 """Assumed sampling rate in Hz without a time, for the intervals of rejected samples."""
 
 
@@ -38,6 +38,7 @@ def numbered(recording: Recording) -> Recording:
         name=recording.name,
         units={**recording.units, _ROW: ""},
         warnings=recording.warnings,
+        notes=recording.notes,
         labels=recording.labels,
     )
 
@@ -61,5 +62,5 @@ def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tupl
     """
     if recording.time is not None:
         return disturbed_intervals(recording.time, rejected)
-    found = disturbed_intervals(places(recording) / _ROWS_A_SECOND, rejected)
-    return tuple(RejectedInterval(*(float(round(end * _ROWS_A_SECOND)) for end in interval)) for interval in found)
+    found = disturbed_intervals(places(recording) / ROWS_A_SECOND, rejected)
+    return tuple(RejectedInterval(*(float(round(end * ROWS_A_SECOND)) for end in interval)) for interval in found)

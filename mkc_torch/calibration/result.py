@@ -73,7 +73,8 @@ class Calibration:
         sensor: "mag", or "accel" for an accelerometer, whose field is gravity.
         rest_bias: bias of the gyroscope at rest; None without a gyroscope or a rest.
         coverage: coverage of directions by the samples in use.
-        warnings: warnings about the recording and the fit.
+        warnings: what makes the result doubtful, the weightiest first.
+        notes: how the recording was read and fitted.
         name: name of the sensor; the recording's name unless another name was given.
         tails: tails of :meth:`algebraic_residual` compared with a Gaussian's, and the expected share of errors beyond
             3 d; None for an exact fit, and for a file without them.
@@ -109,6 +110,7 @@ class Calibration:
     rest_bias: RestBias | None = None
     tails: ChannelTails | None = None
     used: Recording | None = field(default=None, repr=False, compare=False)
+    notes: tuple[str, ...] = ()
 
     @property
     def plot(self) -> CalibrationPlot:
@@ -131,6 +133,7 @@ class Calibration:
             f"Residual {c.before.robust:.3g} → {c.after.robust:.3g} {c.unit} robust; {100 * c.rejected_share:.1f} % of "
             f"{c.samples:,} samples rejected; {100 * c.coverage.fraction:.0f} % of all directions covered.",
             *c.warnings,
+            *c.notes,
         )
         return html_table(f"Calibration of {c.recording or 'a recording'}, {c.unit}", ("", "", "", ""), rows, below)
 
@@ -241,6 +244,7 @@ def calibration_to_json(calibration: Calibration) -> str:
             ],
         },
         "warnings": c.warnings,
+        "notes": c.notes,
     }
     if c.sensor != "mag":
         content["sensor"] = c.sensor
@@ -302,6 +306,7 @@ def calibration_from_json(text: str) -> Calibration:
             information=c.number("coverage", "information"),
         ),
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
+        notes=tuple(c.text("notes", i) for i in c.each("notes")) if c.has("notes") else (),
         name=c.text("name") if "name" in content else c.text("recording"),
         disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
         aid=aid_from_json(c),

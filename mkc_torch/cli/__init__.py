@@ -17,7 +17,8 @@ def main() -> None:
     """Run ``mkc`` with the arguments of the process.
 
     Raises:
-        SystemExit: always. Exit codes: 0 success, 1 failure, 2 wrong arguments, 130 interrupted.
+        SystemExit: always. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a doubtful result, 130
+            interrupted.
     """
     usual = signal.getsignal(signal.SIGINT)
     if usual is signal.default_int_handler:  # a background job ignores the signal; leave that

@@ -13,6 +13,7 @@ from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
+from mkc_torch.cli.doctor import doctor
 from mkc_torch.cli.export import export
 from mkc_torch.cli.inspect import inspect
 from mkc_torch.cli.new import new_effect, new_simulation
@@ -29,12 +30,18 @@ class _Commands(TyperGroup):
             option.default = False  # pydantic validates None; importing it takes longer than all other imports
         return option
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        params = super().get_params(ctx)
+        for param in params:
+            if param.name in ("install_completion", "show_completion"):
+                param.default = False  # as above
+        return params
+
 
 app = typer.Typer(
     cls=_Commands,
     help="Find the physics that a simulation lacks; calibrate sensors; correct recordings. `mkc demo` needs no file.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -57,11 +64,12 @@ def _all_commands(
     """Options of ``mkc`` itself."""
 
 
-app.command()(diagnose)
-app.command()(calibrate)
-app.command()(apply)
-app.command()(export)
-app.command()(inspect)
-app.command()(demo)
-app.command()(new_simulation)
-app.command()(new_effect)
+app.command(short_help="Find the physics that a simulation lacks.")(diagnose)
+app.command(short_help="Calibrate a magnetometer or an accelerometer.")(calibrate)
+app.command(short_help="Correct a recording with a calibration or a model.")(apply)
+app.command(short_help="Write a calibration for an autopilot, ROS or C.")(export)
+app.command(short_help="Show what a file holds, and which commands take it.")(inspect)
+app.command(short_help="Try all of it on simulated sensors; needs no file.")(demo)
+app.command(short_help="Show what is installed, and what is missing.")(doctor)
+app.command(short_help="Write a template for your own simulation.")(new_simulation)
+app.command(short_help="Write a template for your own effect.")(new_effect)

@@ -56,7 +56,7 @@ def apply(
         from mkc_torch.simulation.load import raised_in
     subject: str | Path = model
     try:
-        with interrupts_reported(lambda: f"nothing was written to {output}."), progress(1) as step:
+        with interrupts_reported(lambda: f"nothing was written to {output}."), progress(1, lines=True) as step:
             step(f"correcting {recording.name}")
             own = None
             if simulation is not None or simulator_output is not None:

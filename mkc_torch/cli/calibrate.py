@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mkc_torch.cli.console import (
+    DOUBTFUL,
     FAILURES,
     complain,
     err,
@@ -43,7 +44,9 @@ def calibrate(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs.")
     ],
-    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")] = Path(
+        "results"
+    ),
     columns: Annotated[
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="Names of the columns in the file: mag_x=mx,mag_y=my,mag_z=mz"),
@@ -80,17 +83,22 @@ def calibrate(
     place: Annotated[
         str | None,
         typer.Option(
-            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m; with --date this sets the field's length."
+            metavar="LAT,LON[,ALT]",
+            help="Where it was recorded, in ° and m; with --recorded-on this sets the field's length.",
         ),
     ] = None,
-    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded; needs --place.")] = None,
+    date: Annotated[
+        str | None,
+        typer.Option("--recorded-on", metavar="YYYY-MM-DD", help="When it was recorded; needs --place."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Calibrate a magnetometer: estimate offset, gains and cross-axis coupling while the sensor is turned.
 
     A file with several magnetometers gets a calibration for each, in a subfolder of the sensor's name.
 
-    The exit code is 0 if every recording was calibrated, and 1 otherwise.
+    The exit code is 0 if every recording was calibrated, 1 if one was not, and 3 if all were but a result is doubtful:
+    the correction reduces no scatter, or a third of the samples was rejected.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
@@ -98,7 +106,9 @@ def calibrate(
     if name is not None and (not name.strip() or len(recordings) > 1):
         raise typer.BadParameter("--name names one sensor: give it with one REC, and not empty.")
     if (place is None) != (date is None):
-        raise typer.BadParameter("--place and --date need each other, because the field changes from year to year.")
+        raise typer.BadParameter(
+            "--place and --recorded-on need each other, because the field changes from year to year."
+        )
     if sensor is not None and quantity is Quantity.accel:
         raise typer.BadParameter("--sensor names a magnetometer; leave it out with --quantity accel.")
     exports = checked_exports("--export", export or [], instance, device_id)
@@ -110,14 +120,14 @@ def calibrate(
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.calibration.exports import Destination
         from mkc_torch.cli.calibration_files import CalibrationRequest, calibrations_of, read_calibration
-        from mkc_torch.cli.calibration_summary import show
+        from mkc_torch.cli.calibration_results import show_results
     keep_memory()
     earth = None
     if place is not None and date is not None:
         try:
             earth = earth_field(*parsed_place(place), parsed_date(date))
         except (ValueError, ImportError) as error:
-            raise typer.BadParameter(f"--place {place} --date {date}: {error}") from None
+            raise typer.BadParameter(f"--place {place} --recorded-on {date}: {error}") from None
     try:
         old = None if compare_with is None else read_calibration(compare_with)
     except FAILURES as error:
@@ -136,24 +146,19 @@ def calibrate(
         to=Destination(instance, device_id),
         earth=earth,
     )
-    console, total, failed, left = out(), 0, 0, list(recordings)
+    console, total, failed, doubtful, left = out(), 0, 0, 0, list(recordings)
     with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
-            for subject, outcome in calibrations_of(path, output / path.stem, request, force=force, step=step):
-                total += 1
-                with step.aside():
-                    if isinstance(outcome, Exception):
-                        failed += 1
-                        complain(subject, outcome)
-                        continue
-                    show(console, outcome.calibration, outcome.files, outcome.differences, outcome.notes)
-                    for refused in outcome.refused:
-                        complain(subject, refused)
-                    failed += bool(outcome.refused)
+            results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
+            with step.aside():
+                counts = show_results(console, path, results)
+            total += len(results)
+            failed += counts.failed
+            doubtful += counts.doubtful
             left.remove(path)
             step(None)
     if total > 1 and failed:
         things = "recordings" if total == len(recordings) else "sensors"
         what = "not done in full" if request.exports or request.old else "not calibrated"
         err().print(f"mkc: {failed} of {total} {things} were {what}.", soft_wrap=True)
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if failed else DOUBTFUL if doubtful else 0)

@@ -187,7 +187,7 @@ def _calibrate(
         compared, refused = _compared(calibration, request.old)
         texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), request.exports, request.to)
         drawing()
-        page = calibration_report(calibration, recording, against=compared)
+        page = calibration_report(calibration, recording, against=compared, source=str(path), result=str(result))
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)
         for name, text in texts.items():

@@ -1,9 +1,11 @@
-"""Print a calibration: a table of numbers, the warnings, and the paths of the files."""
+"""Print calibrations: the result first, then the warnings, the numbers, the notes and the paths of the files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -12,8 +14,30 @@ from rich.text import Text
 from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.differences import Differences
+from mkc_torch.cli.remarks import NOTE, note_rows, warning_rows
 from mkc_torch.report.words import numbers as w
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
+from mkc_torch.report.words.verdict import calibration_verdict, is_doubtful, result_in_a_word
+
+__all__ = ["SensorResult", "show", "show_sensors"]
+
+_LABEL = 11
+"""Letters of the column of labels."""
+
+_REPORT = "report.html"
+
+_MOST_WARNINGS = 2
+"""Most warnings for each sensor of a file that holds several."""
+
+
+class SensorResult(NamedTuple):
+    """A sensor of a file with its calibration and files, or the reason why there is none."""
+
+    name: str
+    calibration: Calibration | None
+    files: Sequence[Path]
+    notes: Sequence[str]
+    reason: str = ""
 
 
 def show(
@@ -22,10 +46,75 @@ def show(
     files: Sequence[Path],
     compared: Differences | None = None,
     notes: Sequence[str] = (),
+    source: Path | None = None,
 ) -> None:
-    """Print a summary of a calibration, its differences from an earlier one, and its files."""
+    """Print a summary of a calibration, its differences from an earlier one, the next command and its files.
+
+    ``notes`` are remarks on the exports, ``source`` is the recording.
+    """
     console.print()
-    console.print(Text(c.name or c.recording or term("label.recording"), style="bold"))
+    console.print(_headline(c.name or c.recording or term("label.recording"), c))
+    _print_rows(console, [*warning_rows(c.warnings, _REPORT), *_exports(notes)])
+    console.print(_numbers(c))
+    _print_rows(console, [*_facts(c), *note_rows(c.notes, _REPORT, console.width - _LABEL - 3)])
+    if compared is not None:
+        _show_differences(console, compared)
+    if files and source is not None:
+        command = f"mkc apply {shlex.quote(str(files[0]))} {shlex.quote(str(source))} --output corrected.csv"
+        console.print(Text(f"{term('label.to_do'):<{_LABEL + 3}}{command}"), soft_wrap=True)
+    _print_files(console, files)
+
+
+def show_sensors(console: Console, recording: str, results: Sequence[SensorResult]) -> None:
+    """Print the results of a file with several magnetometers: a table, what questions each, notes, and the files."""
+    console.print()
+    console.print(Text(f"{recording}: {len(results)} magnetometers", style="bold"))
+    table = Table.grid(padding=(0, 3, 0, 0))
+    units = {r.calibration.unit for r in results if r.calibration is not None}
+    unit = next(iter(units)) if len(units) == 1 else ""
+    offset = term("table.offset_line", unit=unit)
+    heads = ("sensor", "result", offset, term("label.residual"), term("label.rejected"))
+    for _ in heads:
+        table.add_column(no_wrap=True)
+    table.add_row(*(Text(head, style="dim") for head in heads))
+    for result in results:
+        table.add_row(*map(Text, _row(result)))
+    console.print(table)
+    for result in results:
+        console.print()
+        if result.calibration is None:
+            console.print(Text.assemble((f"{result.name}: ", "bold"), result.reason), soft_wrap=True)
+            continue
+        console.print(_headline(result.name, result.calibration))
+        remarks = warning_rows(result.calibration.warnings, _REPORT, _MOST_WARNINGS)
+        _print_rows(console, [*remarks, *_exports(result.notes)])
+    console.print()
+    notes = dict.fromkeys(note for r in results if r.calibration is not None for note in r.calibration.notes)
+    _print_rows(console, note_rows(list(notes), _REPORT, console.width - _LABEL - 3))
+    for result in results:
+        _print_files(console, result.files)
+
+
+def _row(result: SensorResult) -> tuple[str, ...]:
+    c = result.calibration
+    if c is None:
+        return result.name, "not calibrated", "", "", ""
+    offset = "  ".join(w.with_errors(c.center, c.center_se, w.power(c.radius)))
+    return result.name, result_in_a_word(c), offset, w.change(c.before, c.after, c.unit), w.share(c.rejected_share)
+
+
+def _headline(name: str, c: Calibration) -> Text:
+    style = "bold yellow" if is_doubtful(c) else "bold green"
+    return Text.assemble((f"{name}: ", "bold"), (calibration_verdict(c), style))
+
+
+def _exports(notes: Sequence[str]) -> Iterator[tuple[str, str]]:
+    for note in notes:
+        yield term("label.warning"), note
+
+
+def _numbers(c: Calibration) -> Table:
+    """Return the table of offset and semi-axes."""
     table = Table.grid(padding=(0, 3, 0, 0))
     table.add_column(no_wrap=True)
     for _ in range(3):
@@ -34,35 +123,46 @@ def show(
     unit = w.in_power(power, c.unit)
     table.add_row(Text(term("table.offset_line", unit=unit)), *w.with_errors(c.center, c.center_se, power))
     table.add_row(Text(term("table.semi_axes_line", unit=unit)), *w.with_errors(c.semi_axes, c.semi_axes_se, power))
-    console.print(table)
-    residual = term(
-        "calibration.change",
-        robust=w.change(c.before, c.after, c.unit),
-        before=w.size(c.before.rms),
-        after=w.size(c.after.rms),
+    return table
+
+
+def _facts(c: Calibration) -> Iterator[tuple[str, str]]:
+    """Yield the residual, the noise, the rejected samples, the coverage, and what aided the fit."""
+    yield (
+        term("label.residual"),
+        term(
+            "calibration.change",
+            robust=w.change(c.before, c.after, c.unit),
+            before=w.size(c.before.rms),
+            after=w.size(c.after.rms),
+        ),
     )
-    facts = Table.grid(padding=(0, 3, 0, 0))
-    facts.add_column(no_wrap=True)
-    facts.add_column(overflow="fold")
-    for name, value in (
-        (term("label.residual"), residual),
-        (term("label.noise"), w.noise(c)),
-        (term("label.rejected"), w.rejection(c)),
-        (term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))),
-    ):
-        facts.add_row(name, Text(value))
+    yield term("label.noise"), w.noise(c)
+    yield term("label.rejected"), w.rejection(c)
+    yield term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))
     if c.rest_bias is not None:
-        facts.add_row(term("label.gyroscope"), Text(w.rest_bias(c.rest_bias)))
+        yield term("label.gyroscope"), w.rest_bias(c.rest_bias)
     if c.aid is not None:
-        facts.add_row(term("label.aided"), Text(" ".join(w.aided(c))))
-    for warning in (*c.warnings, *notes):
-        facts.add_row(Text(term("label.warning"), style="bold yellow"), Text(warning))
-    console.print(facts)
-    if compared is not None:
-        _show_differences(console, compared)
+        yield term("label.aided"), " ".join(w.aided(c))
+
+
+def _print_rows(console: Console, rows: Iterator[tuple[str, str]] | Sequence[tuple[str, str]]) -> None:
+    facts = Table.grid(padding=(0, 3, 0, 0))
+    facts.add_column(no_wrap=True, min_width=_LABEL)
+    facts.add_column(overflow="fold")
+    rows, last = list(rows), ""
+    for label, text in rows:
+        style = "bold yellow" if label == term("label.warning") else ""
+        facts.add_row(Text("" if label == last == NOTE else label, style=style), Text(text))
+        last = label
+    if rows:
+        console.print(facts)
+
+
+def _print_files(console: Console, files: Sequence[Path]) -> None:
     for file in files:
         # outside the table, so that a long path is not broken and can be copied
-        console.print(Text.assemble(f"{term('label.written'):<11}", (str(file), "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
 
 
 def _show_differences(console: Console, found: Differences) -> None:

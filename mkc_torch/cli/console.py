@@ -36,6 +36,9 @@ from mkc_torch._words.terms import term
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """Errors of bad input, a full disk or a numerical breakdown."""
 
+DOUBTFUL = 3
+"""Exit code of a result that was written, but must be looked at before it is used."""
+
 _PIPE_WIDTH = 100
 """Columns of text that is not printed on a terminal."""
 
@@ -274,6 +277,9 @@ _REFRESH_S = 0.2
 _LINE_S = 10.0
 """Seconds between lines of progress in a pipe."""
 
+_FIRST_LINE_S = 3.0
+"""Seconds until the first line of progress in a pipe."""
+
 _FILE_LINE_S = 60.0
 """Seconds between lines in ``progress.txt``."""
 
@@ -287,14 +293,14 @@ def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> 
     Args:
         total: number of items.
         folder: folder of ``progress.txt``.
-        lines: if standard error is not a terminal, write the stage to it every ten seconds.
+        lines: if standard error is not a terminal, write the stage to it after three seconds, then every ten seconds.
     """
     begin = monotonic()
     with _shown(total) as steps, ExitStack() as threads:
         if folder is not None:
             threads.enter_context(_repeated(lambda: _note(steps, folder, monotonic() - begin), _FILE_LINE_S))
         if lines and not steps.on_a_terminal:
-            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_S))
+            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_S, _FIRST_LINE_S))
         yield steps
 
 
@@ -348,14 +354,16 @@ class _PartColumn(ProgressColumn):
 
 
 @contextmanager
-def _repeated(work: Callable[[], None], every: float) -> Iterator[None]:
-    """Call ``work`` repeatedly in a thread, every so many seconds, while the block runs."""
+def _repeated(work: Callable[[], None], every: float, first: float | None = None) -> Iterator[None]:
+    """Call ``work`` repeatedly in a thread, every so many seconds, the first time after ``first`` if it is given."""
     over = Event()
 
     def repeat() -> None:
-        while not over.wait(every):
+        pause = every if first is None else first
+        while not over.wait(pause):
             with drawing:
                 work()
+            pause = every
 
     thread = Thread(target=repeat, daemon=True)
     thread.start()

@@ -30,7 +30,7 @@ __all__ = ["Corrected", "correct", "read_correction", "show_correction", "unit_o
 
 _NOT_MEASURED = ("time", "experiment")
 
-_OTHER_LENGTH = 1.5
+_OTHER_LENGTH = 1.15
 """Ratio of field lengths, up or down, beyond which a recording is suspected to be of another unit or place."""
 
 
@@ -65,7 +65,7 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
     is_field = set(columns) == {f"field_{axis}" for axis in "xyz"}
     for warning in table.warnings:
         console.print(f"warning: {warning}", soft_wrap=True)
-    for note in corrected.notes:
+    for note in (*table.notes, *corrected.notes):
         console.print(f"note: {note}", soft_wrap=True)
     if missing:
         what = "field" if is_field else f"value of {', '.join(columns)}"

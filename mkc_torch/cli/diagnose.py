@@ -51,13 +51,15 @@ def diagnose(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header, or logs")
     ],
-    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")],
+    output: Annotated[Path, typer.Option(help="Folder for the results; each REC gets a subfolder of its name.")] = Path(
+        "results"
+    ),
     simulation: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
             help=f"Simulation to compare with: {', '.join(SIMULATIONS)} (default for a magnetometer's recording), "
-            "FILE.py:CLASS or MODEL.fmu. The code in the file is run.",
+            "FILE.py:CLASS, FILE.py with a single class, or MODEL.fmu. The code in the file is run.",
         ),
     ] = None,
     simulator_output: Annotated[
@@ -144,7 +146,7 @@ def diagnose(
         raise typer.Exit(_all_together(output, request, look, recordings))
     with (
         interrupts_reported(lambda: not_written(left, output)),
-        progress(len(recordings), output) as step,
+        progress(len(recordings), output, lines=True) as step,
         # a single recording is diagnosed in this process, so that its run can be shown
         in_processes(
             partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
@@ -175,7 +177,7 @@ def _all_together(output: Path, request: Request, look: ConsoleStyle, paths: lis
     """Diagnose the recordings together. Returns the exit code."""
     from mkc_torch.cli.diagnosis_files import diagnose_together
 
-    with interrupts_reported(lambda: not_written([output / TOGETHER], output)), progress(1, output) as step:
+    with interrupts_reported(lambda: not_written([output / TOGETHER], output)), progress(1, output, lines=True) as step:
         step("diagnosing the recordings together")
         outcomes = diagnose_together(paths, output / TOGETHER, request, look, step)
         _print_outcomes(outcomes, step)

@@ -27,6 +27,7 @@ from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
+from mkc_torch.report.diagnosis.verdict import RunPaths
 from mkc_torch.simulation.load import load_simulation, raised_in
 
 if TYPE_CHECKING:
@@ -147,7 +148,13 @@ class StageProgress:
 
 
 def write_diagnosis(
-    diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True, note: str = ""
+    diagnosis: Diagnosis,
+    folder: Path,
+    *,
+    force: bool,
+    report: bool = True,
+    note: str = "",
+    paths: RunPaths | None = None,
 ) -> list[Path]:
     """Write diagnosis.json, model.json and report.html into a folder.
 
@@ -164,7 +171,7 @@ def write_diagnosis(
     for name in {"model.json", "corrected.py"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # a file of an earlier diagnosis
     if report:
-        texts["report.html"] = diagnosis_report(diagnosis, note=note)
+        texts["report.html"] = diagnosis_report(diagnosis, note=note, paths=paths)
     for name, text in texts.items():
         write_atomically(folder / name, text, overwrite=force)
     return [folder / name for name in texts]
@@ -208,12 +215,27 @@ def _outcome(
                     progress=progress,
                 )
             progress("writing the report")
-            files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
+            paths = _paths(path, folder, request)
+            files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report, paths=paths)
     except Exception as error:
         own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
     stopped = diagnosis.stop is not None and diagnosis.stop.reason == "interrupt"
-    return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False, interrupted=stopped)
+    return Outcome(look.set(lambda console: show(console, diagnosis, files, paths)), failed=False, interrupted=stopped)
+
+
+def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
+    """Return the paths for the proposed command; None if several recordings were diagnosed together."""
+    if not path.exists():
+        return None
+    options: list[str] = []
+    if request.simulator_output is not None:
+        options += ["--simulator-output", str(request.simulator_output)]
+    elif request.simulation != MAGNETOMETER:
+        options += ["--simulation", request.simulation]
+    if request.columns:
+        options += ["--columns", ",".join(f"{name}={column}" for name, column in request.columns.items())]
+    return RunPaths(str(path), str(folder / "model.json"), tuple(options))
 
 
 def named_simulation(name: str) -> Simulation:

@@ -78,7 +78,7 @@ class Outcome:
 
 
 def is_file_of_a_simulation(name: str) -> bool:
-    """Whether ``--simulation`` names a file, whose code is run: ``FILE.py:CLASS`` or ``MODEL.fmu``.
+    """Whether ``--simulation`` names a file, whose code is run: ``FILE.py:CLASS``, ``FILE.py`` or ``MODEL.fmu``.
 
     Example:
         >>> is_file_of_a_simulation("my.py:Pendulum"), is_file_of_a_simulation("arm.fmu")
@@ -86,4 +86,4 @@ def is_file_of_a_simulation(name: str) -> bool:
         >>> is_file_of_a_simulation("magnetometer")
         False
     """
-    return ".py:" in name or name.casefold().endswith(".fmu")
+    return ".py:" in name or name.casefold().endswith((".py", ".fmu"))

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
+from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import environment, noise, numbers, unseen
 from mkc_torch.report.diagnosis import findings as sentences
@@ -23,13 +24,12 @@ _LABEL = 11
 _MOST_LINES = 6
 """Most lines on the parameters of a finding."""
 
-_MOST_WARNINGS = 6
-"""Most warnings that are printed."""
+_REPORT = "report.html"
 
 _STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
 
 
-def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
+def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.RunPaths | None = None) -> None:
     """Print the summary of a diagnosis and the files that hold it."""
     d = diagnosis
     console.print()
@@ -45,7 +45,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
         if len(d.findings) > 1:
             console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
-    console.print(_facts(_of_all(d)))
+    console.print(_facts(_of_all(d, paths, console.width - _LABEL - 3)))
     for file in files:
         # outside the table, so that a long path is not broken and can be copied
         console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
@@ -115,7 +115,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield _striking("label.doubtful"), typeset(f.plausibility) or term("evidence.no_plausible_size")
 
 
-def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
+def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
         for change in unseen.residual_of_all(d):
@@ -136,14 +136,12 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
         yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield term("label.to_do"), sentence
-    command = top.apply_command(d)
+    command = top.apply_command(d, paths)
     if command:
         yield term("label.to_do"), command
-    warnings = top.warned(d)
-    for warning in warnings[:_MOST_WARNINGS]:
+    for _, warning in warning_rows(top.warned(d), _REPORT):
         yield _striking("label.warning"), warning
-    if len(warnings) > _MOST_WARNINGS:
-        yield _striking("label.warning"), term("number.more_warnings", count=len(warnings) - _MOST_WARNINGS)
+    yield from note_rows([plain(note) for note in d.notes], _REPORT, width)
 
 
 def _striking(key: str) -> str:

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch._words.terms import term
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER
 from mkc_torch.cli.recorded import read_magnetometer
 from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.inspection import FileSeen, SensorSeen, TopicSeen
@@ -26,7 +27,7 @@ def commands_of(seen: FileSeen) -> tuple[list[str], list[str]]:
         question is the first note.
     """
     if seen.question or not seen.sensors:
-        return [], [seen.question]
+        return [], [seen.question] if seen.question else []
     notes: list[str] = []
     options: set[str | None] = set()
     for sensor in seen.sensors:
@@ -51,7 +52,7 @@ def _trial(seen: FileSeen, sensor: SensorSeen) -> tuple[list[str], str | None]:
     except RecordingError as error:
         _, found, after = str(error).partition("`--convert mag=")
         return [str(error)], f" --convert mag={after.partition('`')[0]}" if found else None
-    return list(recording.warnings), ""
+    return [*recording.warnings, *recording.notes], ""
 
 
 def as_data(seen: FileSeen) -> dict[str, Any]:
@@ -64,10 +65,12 @@ def as_data(seen: FileSeen) -> dict[str, Any]:
 
 
 def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -> None:
-    """Print the topics and columns of a file, the recognised sensors, the notes and the commands."""
+    """Print the commands that take a file, then its topics and columns, the recognised sensors and the notes."""
     commands, notes = found
     console.print()
     console.print(Text(str(seen.path), style="bold"), soft_wrap=True)
+    for command in [*commands, *_diagnoses(seen)]:
+        console.print(Text.assemble(f"{term('label.to_do'):<8}", (command, "cyan")), soft_wrap=True)
     for topic in seen.topics:
         console.print(Text(_about(topic)), soft_wrap=True)
         console.print(_columns(topic))
@@ -78,8 +81,16 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
         )
     for sentence in notes:
         console.print(Text(f"note: {sentence}"), soft_wrap=True)
-    for command in commands:
-        console.print(Text.assemble(f"{term('label.to_do'):<8}", (command, "cyan")), soft_wrap=True)
+
+
+def _diagnoses(seen: FileSeen) -> list[str]:
+    """Return the command that diagnoses the file: with the magnetometer, or with the user's simulation."""
+    path = shlex.quote(str(seen.path))
+    if not seen.sensors or seen.question:
+        return [f"mkc diagnose {path} --simulation FILE.py:CLASS  (your simulation of these columns)"]
+    name = seen.sensors[0].name
+    which = f" --sensor {shlex.quote(name)}" if name else ""
+    return [f"mkc diagnose {path} --simulation {MAGNETOMETER}{which}"]
 
 
 def _about(topic: TopicSeen) -> str:

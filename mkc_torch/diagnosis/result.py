@@ -42,6 +42,7 @@ from mkc_torch.diagnosis.parts import (
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
 from mkc_torch.effects import words_of
+from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -185,6 +186,7 @@ class Diagnosis:
         baseline, corrected: scores of the simulation without and with the findings, on held-out blocks.
         advice: what to do or to record next, in sentences that name effects by their ids.
         warnings: sentences of the same form.
+        notes: how the recording was read, a sentence each.
         candidates: the candidates of the search, best first.
         separability: of the leading candidates.
         traces: the residuals.
@@ -233,13 +235,14 @@ class Diagnosis:
     recordings: tuple[str, ...] = ()
     quick: bool = False
     stop: Stop | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"
         return f"Diagnosis({self.recording!r} against {self.simulation!r}: {self.verdict}; {found})"
 
     def _repr_html_(self) -> str:
-        sentences = (*self.advice, *self.warnings)
+        sentences = (*self.advice, *self.warnings, *self.notes)
         return as_html(self.recording, self.simulation, self.verdict, self.findings, sentences, stop=self.stop)
 
     @property
@@ -258,6 +261,18 @@ class Diagnosis:
         """Columns along which smooth structure remains after the findings."""
         smooth: SmoothCorrection | None = value_of(self.evidence, "remaining")
         return () if smooth is None else smooth.columns
+
+    @property
+    def rejected_intervals(self) -> tuple[RejectedInterval, ...]:
+        """Intervals in which most samples were rejected, such as a disturbance of the measurement.
+
+        If no finding is confirmed, these are the intervals of the simulation without findings.
+        """
+        rejected = value_of(self.evidence, "rejected")
+        if rejected is None:
+            return ()
+        confirmed = any(finding.grade != "unconfirmed" for finding in self.findings)
+        return rejected.final if confirmed else rejected.before or rejected.final
 
     @property
     def density_checks(self) -> tuple[DensityCheck, ...]:

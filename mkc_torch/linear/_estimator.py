@@ -29,7 +29,7 @@ Self = TypeVar("Self", bound="LinearEstimator")
 
 
 class NotFittedError(AttributeError):
-    """A result was requested before ``fit``."""
+    """A result was requested before ``fit``, or the estimator has no such result."""
 
 
 class Fitted(Parametrised):
@@ -39,6 +39,9 @@ class Fitted(Parametrised):
 
     def __getattr__(self, name: str) -> Any:
         if name.endswith("_") and not name.startswith("_"):
+            known = sorted(key for key in vars(self) if key.endswith("_") and not key.startswith("_"))
+            if known:
+                raise NotFittedError(f"{type(self).__name__} has no `{name}`; its results are {', '.join(known)}.")
             raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit({self._fit_takes}) first.")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 

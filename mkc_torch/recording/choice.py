@@ -100,9 +100,12 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
     named = listed(name for topic in topics for name in topic.table.names if name)
     where = "" if len(topics) == 1 else f" in {len(topics)} topics"
     if not options:
+        example = _example(topics)
+        if not example:
+            return f"{path}: no magnetometer is recognised among {named}{where}; it needs three columns of numbers."
         return (
-            f"{path}: no magnetometer is recognised among {named}{where}; name its columns: "
-            "`--columns mag_x=...,mag_y=...,mag_z=...`."
+            f"{path}: no magnetometer is recognised among {named}{where}; name its columns, for example "
+            f"`{columns_option(example)}`."
         )
     accel = options == ["--quantity accel"]
     mean = "An accelerometer is calibrated by" if accel else "If these columns are a magnetometer, name them"
@@ -110,6 +113,15 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
         f"{path}: no magnetometer is recognised among {named}{where}. {mean}: "
         f"{' or '.join(f'`{option}`' for option in options[:6])}."
     )
+
+
+def _example(topics: Sequence[Topic]) -> dict[str, str]:
+    """Three columns of the first table that are neither a time nor another sensor, by axis; empty if there are none."""
+    for topic in topics:
+        names = [name for name in topic.table.names if name and meaning(name) is None]
+        if len(names) >= len(_MAG):
+            return dict(zip(_MAG, names, strict=False))
+    return {}
 
 
 def _has(topic: Topic, quantity: str) -> bool:

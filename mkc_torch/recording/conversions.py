@@ -6,8 +6,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import split_unit
-from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed, polars
+from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, UsualUnit, listed, polars
 from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, is_unit, known_units
 
 if TYPE_CHECKING:
@@ -153,6 +154,8 @@ def unit_conversion_warnings(units: Units, values: Mapping[str, Any]) -> list[st
             continue
         done.add((quantity, known.unit))
         same = [key for key, other in units.conversions.items() if quantity_of(key) == quantity and other == known]
-        why = "as requested" if name in units.requested else "as the file says"
-        warnings.append(f"{listed(same)}: converted from {known.unit}, {why}, to {CANONICAL[quantity]}.")
+        usual = isinstance(units.written[name], UsualUnit)
+        why = "as the file says" if not usual else "the usual unit of this message, as the file states none"
+        why = "as requested" if name in units.requested else why
+        warnings.append(Note(f"{listed(same)}: converted from {known.unit}, {why}, to {CANONICAL[quantity]}."))
     return warnings

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_other_type
 from mkc_torch._support.arrays import is_frame
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import RecordingError, listed
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
@@ -80,6 +81,11 @@ def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -
                 f"{name}: {text}"
                 for name, recording in zip(names, recordings, strict=True)
                 for text in recording.warnings
+            ),
+            *(
+                Note(f"{name}: {text}")
+                for name, recording in zip(names, recordings, strict=True)
+                for text in recording.notes
             ),
             *_shift_warnings([label for label, _ in parts], moved),
         ),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.clock import ClockError, TimeAxis, clock_of
 from mkc_torch.recording.conversions import converted, quantity_of
 from mkc_torch.recording.formats.base import Topic, counted, listed
@@ -65,9 +66,8 @@ def join_topics(topics: Sequence[Topic], own: int, clock: TimeAxis, there: set[s
         missing = int(np.isnan(found).any(-1).sum())
         columns |= dict(zip(mine, found.T, strict=True))
         without = f"; {counted(missing, 'sample')} outside of its times or in its gaps have no value" if missing else ""
-        warnings.append(
-            f"{listed(mine)}: of topic `{topic.name}`, interpolated linearly at the magnetometer's times{without}."
-        )
+        how = f"of topic `{topic.name}`, interpolated linearly at the magnetometer's times"
+        warnings.append(Note(f"{listed(mine)}: {how}{without}."))
     return ResampledColumns(columns, warnings)
 
 

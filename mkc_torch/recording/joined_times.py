@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import meaning
 from mkc_torch.recording.formats.base import Table, Topic, polars
 from mkc_torch.recording.formats.cells import as_numbers
@@ -117,11 +118,10 @@ def _holds(series: Any, matches: Any) -> bool:
 
 def _joined(topic: Topic, places: tuple[int, int], name: str, series: Any, unit: str) -> Topic:
     table = topic.table
-    warning = f"Columns `{table.names[places[0]]}` and `{table.names[places[1]]}` are joined into a single time."
+    joined_columns = f"Columns `{table.names[places[0]]}` and `{table.names[places[1]]}`"
+    note = Note(f"{joined_columns} are joined into a single time.")
     kept = [i for i in range(len(table.names)) if i not in places]
     names = [name, *(table.names[i] for i in kept)]
     units = {key: own for key, own in topic.units.items() if key in names and key != name}
     joined = Table(names, [series, *(table.series[i] for i in kept)], table.lines, table.line)
-    return topic._replace(
-        table=joined, units=units | ({name: unit} if unit else {}), warnings=(*topic.warnings, warning)
-    )
+    return topic._replace(table=joined, units=units | ({name: unit} if unit else {}), warnings=(*topic.warnings, note))

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.choice import ColumnChoice, choose
 from mkc_torch.recording.clock import ClockError, TimeAxis, clock_of
 from mkc_torch.recording.clock_faults import interleaved, spread
@@ -141,7 +142,7 @@ def load_table(
             if name == EXPERIMENT:
                 numbers, labels[name] = numbered(series)
             elif name not in wanted and (bad | missing).all():
-                warnings.append(f"Column `{name}` holds no numbers and is left out.")
+                warnings.append(Note(f"Column `{name}` holds no numbers and is left out."))
                 continue
             else:
                 raise text_error(path, table, name, series, int(bad.arg_max()))
@@ -160,9 +161,10 @@ def load_table(
         if slow is not None:
             values["time"] = torch.tensor(slow[0])
             clock = clock.spread(slow[0])
-            warnings.append(
+            sentence = (
                 f"Up to {slow[1]} samples share a time stamp; their times were spread evenly up to the next stamp."
             )
+            warnings.append(Note(sentence))
     if choice.sensor is not None and (period := interleaved(torch.stack([values[name] for name in _MAG], -1).numpy())):
         warnings.append(
             f"Each row is far from the row before it and close to the row {period} rows before it: rows of {period} "
@@ -193,13 +195,13 @@ def _clock(path: Path, table: Table, series: Any, known: Units) -> TimeAxis | No
 
 def _recognised_warnings(choice: ColumnChoice, taken: Mapping[str, Any]) -> list[str]:
     """Return the warnings about columns that were recognised under other names."""
-    warnings = []
+    warnings: list[str] = []
     for quantity in dict.fromkeys(name.split("_")[0] for name in choice.found):
         new = [name for name in choice.found if name.split("_")[0] == quantity and name in taken]
         if new:
             old = [choice.found[name] for name in new]
             are = "Columns {} are" if len(new) > 1 else "Column {} is"
-            warnings.append(f"{are.format(listed(old))} taken as {listed(new)}.")
+            warnings.append(Note(f"{are.format(listed(old))} taken as {listed(new)}."))
     return warnings
 
 
@@ -225,12 +227,12 @@ def _add_runs(
     more = f" and {len(begins) - _SHOWN} more" if len(begins) > _SHOWN else ""
     what = "The time starts again" if clock is not None else "There is no time, and the header is repeated"
     count = counted(len(begins) + 1, "run")
-    warnings.append(f"{what} at {rows}{more}: {count}, numbered in the column `{EXPERIMENT}`.")
+    warnings.append(Note(f"{what} at {rows}{more}: {count}, numbered in the column `{EXPERIMENT}`."))
     return warnings
 
 
 def _clock_warning(clock: TimeAxis) -> str:
-    return f"The times are {clock.format}; they were converted to seconds from the first sample."
+    return Note(f"The times are {clock.format}; they were converted to seconds from the first sample.")
 
 
 def _count_from_first(values: dict[str, Tensor], clock: TimeAxis | None, begins: Sequence[int]) -> None:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, meaning, split_unit
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
@@ -220,12 +221,18 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
         unit = "tesla" if parent == _ROS and any(part in topic.table.names for part in _OF_ROS) else ""
         units = {axis: own or unit for axis, (_, own) in axes.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
-    if len(axes) == 3 and (px4 or is_about_magnetometer(known) or all(_is_magnetic(unit) for _, unit in axes.values())):
+    sure = px4 or is_about_magnetometer(known) or all(_is_magnetic(unit) for _, unit in axes.values())
+    if len(axes) == 3 and (sure or _has_no_header(topic)):
         units = {axis: _unit_of(topic, name, unit) for axis, (name, unit) in axes.items()}
         if is_px4_message(topic.table.names):
             units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
     return groups
+
+
+def _has_no_header(topic: Topic) -> bool:
+    """Whether a table is three columns of numbers without names, as loggers of a single sensor write them."""
+    return topic.table.names == ["x", "y", "z"] and any("has no header" in note for note in topic.warnings)
 
 
 def _is_magnetic(unit: str) -> bool:
@@ -274,7 +281,9 @@ def _without_derived(
     kinds = {number: re.sub(r"_?\d+$", "", topics[number].name) for number, _ in found}
     gone = {number for number, kind in kinds.items() if _DERIVED.get(kind) in kinds.values()}
     warnings = tuple(
-        f"Topic `{topics[number].name}` is left out: it is derived from `{_DERIVED[kinds[number]]}`, which is read."
+        Note(
+            f"Topic `{topics[number].name}` is left out: it is derived from `{_DERIVED[kinds[number]]}`, which is read."
+        )
         for number in sorted(gone)
     )
     return [(number, group) for number, group in found if number not in gone], warnings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
@@ -14,27 +15,27 @@ from torch import Tensor
 
 from mkc_torch._support.arrays import ArrayLike, Data, is_frame
 from mkc_torch._support.files import write_atomically
+from mkc_torch._support.note import Note, notes_of, warnings_of
 from mkc_torch.recording.conversions import DEFAULT_UNITS
 from mkc_torch.recording.formats import check_ending, encoded
-from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, counted, listed
+from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
 from mkc_torch.recording.load import REQUIRED_COLUMNS, load_table, read_file
 from mkc_torch.recording.preview import TablePreview
 from mkc_torch.recording.row_sensors import with_row_sensors
+from mkc_torch.recording.time_order import note_if_few, time_order
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError", "write_table"]
 
-_GAP = 10.0
-"""Longest interval, in median intervals, that is not a gap."""
-
 
 class Recording(TablePreview):
     """A table of named columns of equal length, as a sensor or a simulator wrote it.
 
-    A recording is immutable: each operation returns a new recording, whose ``warnings`` list what was dropped.
+    A recording is immutable: each operation returns a new recording, whose ``warnings`` and ``notes`` list what was
+    dropped.
 
     Args:
         columns: name to values: 1-D tensors or NumPy arrays of equal length >= 1, copied to the CPU as float64;
@@ -42,8 +43,9 @@ class Recording(TablePreview):
         name: name in messages and reports; for a file, the stem of its path.
         units: column to unit; these override the defaults: ``time`` s; ``mag_*`` and ``field_*`` µT;
             ``gyro_*`` rad/s; ``accel_*`` m/s²; ``position_*`` m; ``q_*`` 1; ``temperature`` °C; ``current`` A.
-        warnings: what was found or dropped, a sentence each.
+        warnings: what makes the data doubtful, a sentence each.
         labels: for a column of whole numbers 0, 1, …, the label of each number.
+        notes: how the data were read, a sentence each.
 
     Raises:
         RecordingError: no columns, no samples, unequal lengths, an unusable name, or a unit of an unknown column.
@@ -54,7 +56,7 @@ class Recording(TablePreview):
         (tensor([20., 21.], dtype=torch.float64), 'µT')
     """
 
-    __slots__ = ("_columns", "_labels", "_name", "_units", "_warnings")
+    __slots__ = ("_columns", "_labels", "_name", "_sentences", "_units")
 
     def __init__(
         self,
@@ -64,6 +66,7 @@ class Recording(TablePreview):
         units: Mapping[str, str] | None = None,
         warnings: Sequence[str] = (),
         labels: Mapping[str, Sequence[str]] | None = None,
+        notes: Sequence[str] = (),
     ) -> None:
         units, labels = units or {}, labels or {}
         if is_frame(columns):
@@ -79,7 +82,7 @@ class Recording(TablePreview):
         self._units = known | dict(units)
         self._labels = {key: tuple(values) for key, values in labels.items()}
         self._name = name
-        self._warnings = tuple(warnings)
+        self._sentences = (*warnings, *map(Note, notes))
 
     @classmethod
     def read(
@@ -97,7 +100,8 @@ class Recording(TablePreview):
         time are recognised by the names of their columns, and converted if the name or the format states the unit.
         Where the time starts again, a new run begins; the column ``experiment`` numbers the runs. Empty cells, ``nan``,
         ``NA``, ``n/a`` and ``null`` become NaN. Columns of text are left out unless ``columns`` names them. Text in the
-        column ``experiment`` is numbered, with the text in ``labels``. ``warnings`` reports all of this.
+        column ``experiment`` is numbered, with the text in ``labels``. ``notes`` reports all of this, and ``warnings``
+        what makes the data doubtful.
 
         Args:
             path: the file.
@@ -204,8 +208,13 @@ class Recording(TablePreview):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was found or dropped since the file was read, a sentence each."""
-        return self._warnings
+        """What makes the data doubtful, a sentence each: lost parts, gaps, samples out of order."""
+        return warnings_of(self._sentences)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How the data were read, a sentence each: recognised names, converted units, what was skipped."""
+        return notes_of(self._sentences)
 
     @property
     def time(self) -> Float[Tensor, " N"] | None:
@@ -269,8 +278,9 @@ class Recording(TablePreview):
                 f"{self._in()}no sample has finite values in all of {listed(names)}: {'; '.join(counts)}. "
                 "Leave out the columns that hold no values."
             )
-        dropped = f"Dropped {int((~keep).sum())} of {len(self)} samples that are not finite: {'; '.join(counts)}."
-        return self.rows(keep, dropped)
+        lost = int((~keep).sum())
+        dropped = f"Dropped {lost} of {len(self)} samples that are not finite: {'; '.join(counts)}."
+        return self.rows(keep, note_if_few(dropped, lost, len(self)))
 
     def sorted_by_time(self) -> Recording:
         """The samples sorted by time, with one sample per time.
@@ -288,27 +298,9 @@ class Recording(TablePreview):
             tensor([0.0000, 0.1000, 0.2000], dtype=torch.float64)
         """
         timed = self._with_times()
-        time, group = timed["time"].numpy(), timed._experiment_numbers()
-        by_group = np.argsort(group, kind="stable")
-        backward = int(((np.diff(time[by_group]) < 0) & (np.diff(group[by_group]) == 0)).sum())
-        order = np.lexsort((time, group))  # stable, the last key first
-        same_group = np.diff(group[order]) == 0
-        first = np.concatenate([[True], ~((np.diff(time[order]) == 0) & same_group)])
-        kept = order[first]
-        found = []
-        if backward:
-            found.append(f"The time ran backwards {counted(backward, 'time')}; the samples were sorted by time.")
-        if not first.all():
-            twin, original = order[~first], kept[np.cumsum(first) - 1][~first]
-            table = timed.stack(*timed.names).numpy()
-            a, b = table[twin], table[original]
-            differ = int(((a != b) & ~(np.isnan(a) & np.isnan(b))).any(-1).sum())
-            found.append(
-                f"Dropped {len(twin)} of {len(timed)} samples that repeat the time of an earlier sample, "
-                f"{differ} of them with other values."
-            )
-        found += timed._gaps(time[kept], group[kept])
-        return timed.rows(torch.from_numpy(kept), *found)
+        table = timed.stack(*timed.names).numpy()
+        kept, sentences = time_order(timed["time"].numpy(), timed._experiment_numbers(), table, timed._run_label)
+        return timed.rows(torch.from_numpy(kept), *sentences)
 
     def rows(self, chosen: Tensor, *warnings: str) -> Recording:
         """The chosen rows, as a new recording.
@@ -325,7 +317,7 @@ class Recording(TablePreview):
             {name: values[chosen] for name, values in self._columns.items()},
             name=self._name,
             units=self._units,
-            warnings=(*self._warnings, *warnings),
+            warnings=(*self._sentences, *warnings),
             labels=self._labels,
         )
 
@@ -350,7 +342,7 @@ class Recording(TablePreview):
                 {key: values for key, values in part.columns.items() if key != EXPERIMENT},
                 name=f"{self._name}/{label}" if self._name else label,
                 units={key: unit for key, unit in self._units.items() if key != EXPERIMENT},
-                warnings=self._warnings,
+                warnings=self._sentences,
                 labels={key: values for key, values in self._labels.items() if key != EXPERIMENT},
             )
         return parts
@@ -364,7 +356,10 @@ class Recording(TablePreview):
             return self
         if not keep.any():
             raise RecordingError(f"{self._in()}no sample has a finite time; the column `time` must hold seconds.")
-        return self.rows(keep, f"Dropped {int((~keep).sum())} of {len(self)} samples without a finite time.")
+        lost = int((~keep).sum())
+        return self.rows(
+            keep, note_if_few(f"Dropped {lost} of {len(self)} samples without a finite time.", lost, len(self))
+        )
 
     def _experiment_numbers(self) -> np.ndarray:
         """Run index 0, 1, … of each sample, (N,), in the order of first appearance."""
@@ -379,23 +374,12 @@ class Recording(TablePreview):
             return known[int(value)]
         return str(int(value)) if value.is_integer() else repr(value)
 
-    def _gaps(self, time: np.ndarray, group: np.ndarray) -> list[str]:
-        inside = np.diff(group) == 0
-        intervals = np.where(inside, np.diff(time), 0.0)
-        if not inside.any():
-            return []
-        median = float(np.median(intervals[inside]))
-        count, longest = int((intervals > _GAP * median).sum()), int(np.argmax(intervals))
-        if not count:
-            return []
-        where = ""
-        if EXPERIMENT in self:
-            values = self[EXPERIMENT].numpy()[self._experiment_numbers() == group[longest]]
-            where = f" in experiment {self._experiment_label(float(values[0]))}"
-        return [
-            f"The time has {counted(count, 'gap')} of more than {_GAP:g} median intervals ({median:.4g} s); "
-            f"the longest, {intervals[longest]:.4g} s, begins at {time[longest]:.10g} s{where}."
-        ]
+    def _run_label(self, group: int) -> str:
+        """The label of a run by its index; empty without the column ``experiment``."""
+        if EXPERIMENT not in self:
+            return ""
+        values = self[EXPERIMENT].numpy()[self._experiment_numbers() == group]
+        return self._experiment_label(float(values[0]))
 
 
 def write_table(
@@ -439,8 +423,10 @@ def _whole(numbers: np.ndarray) -> np.ndarray:
 
 
 def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:
-    where = f"{recording}: " if recording else ""
+    where, present = f"{recording}: " if recording else "", list(present)
+    like = {column.casefold(): column for column in present if column not in DEFAULT_UNITS}
+    nearest = next((like[key] for key in get_close_matches(name.casefold(), like, 1, 0.55)), "COLUMN")
     return MissingColumnError(
-        f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name "
-        f'with `--columns {name}=...` (in Python `columns={{"{name}": "..."}}`).'
+        f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name, "
+        f'such as `--columns {name}={nearest}` (in Python `columns={{"{name}": "{nearest}"}}`).'
     )

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import is_about_magnetometer, meaning
 from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 
@@ -118,9 +119,9 @@ def _part(topic: Topic, column: str, labels: Any, value: str, values: Sequence[s
         axes = dict(zip(_axes(names), "xyz", strict=False))
         names = [axes.get(name, name) for name in names]
     lines = [line for line, taken in zip(table.lines, rows.to_list(), strict=True) if taken]
-    warning = f"The column `{column}` identifies the sensor of each row: {listed(called)}."
+    note = Note(f"The column `{column}` identifies the sensor of each row: {listed(called)}.")
     part = Table(names, [table.series[i].filter(rows) for i in kept], lines, table.line)
-    return Topic(_called(column, value), part, topic.units, (*topic.warnings, warning))
+    return Topic(_called(column, value), part, topic.units, (*topic.warnings, note))
 
 
 def _called(column: str, value: str) -> str:

@@ -146,7 +146,9 @@ def converted_from(recording: Recording) -> str:
         >>> converted_from(Recording({"mag_x": torch.zeros(3)}, warnings=warnings))
         'gauss'
     """
-    found = [re.match(r"`mag_x`.*: converted from (\S+), ", sentence) for sentence in recording.warnings]
+    found = [
+        re.match(r"`mag_x`.*: converted from (\S+), ", sentence) for sentence in (*recording.notes, *recording.warnings)
+    ]
     return next((match[1] for match in found if match), "")
 
 

@@ -32,6 +32,8 @@ class SimulationFileError(ValueError):
 def load_simulation(source: str) -> Simulation:
     """Load the simulation ``FILE.py:NAME``: a class, which is called without arguments, or an instance.
 
+    ``FILE.py`` is its only simulation.
+
     The file is run like a script: it can import modules from its folder and from the current folder. ``MODEL.fmu`` is
     the simulation in an FMU, whose binary is run.
 
@@ -51,8 +53,14 @@ def load_simulation(source: str) -> Simulation:
     if not path.is_file():
         raise SimulationFileError(f"{path}: there is no such file for --simulation {source}.")
     module = _module(path)
+    known = [key for key, value in vars(module).items() if _own(value, module)]
+    if not name:
+        if len(known) != 1:
+            choices = " or ".join(f"--simulation {path}:{key}" for key in known)
+            advice = f"it defines {len(known)} simulations; give {choices}" if known else "it defines no simulation"
+            raise SimulationFileError(f"{path}: {advice}.")
+        name = known[0]
     if not hasattr(module, name):
-        known = [key for key, value in vars(module).items() if _own(value, module)]
         raise SimulationFileError(f"{path}: it defines no `{name}`; simulations in it: {', '.join(known) or 'none'}.")
     found = getattr(module, name)
     if isinstance(found, type):
@@ -124,7 +132,30 @@ def raised_in(source: str, error: BaseException) -> SimulationFileError | None:
     frames = traceback.extract_tb(error.__traceback__)
     if not any(_same(frame.filename, path) for frame in frames):
         return None
-    return SimulationFileError(f"{path}: {name} raised an error of its own.\n{_user_traceback(error, path)}")
+    text = f"{path}: {name or 'it'} raised an error of its own.\n{_user_traceback(error, path)}"
+    return SimulationFileError(f"{text}{_torch_functions(error)}")
+
+
+_NOT_OF_TORCH = (
+    "only one element tensors can be converted",
+    "cannot access data pointer of tensor",
+    "can't call numpy() on tensor",
+    "call to item on a tensor",
+    ".item() on a tensor",
+    "cannot be converted to scalar",
+)
+"""Parts of the messages with which torch refuses a function of ``math`` or NumPy."""
+
+
+def _torch_functions(error: BaseException) -> str:
+    """The remedy for a function of ``math`` or NumPy in the equations; else empty."""
+    message = str(error).lower()
+    if not any(part in message for part in _NOT_OF_TORCH):
+        return ""
+    return (
+        "\nStates, inputs and parameters are tensors: write torch.sin(x), torch.exp(x), abs(x) or torch.where(...) "
+        "instead of functions of math and NumPy, float(x) and item()."
+    )
 
 
 def _is_fmu(source: str) -> bool:
@@ -132,6 +163,8 @@ def _is_fmu(source: str) -> bool:
 
 
 def _parts(source: str) -> tuple[Path, str]:
+    if source.endswith(".py"):
+        return Path(source), ""
     file, _, name = source.rpartition(":")
     if not file.endswith(".py") or not name:
         raise SimulationFileError(

@@ -394,6 +394,7 @@ def _with_columns(recording: Recording, columns: Mapping[str, Tensor], *warnings
         name=recording.name,
         units={name: recording.units[name] for name in columns},
         warnings=(*recording.warnings, *warnings),
+        notes=recording.notes,
         labels={name: values for name, values in recording.labels.items() if name in columns},
     )
 

@@ -232,7 +232,6 @@ def test_a_write_that_fails_leaves_no_half_file(good, tmp_path, monkeypatch):
 def test_usage_errors_exit_with_two(good, tmp_path):
     out = ("--output", tmp_path / "out")
     refused(mkc("calibrate", *out), code=2)
-    refused(mkc("calibrate", good), code=2)
     refused(mkc("calibrate", good, *out, "--columns", "mag_x"), "mag_x=mx", code=2)
     refused(mkc("calibrate", good, *out, "--columns", "mag_x=a,mag_x=b"), "twice", code=2)
     refused(mkc("calibrate", good, *out, "--unit-label", " "), "--unit-label", code=2)
@@ -242,6 +241,23 @@ def test_usage_errors_exit_with_two(good, tmp_path):
 
 
 @pytest.mark.e2e
+def test_results_are_written_to_results_by_default(good, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = mkc("calibrate", good)
+    assert result.exit_code == 0
+    assert (tmp_path / "results" / "good" / "calibration.json").exists()
+    assert f"mkc apply results/good/calibration.json {good} --output corrected.csv" in result.output
+
+
+def test_a_doubtful_calibration_has_an_exit_code_of_its_own(tmp_path):
+    path = shared_data("magnetometer/quadrotor_compass3.csv")
+    result = mkc("calibrate", path, "--output", tmp_path)
+    assert result.exit_code == 3
+    first = " ".join(result.output.split()[:30])
+    assert "doubtful: the field's length scatters no less than before" in first
+    assert (tmp_path / "quadrotor_compass3" / "calibration.json").exists()
+
+
 def test_columns_and_units_of_the_users_own(tmp_path):
     points = 20.0 * noisy_ellipsoid(300)
     path = tmp_path / "own.csv"
@@ -509,14 +525,14 @@ def test_a_full_disk_behind_stdout_is_reported_in_a_line(good, tmp_path):
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr == "mkc: the output could not be written: No space left on device.\n"
+    assert done.stderr.splitlines()[-1] == "mkc: the output could not be written: No space left on device."
 
 
 def test_place_date_and_sensor_are_checked_in_one_sentence(good, tmp_path):
     out = ("--output", tmp_path / "out")
-    refused(mkc("calibrate", good, *out, "--place", "48,11"), "--date", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48", "--date", "2026-01-01"), "LAT,LON", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1.1.26"), "YYYY-MM-DD", code=2)
-    refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1999-01-01"), "2015-01-01", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11"), "--recorded-on", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48", "--recorded-on", "2026-01-01"), "LAT,LON", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11", "--recorded-on", "1.1.26"), "YYYY-MM-DD", code=2)
+    refused(mkc("calibrate", good, *out, "--place", "48,11", "--recorded-on", "1999-01-01"), "2015-01-01", code=2)
     refused(mkc("calibrate", good, *out, "--sensor", "sonar"), "sonar")
     refused(mkc("calibrate", good, *out, "--quantity", "accel"), "no column `accel_x`")

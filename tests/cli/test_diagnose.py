@@ -339,7 +339,6 @@ def test_usage_errors_exit_with_two(tmp_path):
     (tmp_path / "b").mkdir()
     twin = quiet(tmp_path / "b" / "A.csv")
     for arguments, words in (
-        ((path, *known), "--output"),
         ((*known, *out), "REC"),
         ((path, *out, "--simulation", "pendulum"), '"pendulum" is unknown; give magnetometer'),
         ((path, *out, *known, "--level", "1"), "--level must be"),

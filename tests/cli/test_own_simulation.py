@@ -330,7 +330,7 @@ def test_usage_errors(thermistor):
     source, table, output = thermistor
     for more, words in (
         (("--simulation", source, "--simulator-output", table), "give one of --simulation and --simulator-output"),
-        (("--simulation", "bench.py"), "your own simulation as FILE.py:CLASS or MODEL.fmu"),
+        (("--simulation", "bench"), "your own simulation as FILE.py:CLASS or MODEL.fmu"),
     ):
         result = mkc("diagnose", table, "--output", output, *more)
         assert result.exit_code == 2

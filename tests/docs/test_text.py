@@ -36,7 +36,7 @@ MANUAL = {
     "wrong_targets.md",
 }
 FOLDERS = {"decisions/index.md"}
-COMMON = {"--version", "--help"}
+COMMON = {"--version", "--help", "--install-completion"}
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 

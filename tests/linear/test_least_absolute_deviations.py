@@ -297,3 +297,13 @@ def test_parameters_out_of_range_raise(arguments, message):
 
 def test_repr_shows_the_parameters():
     assert repr(LeastAbsoluteDeviations(max_iter=7)) == "LeastAbsoluteDeviations(tol=1e-09, max_iter=7)"
+
+
+def test_a_result_that_the_estimator_lacks_is_not_blamed_on_a_missing_fit():
+    X, Y = torch.randn(20, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
+    fitted = LeastAbsoluteDeviations().fit(X, Y)
+    with pytest.raises(AttributeError, match=r"its results are .*coef_") as error:
+        fitted.standard_error_  # noqa: B018
+    assert "first" not in str(error.value)
+    with pytest.raises(AttributeError, match="call fit"):
+        LeastAbsoluteDeviations().coef_  # noqa: B018

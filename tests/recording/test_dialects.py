@@ -91,7 +91,7 @@ def test_a_parquet_of_the_same_samples_is_the_same(tmp_path):
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"plain"}))
 def test_warnings_report_what_was_done(tmp_path, kind):
-    assert read(tmp_path, KINDS[kind]).warnings
+    assert read(tmp_path, KINDS[kind]).notes
 
 
 def test_a_clean_table_is_read_without_a_word(tmp_path):
@@ -104,7 +104,7 @@ def test_a_requested_unit_overrides_the_name(tmp_path):
 
 
 def test_every_skipped_line_is_reported_with_its_number(tmp_path):
-    warnings = " ".join(read(tmp_path, Dialect(comments=2, above=1, among=True, header_again=True, cut=True)).warnings)
+    warnings = " ".join(read(tmp_path, Dialect(comments=2, above=1, among=True, header_again=True, cut=True)).notes)
     for words in (
         '3 comment lines skipped, the first line 1, "# recorded by a logger, 0"',
         '1 line above the first row skipped, the first line 3, "Logger v1.3"',

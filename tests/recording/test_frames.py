@@ -68,7 +68,7 @@ def test_a_frame_gives_what_its_file_gives(library, tmp_path):
     got = Recording.from_frame(frame, columns={"mag_x": "mx"}, name="r")
     assert same(got, want)
     assert (got.labels, got.units, got.warnings) == (want.labels, want.units, want.warnings)
-    assert got.warnings == ("Column `note` holds no numbers and is left out.",)
+    assert got.notes == ("Column `note` holds no numbers and is left out.",)
     assert list(Recording(frame).experiments()) == ["left", "right"]
 
 

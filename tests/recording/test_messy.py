@@ -62,7 +62,7 @@ def test_the_centre_is_that_of_the_whole_recording(name, whole):
 
 @pytest.mark.parametrize("name", sorted(EXPECTED_WARNINGS))
 def test_warnings_report_what_was_done_to_read_a_file(name):
-    warnings = " ".join(read(name).warnings)
+    warnings = " ".join(read(name).notes)
     for words in EXPECTED_WARNINGS[name]:
         assert words in warnings, warnings
 

@@ -179,7 +179,7 @@ def test_other_topics_are_interpolated_at_the_magnetometers_times(tmp_path, monk
     assert recording["gyro_x"][1:3].tolist() == pytest.approx([np.pi / 4, 3 * np.pi / 4])
     assert recording["gyro_y"][1:3].tolist() == pytest.approx([1.5, 2.5])
     assert recording["q_w"].tolist() == pytest.approx([1.0] * 5)  # q and -q are the same rotation
-    warnings = " ".join(recording.warnings)
+    warnings = " ".join(recording.notes)
     assert "of topic `sensor_gyro_0`, interpolated linearly" in warnings
     assert "3 samples outside of its times or in its gaps have no value" in warnings
 
@@ -333,5 +333,5 @@ def test_a_converted_time_starts_at_zero_in_each_run(tmp_path):
 def test_a_repeated_header_starts_a_run_without_a_time(tmp_path):
     recording = read(tmp_path, "mx,my,mz\n1,2,3\n2,3,4\nmx,my,mz\n3,4,5\n")
     assert recording["experiment"].tolist() == [1.0, 1.0, 2.0]
-    assert "There is no time" in recording.warnings[-1]
+    assert "There is no time" in recording.notes[-1]
     assert "experiment" not in read(tmp_path, "mx,my,mz\n1.25,2.25,3.25\nmx,my,mz\nmx,my,mz\n3,4\n")

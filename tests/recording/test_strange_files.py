@@ -173,7 +173,7 @@ EXPECTED_WARNINGS = {
 
 @pytest.mark.parametrize("kind", EXPECTED_WARNINGS)
 def test_warnings_report_what_was_done(tmp_path, kind):
-    assert EXPECTED_WARNINGS[kind] in " ".join(Recording.read(write(tmp_path, SAME[kind])).warnings)
+    assert EXPECTED_WARNINGS[kind] in " ".join(Recording.read(write(tmp_path, SAME[kind])).notes)
 
 
 @pytest.mark.parametrize("kind", ["date and time", "ROS 2", "C's timeval"])
@@ -198,7 +198,7 @@ def test_a_word_for_a_missing_value_is_nan(tmp_path, word):
     lines[9] = f"0.16,{word},1,2"
     recording = Recording.read(write(tmp_path, "\n".join(lines)))
     assert recording["mag_x"].isnan().nonzero().flatten().tolist() == [8]
-    assert f'holds "{word}" or the like 1 time, first at line 10' in " ".join(recording.warnings)
+    assert f'holds "{word}" or the like 1 time, first at line 10' in " ".join(recording.notes)
 
 
 def test_a_row_that_a_power_off_cut_is_left_out_wherever_it_is(tmp_path):
@@ -328,7 +328,7 @@ def test_a_frame_is_recognised_and_converted_like_its_file():
         given = frame("timestamp,magX [mG],magY [mG],magZ [mG]", [times, *(10.0 * XYZ)])
         recording = Recording.from_frame(given)
         assert_same(recording)
-        warnings = " ".join(recording.warnings)
+        warnings = " ".join(recording.notes)
         assert "are taken as `mag_x`, `mag_y`, `mag_z`" in warnings
         assert "converted from milligauss" in warnings
 

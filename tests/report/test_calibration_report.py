@@ -96,7 +96,7 @@ def test_references_inside_the_pictures_resolve(page):
 
 def test_page_begins_with_the_result_in_plain_words(page):
     text = text_of(page)
-    assert "Calibrated. Offset (11.9" in text
+    assert "most samples were rejected there. Offset (11.9" in text
     assert "samples were rejected, mainly between 3" in text
     assert "SIMULATED data" in text
     assert "truth 12.00 −7.50 21.00 44.98 48.54 51.45" in text

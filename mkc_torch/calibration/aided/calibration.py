@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.note import Note, notes_of, warnings_of
 from mkc_torch.calibration.aided.by_place import chosen_by_place
 from mkc_torch.calibration.aided.evidence import FittedResponse
 from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
@@ -268,6 +269,7 @@ def _result(
     unit = usable.units["mag_x"]
     bias = chosen.errors[:3] if best.model.biased else None
     bias_se = full.covariance.diagonal()[-ERRORS:][:3].sqrt()
+    turned = _misaligned(best, spread, by)
     return Calibration(
         recording=usable.name,
         samples=len(points),
@@ -291,7 +293,8 @@ def _result(
         disturbed=disturbed_places(usable, rejected),
         disturbed_unit="row" if usable.time is None else "s",
         coverage=found,
-        warnings=(*usable.warnings, *_misaligned(best, spread, by)),
+        warnings=(*warnings_of(turned), *usable.warnings),
+        notes=(*usable.notes, *notes_of(turned)),
         aid=AidedResult(
             by=by,
             response=best.model.name,
@@ -307,7 +310,7 @@ def _result(
 
 
 def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...]:
-    """Warnings about a magnetometer whose axes differ from those of the gyroscope or attitude."""
+    """A warning about exchanged axes of the magnetometer, or a note on axes that the matrix turns back."""
     sentence, response = exchanged(best.model.response(best.fit.theta), by)
     if sentence:
         return (f"{sentence} The matrix corrects this: the corrected field is in the axes of the {by}.",)
@@ -316,9 +319,12 @@ def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...
     if best.model.name != "full matrix" or angle < max(MISALIGNED, 3.0 * sure):
         return ()
     x, y, z = axis.tolist()
+    about = f"({x:+.2f}, {y:+.2f}, {z:+.2f})"
     return (
-        f"The magnetometer seems to be turned by {angle:.1f}° about ({x:+.2f}, {y:+.2f}, {z:+.2f}) against the {by}; "
-        "the matrix turns it back.",
+        Note(
+            f"The magnetometer seems to be turned by {angle:.1f}° about {about} against the {by}; the matrix turns it "
+            "back."
+        ),
     )
 
 

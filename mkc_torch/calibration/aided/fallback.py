@@ -53,7 +53,7 @@ def with_aid(
         except (ValueError, NoFitError, RecordingError, LinAlgError) as error:
             tried.append(str(error).replace("Not identifiable: ", f"With the {by}: ", 1))
             continue
-        reason = str(refusal).removeprefix("Not identifiable: ")
+        reason = str(refusal).removeprefix("Not identifiable: ").split(" Turn the sensor ")[0]
         stands = "the field of the place" if by == "place" else f"the {by}"
         explanation = (
             f"The ellipsoid alone is not identifiable; {stands} replaces the missing turns. "
@@ -62,13 +62,13 @@ def with_aid(
         return dataclasses.replace(
             found,
             warnings=(
-                *found.warnings,
-                explanation,
-                *([_taken(place)] if by == "place" and place else []),
                 *_rejected(found),
                 *_undetermined(found),
                 *_other(found, earth),
+                *([_taken(place)] if by == "place" and place else []),
+                *found.warnings,
             ),
+            notes=(*found.notes, explanation),
         )
     raise NotIdentifiableError(" ".join([str(refusal), *tried]), refusal.coverage, refusal.directions)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
@@ -14,7 +15,14 @@ from mkc_torch.recording.disturbance import RejectedInterval, disturbed_interval
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["called", "localised_evidence", "rejected_evidence", "rejected_warning"]
+__all__ = [
+    "RejectedByFit",
+    "called",
+    "localised_evidence",
+    "rejected_evidence",
+    "rejected_intervals",
+    "rejected_warning",
+]
 
 
 def localised_evidence(case: EvidenceContext) -> EvidenceResult:
@@ -46,17 +54,36 @@ _MOST_LISTED = 3
 """Largest number of intervals that are listed, the longest."""
 
 
+class RejectedByFit(NamedTuple):
+    """Intervals in which most samples are rejected.
+
+    Attributes:
+        final: by the fit with all findings.
+        before: by the simulation without findings, which an unconfirmed finding may cover.
+    """
+
+    final: tuple[RejectedInterval, ...]
+    before: tuple[RejectedInterval, ...]
+
+
 def rejected_evidence(case: EvidenceContext) -> EvidenceResult:
     """Return a warning with the intervals; none for a recording without times."""
     if case.prepared.recording.time is None:
         return EvidenceResult("rejected")
+    intervals, before = (
+        rejected_intervals(case.prepared.time, fit.weights, case.settings) for fit in (case.final.fit, case.base)
+    )
     return EvidenceResult(
-        "rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights, case.settings)
+        "rejected",
+        RejectedByFit(intervals, before),
+        warnings=rejected_warning(intervals),
     )
 
 
-def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings) -> tuple[str, ...]:
-    """Return a warning with the longest intervals of rejected samples; empty if there are none.
+def rejected_intervals(
+    time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings
+) -> tuple[RejectedInterval, ...]:
+    """Return the intervals in which most samples are rejected, without short bursts.
 
     Args:
         time: in s.
@@ -67,12 +94,16 @@ def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], s
         >>> import torch
         >>> time = torch.arange(1000) / 50.0
         >>> weights = torch.where((time > 4.0) & (time < 7.0), 0.0, 1.0).unsqueeze(-1)
-        >>> rejected_warning(time, weights, Settings())
+        >>> rejected_warning(rejected_intervals(time, weights, Settings()))
         ('Most samples were rejected from 4.0 to 7.0 s. ...',)
     """
-    stretches = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
-    long = [interval for interval in stretches if _length(interval) >= settings.evidence.disturbed]
-    found = sorted(long, key=_length, reverse=True)
+    intervals = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
+    return tuple(interval for interval in intervals if _length(interval) >= settings.evidence.disturbed)
+
+
+def rejected_warning(intervals: Sequence[RejectedInterval]) -> tuple[str, ...]:
+    """Return a warning with the longest intervals of rejected samples; empty if there are none."""
+    found = sorted(intervals, key=_length, reverse=True)
     if not found:
         return ()
     text = ", ".join(f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED]))

@@ -204,6 +204,8 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
+        "notes": d.notes,
+        "rejected_intervals": d.rejected_intervals,
     }
     content = _with_evidence(content, d.evidence, json_schema())
     _refuse_not_finite(content)

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch._parallel.pool import shared
+from mkc_torch._support.note import Note
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.recording.recording import Recording
+from mkc_torch.recording.time_order import note_if_few
 from mkc_torch.simulation.ports import Port
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -108,7 +110,10 @@ def find_drivers(
         values, complaint = _usable(name, recording[name], settings)
         repeated = None if values is None else _repeated(values, recording, measured, settings)
         if repeated is not None:
-            values, complaint = None, [f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing."]
+            values, complaint = (
+                None,
+                [Note(f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing.")],
+            )
         warnings += complaint
         if values is not None:
             usable[name] = values
@@ -149,10 +154,11 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
     share = float(finite.double().mean())
     if share < settings.fewest_finite:
         found = "no finite values" if share == 0 else f"only {share:.0%} finite values"
-        return None, [f"Column `{name}` has {found} and is left out."]
-    warnings = []
+        return None, [Note(f"Column `{name}` has {found} and is left out.")]
+    warnings: list[str] = []
     if share < 1.0:
-        warnings.append(f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time.")
+        lacking = f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time."
+        warnings.append(note_if_few(lacking, int((~finite).sum()), len(values)))
         values = _filled(values, finite)
     wild = _wild(values, settings)
     if bool(wild.any()):
@@ -165,7 +171,7 @@ def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor
         values = _filled(values, ~wild)
     spread = float(values.amax() - values.amin())
     if spread <= 1e-12 * float(values.abs().amax()):
-        return None, [*warnings, f"Column `{name}` is constant and can drive nothing."]
+        return None, [*warnings, Note(f"Column `{name}` is constant and can drive nothing.")]
     return values, warnings
 
 

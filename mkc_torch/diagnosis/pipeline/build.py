@@ -10,6 +10,7 @@ from functools import partial
 import torch
 
 from mkc_torch._parallel.deadline import within
+from mkc_torch._support.note import notes_of, warnings_of
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
 from mkc_torch.diagnosis.evidence.rejected import called
 from mkc_torch.diagnosis.evidence.remaining import nameless
@@ -248,12 +249,13 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
             *prepared.warnings,
-            *whole.drivers.warnings,
+            *warnings_of(whole.drivers.warnings),
             *_time_warnings(prepared),
             *answers.warnings,
             *(_no_size(finding) for finding in without_size),
             *(doubt for finding in findings for doubt in finding.doubts),
         ),
+        notes=(*prepared.recording.notes, *notes_of(whole.drivers.warnings)),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, whole.drivers, case.base, final),

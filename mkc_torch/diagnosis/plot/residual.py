@@ -22,6 +22,7 @@ __all__ = [
     "draw_residual",
     "draw_residuals",
     "mark_findings",
+    "mark_rejected",
     "of_channel",
     "onsets",
 ]
@@ -126,6 +127,12 @@ def mark_findings(ax: Any, findings: Sequence[Finding]) -> None:
             ax.axvline(moment, color=ORANGE, lw=1.2, zorder=3)
         if finding.onset_interval is not None:
             ax.axvspan(*finding.onset_interval, color=ORANGE, alpha=0.3, lw=0, zorder=2)
+
+
+def mark_rejected(ax: Any, intervals: Sequence[tuple[float, float]]) -> None:
+    """Shade the intervals in which most samples were rejected."""
+    for start, end in intervals:
+        ax.axvspan(start, end, color=ORANGE, alpha=0.18, lw=0, zorder=0)
 
 
 def onsets(finding: Finding) -> tuple[float, ...]:

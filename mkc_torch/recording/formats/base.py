@@ -74,6 +74,12 @@ class Topic(NamedTuple):
     restarts: tuple[int, ...] = ()
 
 
+class UsualUnit(str):
+    """A unit that all files of a format have in a column, although the file does not state it."""
+
+    __slots__ = ()
+
+
 class FileFormat(NamedTuple):
     """A file format; a new format is a module of this folder and an entry in ``FORMATS``.
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import (
     MISSING,
     MISSING_SIGNS,
@@ -27,13 +28,13 @@ def renamed(
     table: Table, columns: Mapping[str, str], path: Path | str, what: str = "file"
 ) -> tuple[dict[str, Any], list[str]]:
     """Rename columns; returns the named columns by new name, and warnings about columns left out."""
-    warnings = []
+    warnings: list[str] = []
     repeated = [name for name, count in Counter(table.names).items() if name and count > 1]
     if repeated:
         raise RecordingError(f"{path}: the header names {listed(repeated)} more than once; each name must be unique.")
     present = {name: series for name, series in zip(table.names, table.series, strict=True) if name}
     if nameless := len(table.names) - len(present):
-        warnings.append(f"{counted(nameless, 'column')} without a name left out.")
+        warnings.append(Note(f"{counted(nameless, 'column')} without a name left out."))
     sources = {new: old.strip() for new, old in columns.items()}
     for new, old in sources.items():
         if old not in present:
@@ -44,7 +45,7 @@ def renamed(
     for name, series in present.items():
         new_names = [new for new, old in sources.items() if old == name]
         if not new_names and name in sources:
-            warnings.append(f"Column `{name}` of the {what} is left out: `{sources[name]}` takes its name.")
+            warnings.append(Note(f"Column `{name}` of the {what} is left out: `{sources[name]}` takes its name."))
         elif not new_names:
             new_names = [name]
         names |= dict.fromkeys(new_names, series)
@@ -75,7 +76,7 @@ def missing_warning(table: Table, name: str, series: Any) -> str | None:
     if not count:
         return None
     row = int(words.fill_null(False).arg_max())
-    return (
+    return Note(
         f'Column `{name}` holds "{cells[row]}" or the like {counted(count, "time")}, first at {table.line} '
         f"{table.lines[row]}; it is read as a missing value."
     )

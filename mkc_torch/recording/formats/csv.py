@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, is_number, listed, polars
 from mkc_torch.recording.formats.text_cells import WHITE, cells_of
 from mkc_torch.recording.formats.text_layout import layout_of
@@ -54,7 +55,7 @@ def topic(path: Path) -> Topic:
     numbers = [line.number for line in layout.rows]
     grouped, thousands = without_thousands(frame.get_columns())
     series, changes = _with_points(path, names, grouped, numbers)
-    changes = ["Thousands separators were removed from the numbers.", *changes] if thousands else changes
+    changes = [Note("Thousands separators were removed from the numbers."), *changes] if thousands else changes
     bare = [without_units(column) for column in series]
     series = [column for column, _ in bare]
     units = {name: unit for name, (_, unit) in zip(names, bare, strict=True) if unit}
@@ -66,7 +67,7 @@ def topic(path: Path) -> Topic:
 
 def _plainly_quoted(lines: list[Line]) -> tuple[list[Line], list[str]]:
     """Replace single quotes by double quotes, and decimal commas in time stamps by points; returns warnings too."""
-    warnings = []
+    warnings: list[str] = []
     if len(lines) > 1 and all(
         line.text[:1] == line.text.rstrip()[-1:] == "'" and '"' not in line.text for line in lines
     ):
@@ -77,7 +78,7 @@ def _plainly_quoted(lines: list[Line]) -> tuple[list[Line], list[str]]:
         commas = row.count(",") - len(_COMMA_SECONDS.findall(row))
         if row.count(";") + row.count("\t") == 0 and any(name.count(",") == commas for name in names[:20]):
             lines = [line._replace(text=_COMMA_SECONDS.sub(".", line.text)) for line in lines]
-            warnings.append("A comma before the fraction of a second was read as a point.")
+            warnings.append(Note("A comma before the fraction of a second was read as a point."))
     return lines, warnings
 
 
@@ -112,7 +113,7 @@ def _with_points(path: Path, names: list[str], series: list[Any], lines: list[in
         column.str.replace(",", ".", literal=True) if bool(has.any()) else column
         for column, has in zip(series, commas, strict=True)
     ]
-    return changed, ["Decimal commas were read as points."]
+    return changed, [Note("Decimal commas were read as points.")]
 
 
 def _may_be_thousands(cells: Any, rows: int) -> bool:

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mkc_torch.recording.formats.base import UsualUnit
+
 __all__ = ["MESSAGE_FORMAT", "MessageFormat", "instance_column", "message_format", "units_of"]
 
 
@@ -136,7 +138,7 @@ def units_of(
             # zero stands for "none" and −1 for "unknown"
             unit = f"{_PREFIXES[multiplier]}{unit}" if multiplier in _PREFIXES else "" if multiplier > 0 else unit
         if not unit:
-            unit = {"TimeUS": "us", "TimeMS": "ms"}.get(column, legacy.get(column, ""))
+            unit = UsualUnit({"TimeUS": "us", "TimeMS": "ms"}.get(column, legacy.get(column, "")))
         if unit and unit not in ("instance", "UNKNOWN"):
             found[column] = unit
     return found

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic, listed
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
 
@@ -101,11 +102,12 @@ def _own_topics(group: Group) -> list[Topic]:
             topics.append(topic)
     warnings = list(group.warnings)
     if single:
-        warnings.append(f"{listed(single[:8])}{' and others' if len(single) > 8 else ''}: single values, left out.")
+        others = " and others" if len(single) > 8 else ""
+        warnings.append(Note(f"{listed(single[:8])}{others}: single values, left out."))
     if wide:
-        warnings.append(f"{listed(wide[:8])}: more than {MOST_ELEMENTS} numbers per row, left out.")
+        warnings.append(Note(f"{listed(wide[:8])}: more than {MOST_ELEMENTS} numbers per row, left out."))
     if len(topics) > 1:
-        warnings.append(f"Columns of different lengths were split into {len(topics)} tables.")
+        warnings.append(Note(f"Columns of different lengths were split into {len(topics)} tables."))
     if warnings and topics:
         topics[0] = topics[0]._replace(warnings=(*warnings, *topics[0].warnings))
     return topics

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, Topic
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
@@ -102,13 +103,13 @@ def _group(name: str, variables: dict[str, Any], depth: int) -> Group:
             or type(value) is not np.ndarray
             or (value.dtype.kind == "V" and not fields)
         ):
-            group.warnings.append(f"`{path}` is an object; {_TABLES}.")
+            group.warnings.append(Note(f"`{path}` is an object; {_TABLES}."))
         elif fields:
             _add_struct(group, key, path, value, depth)
         elif value.dtype == object:
             texts = _texts(value)
             if texts is None:
-                group.warnings.append(f"`{path}` is a cell array and is left out.")
+                group.warnings.append(Note(f"`{path}` is a cell array and is left out."))
             else:
                 group.arrays[key] = texts
         else:

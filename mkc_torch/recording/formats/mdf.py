@@ -23,6 +23,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
 from mkc_torch.recording.formats.damage import no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
@@ -68,7 +69,7 @@ def _topic(group: dict[str, Any]) -> Topic | None:
     warnings = list(group["warnings"])
     for name, values in group["columns"].items():
         if math.prod(values.shape[1:]) > MOST_ELEMENTS:
-            warnings.append(f"`{name}`: more than {MOST_ELEMENTS} numbers per row, left out.")
+            warnings.append(Note(f"`{name}`: more than {MOST_ELEMENTS} numbers per row, left out."))
             continue
         parts = spread(name, values)
         columns |= parts

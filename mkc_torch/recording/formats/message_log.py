@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic, counted
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE, Cell, MessageRows
 
@@ -83,7 +84,9 @@ class MessageLog:
             elif left_out:
                 self._left_out[name] = left_out[0][0].lower() + left_out[0][1:-1]
         # names in a damaged file may contain line breaks
-        warnings = [" ".join(f"Topic {name} is left out: {why}.".split()) for name, why in self._left_out.items()]
+        warnings: list[str] = [
+            Note(" ".join(f"Topic {name} is left out: {why}.".split())) for name, why in self._left_out.items()
+        ]
         return topics, warnings
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, topic_of
 
@@ -71,11 +72,11 @@ class MessageRows:
         if self._uneven:
             names = ", ".join(f"`{key}`" for key in list(self._uneven)[:8])
             what = "an array of changing length or of" if len(self._uneven) == 1 else "arrays of changing length or of"
-            messages.append(f"{names}: {what} more than {MOST_ELEMENTS} elements, left out.")
+            messages.append(Note(f"{names}: {what} more than {MOST_ELEMENTS} elements, left out."))
         text = [key for key in self._text if key not in self._columns]
         if text:
             verb = "holds text and is" if len(text) == 1 else "hold text and are"
-            messages.append(f"{', '.join(f'`{key}`' for key in text[:8])} {verb} left out.")
+            messages.append(Note(f"{', '.join(f'`{key}`' for key in text[:8])} {verb} left out."))
         return topic_of(self.name, ordered, self._units, messages, line="message")
 
     def _put(self, key: str, value: float | int) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from mkc_torch.recording.formats.base import UsualUnit
+
 __all__ = ["px4_units"]
 
 _BODY_RATE = dict.fromkeys("xyz", "rad/s")
@@ -60,11 +62,11 @@ def px4_units(topic: str, columns: Iterable[str]) -> dict[str, str]:
         {'magnetometer_ga[2]': 'gauss'}
     """
     known = _TOPICS.get(topic, {})
-    units = {}
+    units: dict[str, str] = {}
     for column in columns:
         plain = column.partition("[")[0]
         if plain in ("timestamp", "timestamp_sample"):
-            units[column] = "us"
+            units[column] = UsualUnit("us")
         elif found := known.get(column) or _SUFFIXES.get(plain):
-            units[column] = found
+            units[column] = UsualUnit(found)
     return units

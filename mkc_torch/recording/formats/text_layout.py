@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import RecordingError, counted
 from mkc_torch.recording.formats.text_cells import SEPARATORS, WHITE, cells_of, count_of, is_value, separator_of
 from mkc_torch.recording.formats.text_lines import Line
@@ -18,6 +19,12 @@ _MARKS = ("#", "%", "//", ";")
 _DIGITS = frozenset("0123456789+-.")
 _CUT_NUMBER = re.compile(r"[+-]?(\d*[.,]?\d*([eE][+-]?)?|na?|in?)")
 """Pattern of a truncated number."""
+
+_AXES = ("x", "y", "z")
+"""Names of the columns of a table of three columns without a header."""
+
+_MOST_TORN = 3
+"""Most truncated lines at the end that are left out."""
 
 _MANY = 10
 """Fewest lines with another number of cells than the header if the header is wrong."""
@@ -70,11 +77,12 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
     skipped_comments = [line for line in comments if line.number not in head.lines]
     if skipped_comments:
         number = counted(len(skipped_comments), "comment line")
-        warnings.append(f"{number} skipped, the first {_shown(skipped_comments[0])}.")
+        warnings.append(Note(f"{number} skipped, the first {_shown(skipped_comments[0])}."))
+    if not head.has_header:
+        warnings.append(Note(f"The file has no header; its columns are taken as {', '.join(head.names)}."))
     if head.above:
-        warnings.append(
-            f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
-        )
+        above = f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
+        warnings.append(Note(above))
     if not rows:
         why = f" {' '.join(skipped)}" if skipped else ""
         raise RecordingError(
@@ -95,6 +103,7 @@ class _Head(NamedTuple):
         lines: line numbers of the header, the units and the lines above.
         above: the lines above the first row that are neither header nor units.
         has_rows: False if the table has no row of numbers.
+        has_header: False if the names are not in the file.
     """
 
     separator: str
@@ -105,6 +114,7 @@ class _Head(NamedTuple):
     lines: set[int]
     above: list[Line]
     has_rows: bool = True
+    has_header: bool = True
 
 
 def _is_marked(text: str) -> bool:
@@ -169,6 +179,8 @@ def _unusual_head(path: Path, plain: list[Line], comments: list[Line], first: in
         if len(cells) == count and all(cell.strip() and not is_value(cell) for cell in cells):
             above = plain[:first]
             return _Head(separator, cells, line.text.strip(), [], "", {other.number for other in above}, above)
+    if first == 0 and count == len(_AXES) and _all_numbers(plain, separator):
+        return _Head(separator, list(_AXES), ",".join(_AXES), [], "", set(), [], has_header=False)
     if first == 0:
         raise RecordingError(
             f"{path}: the first line holds numbers; it must hold the column names: add a first line such as "
@@ -177,6 +189,12 @@ def _unusual_head(path: Path, plain: list[Line], comments: list[Line], first: in
     line = plain[first - 1]
     used = {other.number for other in plain[:first]}
     return _Head(separator, cells_of(line.text, separator), line.text.strip(), [], "", used, plain[: first - 1])
+
+
+def _all_numbers(lines: list[Line], separator: str) -> bool:
+    """Whether the first lines hold numbers in all of their three cells."""
+    cells = [cells_of(line.text, separator) for line in lines[:_FIXED]]
+    return all(len(row) == len(_AXES) and all(map(is_value, row)) for row in cells)
 
 
 def _is_row(cells: Sequence[str], count: int) -> bool:
@@ -227,7 +245,7 @@ def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[li
         Line(line.number, line.text.rstrip(" ").removesuffix(separator)) if end and n == count else line
         for line, end, n in zip(lines, ends, counts, strict=True)
     ]
-    return trimmed, count - 1, [f"Every row ends with an extra {SEPARATORS[separator]}."]
+    return trimmed, count - 1, [Note(f"Every row ends with an extra {SEPARATORS[separator]}.")]
 
 
 def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[int, ...], list[str]]:
@@ -269,13 +287,13 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
             rows.append(line)
         else:
             pending.append(line)
-    last = _last_cut(head, rows, pending)
-    if pending and last is not pending[0]:
+    torn = _torn(head, rows, pending)
+    if pending and not torn:
         raise _strange(path, head, pending[0], len(pending))
-    if last is not None and last not in pending:
-        rows.remove(last)
+    if torn and torn[0] not in pending:
+        rows.remove(torn[0])
     begins = tuple(row for row in dict.fromkeys(at) if row < len(rows))
-    warnings = _skip_warnings(restarts, at, cut, between, last)
+    warnings = _skip_warnings(restarts, at, cut, between, torn)
     if broken:
         warnings.append(
             f"{counted(len(broken), 'line')} cut short by zero bytes left out, the first {_shown(broken[0])}."
@@ -284,21 +302,22 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
 
 
 def _skip_warnings(
-    restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None
+    restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], torn: list[Line]
 ) -> list[str]:
-    warnings = []
+    warnings: list[str] = []
     if restarts and at:
         numbers = ", ".join(str(line.number) for line in restarts[:5]) + (", …" if len(restarts) > 5 else "")
-        warnings.append(
-            f"The header is repeated in line{'s' if len(restarts) > 1 else ''} {numbers}, as after a restart of the "
-            "logger."
-        )
+        lines = f"line{'s' if len(restarts) > 1 else ''} {numbers}"
+        warnings.append(Note(f"The header is repeated in {lines}, as after a restart of the logger."))
     if cut:
-        warnings.append(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}.")
+        warnings.append(Note(f"{counted(len(cut), 'line')} cut short before it left out, the first {_shown(cut[0])}."))
     if between:
-        warnings.append(f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}.")
-    if last is not None:
-        warnings.append(f"The last line is cut short and left out, {_shown(last)}.")
+        skipped = f"{counted(len(between), 'line')} of text before it skipped, the first {_shown(between[0])}."
+        warnings.append(Note(skipped))
+    if len(torn) == 1:
+        warnings.append(Note(f"The last line is cut short and left out, {_shown(torn[0])}."))
+    elif torn:
+        warnings.append(Note(f"The last {len(torn)} lines are cut short and left out, the first {_shown(torn[0])}."))
     return warnings
 
 
@@ -312,6 +331,16 @@ def _is_cut(text: str, separator: str, count: int) -> bool:
     """Whether a line is a truncated row."""
     cells = cells_of(text, separator)
     return len(cells) <= count and all(is_value(cell) for cell in cells[:-1]) and any(map(is_value, cells))
+
+
+def _torn(head: _Head, rows: list[Line], pending: list[Line]) -> list[Line]:
+    """The truncated lines at the end of the table; empty if there are none, or if a line is something else."""
+    if 1 < len(pending) <= _MOST_TORN:
+        after = bool(rows) and pending[0].number > rows[-1].number
+        cut = all(_is_cut(line.text, head.separator, len(head.names)) for line in pending)
+        return pending if after and cut else []
+    last = _last_cut(head, rows, pending)
+    return [] if last is None else [last]
 
 
 def _last_cut(head: _Head, rows: list[Line], pending: list[Line]) -> Line | None:

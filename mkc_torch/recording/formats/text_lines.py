@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 from typing import NamedTuple
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import RecordingError, counted
 from mkc_torch.recording.formats.magic_numbers import is_of_another_kind, wrong_format_error
 
@@ -54,7 +55,7 @@ def lines_of(path: Path) -> tuple[list[Line], list[str]]:
     text, warnings = _decoded(path, data)
     if "\u2212" in text:
         text = text.replace("\u2212", "-")
-        warnings.append("Typographic minus signs were read as minus signs.")
+        warnings.append(Note("Typographic minus signs were read as minus signs."))
     lines: list[Line] = []
     zeros: list[int] = []
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
@@ -123,7 +124,7 @@ def _latin_1(path: Path, data: bytes, start: int) -> tuple[str, list[str]]:
         except UnicodeDecodeError:
             text = ""
         if text and all(letter.isprintable() or letter in _PLAIN for letter in text):
-            return text, [f"The file is not UTF-8 and was read as Windows-1252, first in line {line}."]
+            return text, [Note(f"The file is not UTF-8 and was read as Windows-1252, first in line {line}.")]
         raise RecordingError(
             f"{path}: the file is not UTF-8 text: line {line} holds the byte 0x{data[start]:02x}; export it as CSV in "
             "UTF-8."
@@ -131,7 +132,7 @@ def _latin_1(path: Path, data: bytes, start: int) -> tuple[str, list[str]]:
     text = data.decode("latin-1")
     _refuse_binary(path, text)
     shown = " ".join(chr(byte) for byte in strange[:8])
-    return text, [f"The file is not UTF-8 and was read as Latin-1: {shown}, first in line {line}."]
+    return text, [Note(f"The file is not UTF-8 and was read as Latin-1: {shown}, first in line {line}.")]
 
 
 def _refuse_binary(path: Path, text: str) -> None:

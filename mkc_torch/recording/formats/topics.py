@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 
 __all__ = ["MOST_ELEMENTS", "spread", "topic_of"]
@@ -77,7 +78,8 @@ def topic_of(
     found = list(warnings)
     for names, what in ((text, "text"), (other, "no plain numbers")):
         if names:
-            found.append(f"{_columns(names)} {'holds' if len(names) == 1 else 'hold'} {what} and {_left(names)}.")
+            verb = "holds" if len(names) == 1 else "hold"
+            found.append(Note(f"{_columns(names)} {verb} {what} and {_left(names)}."))
     if not any(series.dtype != package.String for series in kept.values()):
         return None
     rows = len(next(iter(kept.values())))

@@ -13,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import check_begins
@@ -82,7 +83,7 @@ def _topic(data: Any) -> Topic | None:
     columns = {name: values for name, values in columns.items() if kinds.get(name) != "char"}
     first = [name for name in ("timestamp",) if name in columns]
     columns = {name: columns[name] for name in [*first, *columns]}
-    warnings = [f"Column `{name}` holds text and is left out." for name in text]
+    warnings = [Note(f"Column `{name}` holds text and is left out.") for name in text]
     return topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), warnings)
 
 

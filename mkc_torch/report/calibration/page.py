@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
+from mkc_torch.report.words.verdict import calibration_verdict, is_doubtful
 
 __all__ = ["Comparison", "calibration_report", "refusal_report"]
 
@@ -37,6 +39,8 @@ def calibration_report(
     note: str = "",
     comparison: Sequence[Comparison] = (),
     against: Differences | None = None,
+    source: str = "NEW.csv",
+    result: str = "calibration.json",
 ) -> str:
     """Return the page of a calibration and its recording.
 
@@ -46,6 +50,7 @@ def calibration_report(
         note: a sentence for the top of the page, for example that the data are simulated.
         comparison: other results, or the truth, for comparison.
         against: differences from an older calibration.
+        source, result: paths of the recording and of the calibration, for the proposed commands.
 
     Returns:
         HTML with inline figures.
@@ -65,11 +70,13 @@ def calibration_report(
     return render(
         "calibration.html.j2",
         c=calibration,
-        # warnings on the file, such as a gap in time, do not question the result
-        doubtful=len(calibration.warnings) > len(usable.warnings),
+        doubtful=is_doubtful(calibration),
+        verdict=calibration_verdict(calibration),
         enough=ENOUGH_INFORMATION,
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
+        source=shlex.quote(source),
+        result=shlex.quote(result),
         comparison=comparison,
         in_known_unit=is_known(calibration.unit),
         against=against,

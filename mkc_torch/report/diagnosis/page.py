@@ -50,12 +50,13 @@ class Cell(NamedTuple):
     color: str
 
 
-def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
+def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.RunPaths | None = None) -> str:
     """Return the page of a diagnosis.
 
     Args:
         diagnosis: what was found.
         note: a sentence for the top of the page, for example that the data are simulated.
+        paths: paths of the run, for the proposed command.
 
     Returns:
         HTML with inline figures.
@@ -74,6 +75,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         "diagnosis.html.j2",
         d=d,
         note=note,
+        paths=paths,
         say=findings,
         evidence=evidence,
         numbers=numbers,

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.plot.residual import (
     draw_floor,
     draw_residuals,
     mark_findings,
+    mark_rejected,
     of_channel,
     onsets,
 )
@@ -57,6 +58,7 @@ def over_time(diagnosis: Diagnosis) -> str:
             axes = [grid.axes(figure, row, column) for column in range(columns)]
             for ax in axes:
                 mark_findings(ax, findings)
+                mark_rejected(ax, diagnosis.rejected_intervals)
             draw_residuals(axes, t, array(t.time), row)
             for ax in axes:
                 draw_floor(ax, known.get(t.channels[row]))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
@@ -14,8 +15,10 @@ from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correct
 from mkc_torch.diagnosis.result import Diagnosis, Finding, notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.words.numbers import size
+from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
+    "RunPaths",
     "Tone",
     "apply_command",
     "headline",
@@ -27,6 +30,25 @@ __all__ = [
     "unexplained_place",
     "warned",
 ]
+
+
+_MOST_REJECTED = "Most samples were rejected"
+"""Beginning of the warning about a disturbed measurement."""
+
+
+class RunPaths(NamedTuple):
+    """Paths and options of a run, for the commands that are proposed.
+
+    Attributes:
+        recording: the diagnosed file.
+        model: the model.json.
+        options: options for ``mkc apply``, such as ``--simulation`` with the class.
+    """
+
+    recording: str
+    model: str
+    options: tuple[str, ...]
+
 
 Tone = Literal["good", "found", "faint", "open"]
 """Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
@@ -47,7 +69,12 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences, the findings by grade."""
+    """Return the verdict in one or two sentences, the findings by grade; a disturbed measurement comes first."""
+    disturbance = disturbed(diagnosis.rejected_intervals)
+    return f"{disturbance} {_verdict(diagnosis)}" if disturbance else _verdict(diagnosis)
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.environment)):
         return term("verdict.unfit")
@@ -152,7 +179,7 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
-    """Return the warnings, those on a finding or its driver first, with names for effect ids.
+    """Return the warnings by weight, with names for effect ids: a disturbance, then those on a finding or its driver.
 
     The notices of a quick look and of a stopped search are not included.
     """
@@ -161,7 +188,10 @@ def warned(diagnosis: Diagnosis) -> list[str]:
     first = notices_first(d)
     ordered = sorted(
         [warning for warning in d.warnings if warning not in first],
-        key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)),
+        key=lambda sentence: (
+            not sentence.startswith(_MOST_REJECTED),
+            doubted.isdisjoint(re.findall(r"\w+", sentence)),
+        ),
     )
     return [capital(with_names(sentence, ids, _kinds(d))) for sentence in ordered]
 
@@ -183,8 +213,11 @@ def _ids(diagnosis: Diagnosis) -> set[str]:
     return {effect for effect in found | {c.effect for c in d.candidates} if "_" in effect}
 
 
-def apply_command(diagnosis: Diagnosis) -> str:
-    """Return the command that corrects another recording; empty if no finding transfers."""
+def apply_command(diagnosis: Diagnosis, paths: RunPaths | None = None) -> str:
+    """Return the command that corrects a recording; empty if no finding transfers.
+
+    ``paths`` are those of the run; None if they are unknown.
+    """
     d = diagnosis
     if not any(transfers(f) for f in d.findings):
         return ""
@@ -192,4 +225,8 @@ def apply_command(diagnosis: Diagnosis) -> str:
         "magnetometer": " --output corrected.csv",
         "simulated": " --simulator-output NEW_SIM.csv --output corrected.csv",
     }.get(d.simulation, f" --simulation FILE.py:{plain(d.simulation) or 'CLASS'} --output simulated.csv")
-    return f"mkc apply model.json NEW.csv{own}"
+    if paths is None:
+        return f"mkc apply model.json NEW.csv{own}"
+    output = "corrected.csv" if d.simulation in ("magnetometer", "simulated") else "simulated.csv"
+    options = " ".join(map(shlex.quote, (*paths.options, "--output", output)))
+    return f"mkc apply {shlex.quote(paths.model)} {shlex.quote(paths.recording)} {options}"

@@ -231,7 +231,8 @@ def aided(calibration: Calibration) -> list[str]:
         sentences.append(term("aided.turned", change=size(aid.heading_error)))
     else:
         sentences.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
-    if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
+    # the bias at rest is measured; that of the fit also absorbs errors of the turns, and would contradict it
+    if calibration.rest_bias is None and aid.gyro_bias is not None and aid.gyro_bias_se is not None:
         sentences.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
     return sentences
 

@@ -97,6 +97,7 @@ class FmuDynamics(Dynamics):
             name=recording.name,
             units={new.get(name, name): unit for name, unit in recording.units.items()},
             warnings=recording.warnings,
+            notes=recording.notes,
             labels={new.get(name, name): label for name, label in recording.labels.items()},
         )
 

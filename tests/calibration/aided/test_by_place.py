@@ -72,7 +72,7 @@ def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
 
 def test_warnings_state_the_aid_and_its_assumptions(found):
     assert found.aid.by == "place"
-    assert any("field of the place replaces the missing turns" in warning for warning in found.warnings)
+    assert any("field of the place replaces the missing turns" in note for note in found.notes)
     assert any("level ground" in warning and "known heading" in warning for warning in found.warnings)
     assert "By the place" in " ".join(aided(found))
     assert "constant heading offset cannot be observed" in " ".join(aided(found))

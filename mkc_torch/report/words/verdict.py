@@ -1,0 +1,54 @@
+"""The headline of a calibration, for the terminal and the page: the result, its doubts and its disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mkc_torch._words.terms import term
+from mkc_torch.calibration.quality import Doubt, disturbances, doubts
+from mkc_torch.calibration.result import Calibration
+from mkc_torch.recording.disturbance import RejectedInterval
+from mkc_torch.report.words.numbers import change, share, when
+
+__all__ = ["calibration_verdict", "disturbed", "is_doubtful", "result_in_a_word"]
+
+
+def calibration_verdict(calibration: Calibration) -> str:
+    """Return the headline: doubtful with its reasons, or calibrated; then the disturbed intervals."""
+    c, reasons = calibration, doubts(calibration)
+    if reasons:
+        first = f"Calibrated, but doubtful: {'; '.join(_reason(doubt, c) for doubt in reasons)}."
+    else:
+        first = term("verdict.doubtful" if is_doubtful(c) else "verdict.calibrated")
+    return " ".join(filter(None, [first, disturbed(disturbances(c), c.disturbed_unit)]))
+
+
+def result_in_a_word(calibration: Calibration) -> str:
+    """Return the result for a table of several sensors."""
+    if doubts(calibration):
+        return "doubtful"
+    return "read the warnings" if is_doubtful(calibration) else "calibrated"
+
+
+def is_doubtful(calibration: Calibration) -> bool:
+    """Return whether a warning or a doubt questions the result, and not only the file."""
+    c = calibration
+    of_file = () if c.used is None else c.used.warnings
+    return bool(doubts(c)) or any(warning not in of_file for warning in c.warnings)
+
+
+def disturbed(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
+    """Return a sentence on the disturbed intervals; empty if there are none.
+
+    Example:
+        >>> disturbed([RejectedInterval(48.8, 51.8)])
+        'Disturbed between 48.8 s and 51.8 s: most samples were rejected there.'
+    """
+    return f"Disturbed {when(intervals, unit)}: most samples were rejected there." if intervals else ""
+
+
+def _reason(doubt: Doubt, calibration: Calibration) -> str:
+    c = calibration
+    if doubt == "not_better":
+        return f"the field's length scatters no less than before ({change(c.before, c.after, c.unit)})"
+    return f"{share(c.rejected_share)} of the samples were rejected"
