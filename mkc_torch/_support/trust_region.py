@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import symmetric_eigen
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
@@ -63,7 +65,7 @@ def _step(at: Quadratic, radius: Float[Tensor, " K"]) -> _Step:
 
     Where a step along the most negative curvature gains more, such as at a saddle, it is taken instead.
     """
-    curvature, vectors = torch.linalg.eigh(at.hessian)
+    curvature, vectors = symmetric_eigen(at.hessian)
     slope = torch.matmul(at.gradient.unsqueeze(-2), vectors).squeeze(-2)
     size = curvature.abs()
     largest = size.amax(-1)

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import side_by_side
+from mkc_torch._support.small_factors import null_vector, solve
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
@@ -27,8 +30,12 @@ class Minimax:
 
 def equal_heights(rows: Float[Tensor, "*batch k n"], target: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch n"]:
     """Chebyshev fit of k = n + 1 rows: all residuals have equal size. Not finite where the rows are dependent."""
-    q, upper = torch.linalg.qr(rows, mode="complete")
     n = rows.shape[-1]
+    if side_by_side(rows):
+        sign = torch.where(null_vector(rows) < 0, -1.0, 1.0).to(rows.dtype).unsqueeze(-1)
+        matrix = torch.cat([rows.expand(*target.shape, n), sign.expand(*target.shape, 1)], -1)
+        return solve(matrix, target.unsqueeze(-1))[..., :n, 0]
+    q, upper = torch.linalg.qr(rows, mode="complete")
     normal = q[..., n]
     height = (normal * target).sum(-1, keepdim=True) / normal.abs().sum(-1, keepdim=True)
     fitted = target - height * torch.where(normal < 0, -1.0, 1.0)
@@ -71,8 +78,9 @@ def minimax(
     basis = _first_rows(everywhere, centred, used)
     eps = torch.finfo(torch.float64).eps
     floor = 64 * eps * (target.abs() * used).amax(-1)
-    sign = torch.where(_null_vector(_take(everywhere, basis)) < 0, -1.0, 1.0).to(target)
-    negative = (_null_vector(_take(everywhere, basis)) * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
+    normal = null_vector(_take(everywhere, basis))
+    sign = torch.where(normal < 0, -1.0, 1.0).to(target)
+    negative = (normal * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
     sign = torch.where(negative, -sign, sign)
 
     beta = torch.zeros_like(guess)
@@ -86,7 +94,7 @@ def minimax(
     for step in range(max_iter + 1):
         at = moving.nonzero().squeeze(-1)
         matrix = torch.cat([_take(everywhere[at], basis[at]), sign[at].unsqueeze(-1)], -1)
-        solution = torch.linalg.solve(matrix, centred[at].gather(1, basis[at]))
+        solution = solve(matrix, centred[at].gather(1, basis[at]).unsqueeze(-1)).squeeze(-1)
         beta[at], height[at] = solution[:, :n], solution[:, n]
         residual = centred[at] - torch.matmul(everywhere[at], beta[at].unsqueeze(-1)).squeeze(-1)
         over = torch.where(used[at], residual.abs(), 0.0) - height[at].unsqueeze(-1)
@@ -105,7 +113,7 @@ def minimax(
         enter_sign = torch.where(residual.gather(1, enter) < 0, -1.0, 1.0).to(target)
         column = torch.cat([_take(everywhere[at], enter).squeeze(1), enter_sign], -1)
         both = torch.stack([column, last.expand_as(column)], -1)
-        share, dual = torch.linalg.solve(matrix.mT, both).unbind(-1)
+        share, dual = solve(matrix.mT, both).unbind(-1)
         falls = share * enter_sign * sign[at]
         ratio = torch.where(falls > 1e-12, (dual * sign[at]).clamp(min=0.0) / falls, torch.inf)
         ties = ratio <= ratio.amin(-1, keepdim=True) * (1 + 1e-12)
@@ -117,12 +125,6 @@ def minimax(
 
 def _take(rows: Float[Tensor, "P R n"], index: Int[Tensor, "P k"]) -> Float[Tensor, "P k n"]:
     return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
-
-
-def _null_vector(rows: Float[Tensor, "P k n"]) -> Float[Tensor, "P k"]:
-    """The vector orthogonal to the columns of n + 1 rows of rank n."""
-    q = torch.linalg.qr(rows, mode="complete").Q
-    return q[..., -1]
 
 
 def _first_rows(

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import solve
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -80,8 +82,8 @@ def _fits_through(problem: LinearProblem, drawn: Tensor) -> Float[Tensor, "B cou
         index = torch.where(used, drawn, -1.0).topk(n, dim=-1).indices
         batch = torch.arange(B, device=y.device).view(B, 1, 1)
         chosen, target = rows.expand(B, -1, -1)[batch, index], y[batch, index]
-    solution, info = torch.linalg.solve_ex(chosen.expand(B, -1, -1, -1), target)
-    usable = (info == 0).unsqueeze(-1) & torch.isfinite(solution)
+    solution = solve(chosen.expand(B, -1, -1, -1), target.unsqueeze(-1)).squeeze(-1)
+    usable = torch.isfinite(solution).all(-1, keepdim=True)
     least_squares = problem.weighted_fit(torch.ones_like(problem.Y))
     return torch.cat([torch.where(usable, solution, 0.0), least_squares.unsqueeze(1)], dim=1)
 

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.small_factors import solve, solve_gram
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._problem import linear_problem, solve_gram
+from mkc_torch.linear._problem import linear_problem
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -255,5 +256,4 @@ def _solve_through(
 ) -> Float[Tensor, "B n"]:
     """Coefficients that fit the chosen rows exactly."""
     matrix = rows.expand(target.shape[0], -1, -1).gather(-2, chosen.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
-    solution: Tensor = torch.linalg.solve(matrix, target.gather(-1, chosen))
-    return solution
+    return solve(matrix, target.gather(-1, chosen).unsqueeze(-1)).squeeze(-1)

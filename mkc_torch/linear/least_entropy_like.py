@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.small_factors import solve
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -201,7 +202,7 @@ class LeastEntropyLike(LinearEstimator):
             coef = orthogonal_starts(first)
         else:
             coef = orthogonal_starts(_coefficients(problem, least_squares.unsqueeze(1)).squeeze(1))
-        return torch.linalg.solve(problem.to_coef, coef.mT).mT
+        return solve(problem.to_coef, coef.mT).mT
 
 
 def _least_squares(problem: LinearProblem) -> Float[Tensor, "B n"]:

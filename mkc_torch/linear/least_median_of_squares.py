@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -236,6 +237,6 @@ def _determined(rows: Float[Tensor, "#B R n"], used: Tensor) -> Tensor:
     count = used.to(rows.dtype)
     outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
     gram = torch.matmul(count, outer[0] if outer.shape[0] == 1 else outer).unflatten(-1, (rows.shape[-1],) * 2)
-    values = torch.linalg.eigvalsh(gram)
+    values, _ = symmetric_eigen(gram)
     full: Tensor = values[..., 0] > 1e2 * torch.finfo(rows.dtype).eps * values[..., -1]
     return full & (count.sum(-1) > rows.shape[-1])

@@ -14,6 +14,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.small_factors import symmetric_pinv
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, coefficients_a_value
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -328,7 +329,7 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         gram, _ = some.normal_equations(counts)
         beta[active] = some.weighted_fit(counts)
         error = some.residual(beta[active])[..., 0]
-        inverse = torch.linalg.pinv(gram, hermitian=True)
+        inverse = symmetric_pinv(gram)
         mine = rows if rows.shape[0] == 1 else rows[active]
         leverage = torch.matmul(torch.matmul(mine, inverse), mine.mT)
         own = leverage.diagonal(dim1=-2, dim2=-1)

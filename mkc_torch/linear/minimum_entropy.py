@@ -11,6 +11,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.small_factors import pinv, symmetric_eigen
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -173,7 +174,7 @@ class MinimumEntropy(LinearEstimator):
         else:
             rows = rows - rows.mean(-3, keepdim=True)
         gram = torch.matmul(rows.flatten(-3, -2).mT, rows.flatten(-3, -2))
-        values, vectors = torch.linalg.eigh(gram)
+        values, vectors = symmetric_eigen(gram)
         # the basis is orthonormal, so a direction without a constant part has eigenvalue 1
         seen = (values > 1e3 * torch.finfo(torch.float32).eps ** 2).to(rows)
         return torch.matmul(vectors * seen.unsqueeze(-2), vectors.mT)
@@ -191,7 +192,7 @@ class MinimumEntropy(LinearEstimator):
             used = (weight > 0).to(rows).unsqueeze(-1)
             level = (used * rows).sum(-3) / used.sum(-3)
         constant = torch.matmul(level, hidden)
-        shift = torch.matmul(torch.linalg.pinv(constant, rtol=1e-6), median.unsqueeze(-1)).squeeze(-1)
+        shift = torch.matmul(pinv(constant, rtol=1e-6), median.unsqueeze(-1)).squeeze(-1)
         return torch.matmul(hidden, shift.unsqueeze(-1)).squeeze(-1)
 
 

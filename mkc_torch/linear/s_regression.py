@@ -12,6 +12,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.small_factors import symmetric_pinv
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import (
     ScaleInfluence,
@@ -243,7 +244,7 @@ def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) 
             * first.unsqueeze(-2)
         )
         curved = problem.normal_equations(at.slope / (at.scale.square() * slope_sum).unsqueeze(-2))[0]
-        inverse = torch.linalg.pinv(curved + (own - cross - cross.mT).sum(1), hermitian=True)
+        inverse = symmetric_pinv(curved + (own - cross - cross.mT).sum(1))
     return -torch.matmul(inverse, first.sum(1).unsqueeze(-1)).squeeze(-1)
 
 

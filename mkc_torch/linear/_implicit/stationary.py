@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import definite_inverse
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
 from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
 from mkc_torch.density.normalizer import _log_partition_and_slopes
@@ -204,12 +205,8 @@ def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"]
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     root = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     outer = root.unsqueeze(-1) * root.unsqueeze(-2)
-    factor, info = torch.linalg.cholesky_ex(outer * hessian)
-    pivots = factor.diagonal(dim1=-2, dim2=-1).square().amin(-1)
-    strict = (info == 0) & (pivots > 1e2 * hessian.shape[-1] * torch.finfo(hessian.dtype).eps)
-    safe = torch.where(strict[:, None, None], factor, torch.eye(factor.shape[-1]).to(factor))
-    inverse = outer * torch.cholesky_inverse(safe)
-    return torch.where(both & strict[:, None, None], inverse, 0.0), strict
+    inverse, strict = definite_inverse(outer * hessian)
+    return torch.where(both & strict[:, None, None], outer * inverse, 0.0), strict
 
 
 def moved(fit_state: FitState, point: Unknowns, move: Float[Tensor, "B p"], unit: Tensor, m: int) -> Unknowns:

@@ -1,0 +1,131 @@
+"""What a GPU needs of a fit: no batched factorisation of cuSOLVER, in the path that is forced here on the CPU."""
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from mkc_torch._support.side_by_side import forced
+from mkc_torch.linear import (
+    FixedPointLinear,
+    LeastAbsoluteDeviations,
+    LeastEntropyLike,
+    LeastMedianOfSquares,
+    LeastSquares,
+    LeastTrimmedSquares,
+    MEstimator,
+    MinimumEntropy,
+    MKCRegression,
+    MMRegression,
+    RankDeficientError,
+    ReweightedLeastSquares,
+    Ridge,
+    SRegression,
+)
+from mkc_torch.linear._estimator import LinearEstimator
+
+ESTIMATORS = [
+    LeastSquares(),
+    Ridge(1.0),
+    FixedPointLinear(sigma=2.0, d=0.2),
+    MKCRegression(),
+    LeastAbsoluteDeviations(),
+    MEstimator("tukey"),
+    MEstimator("huber", scale="proposal2"),
+    LeastTrimmedSquares(),
+    LeastMedianOfSquares(starts=300),
+    ReweightedLeastSquares(),
+    SRegression(),
+    MMRegression(),
+    MinimumEntropy(),
+    MinimumEntropy("renyi"),
+    LeastEntropyLike(),
+]
+
+
+def sample(problems: int, N: int = 30, n: int = 3) -> tuple[Tensor, Tensor]:
+    """Problems of N samples with every fifth target wrong, about a tenth of them hard."""
+    generator = torch.Generator().manual_seed(1)
+    X = torch.randn(problems, N, n, dtype=torch.float64, generator=generator)
+    X[..., 0] = 1.0
+    y = X.sum(-1) + 0.1 * torch.randn(problems, N, dtype=torch.float64, generator=generator)
+    y[:, ::5] += 5.0
+    return X, y
+
+
+FACTORISATIONS = ("linalg_qr", "geqrf", "linalg_eigh", "linalg_svd", "linalg_lstsq", "linalg_pinv", "linalg_cholesky")
+
+
+class Factorisations(TorchDispatchMode):
+    """Records the names of batched factorisations; a single matrix counts as no batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: set[str] = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.split("::")[1].lstrip("_")
+        if name.startswith(FACTORISATIONS) and args[0].dim() > 2 and args[0].shape[:-2].numel() > 1:
+            self.found.add(name)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
+def test_no_batched_factorisation(estimator: LinearEstimator):
+    X, y = sample(4)
+    with forced(), Factorisations() as recorded:
+        estimator.fit(X, y)
+    assert recorded.found == set()
+
+
+def test_the_mode_sees_a_batched_factorisation():
+    with Factorisations() as recorded:
+        LeastSquares().fit(*sample(4))
+        LeastTrimmedSquares().fit(*sample(4))
+    assert {"linalg_qr", "linalg_pinv"} <= recorded.found
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
+def test_both_paths_agree(estimator: LinearEstimator, weighted):
+    X, y = sample(6, 40, 3)
+    weight = 0.5 + torch.rand(6, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    weight[0, :3] = 0.0
+    expected = copy.copy(estimator).fit(X, y, weight if weighted else None)
+    with forced():
+        found = copy.copy(estimator).fit(X, y, weight if weighted else None)
+    if isinstance(estimator, LeastMedianOfSquares):
+        # rounding decides which of the values on the edge of a Chebyshev fit the next step uses
+        torch.testing.assert_close(found.objective_, expected.objective_, rtol=0.15, atol=0.0)
+    else:
+        torch.testing.assert_close(found.coef_, expected.coef_, rtol=1e-6, atol=1e-6)
+
+
+def test_nearly_dependent_columns_are_fitted_and_dependent_ones_refused():
+    X, y = sample(5)
+    X[3, :, 2] = X[3, :, 1] + 1e-9 * X[3, :, 2]
+    expected = LeastSquares().fit(X, y).coef_
+    with forced():
+        found = LeastSquares().fit(X, y).coef_
+    torch.testing.assert_close(found[:3], expected[:3])
+    torch.testing.assert_close((X @ found.unsqueeze(-1))[3], (X @ expected.unsqueeze(-1))[3], rtol=1e-5, atol=1e-5)
+    X[3, :, 2] = X[3, :, 1]
+    with forced(), pytest.raises(RankDeficientError, match=r"columns \[1, 2\] are linearly dependent"):
+        LeastSquares().fit(X, y)
+    X[3, :, 2] = 0.0
+    with forced(), pytest.raises(RankDeficientError, match="Column 2 of `X` is zero"):
+        LeastSquares().fit(X, y)
+
+
+def test_many_float32_rows_keep_their_rank():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.randn(1 << 21, 5, generator=generator)
+    y = X.sum(-1) + 0.1 * torch.randn(1 << 21, generator=generator)
+    with forced():
+        fit = LeastSquares().fit(X, y)
+    torch.testing.assert_close(fit.coef_, torch.ones(5), rtol=0.0, atol=1e-3)
+    X[:, 4] = X[:, 0] + X[:, 1]
+    with forced(), pytest.raises(RankDeficientError):
+        LeastSquares().fit(X, y)
