@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.elemental_sets import drawn_of_used, drawn_samples
+from mkc_torch._support.side_by_side import at_once, side_by_side, steps_between_tests
 from mkc_torch._support.small_factors import solve
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ class _Candidates:
 def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Candidates]) -> _Candidates:
     """Apply ``work`` to parts of the problems, sized so that ``values`` of each problem stay in the cache."""
     every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
-    parts = every.split(max(1, _BATCH // values))
+    parts = every.split(at_once(problem.Y, values, _BATCH))
     if len(parts) == 1:
         return work(problem, every)
     found = [work(problem.select(part), part) for part in parts]
@@ -224,8 +225,9 @@ def _ended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> S
 def _screened(problem: LinearProblem, search: ScaleSearch) -> _Candidates:
     """Screen the starts, in parts that stay in the cache for a large problem, and return the candidates."""
     beta = elemental_starts(problem, search.starts, search.seed)
-    at_once = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
-    found = [_screened_part(problem, part, search) for part in beta.split(at_once, dim=1)]
+    together = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
+    together = beta.shape[1] if side_by_side(beta) else together
+    found = [_screened_part(problem, part, search) for part in beta.split(together, dim=1)]
     beta, scale = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
     converged = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
     return _Candidates(beta, scale, converged).narrowed(search.candidates)
@@ -256,16 +258,18 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
     objective = torch.full(beta.shape[:2], math.inf, dtype=beta.dtype, device=beta.device)
     scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near.clone()
     active = torch.arange(beta.shape[0], device=beta.device)
-    some, n_iter = problem, 0
+    going = torch.arange(beta.shape[1], device=beta.device)
+    some, n_iter, every = problem, 0, steps_between_tests(beta)
     while n_iter < search.max_iter:
-        unfinished = moving[active]
-        left = unfinished.any(1)
-        if 2 * int(left.sum()) <= active.shape[0]:
-            active, unfinished = active[left], unfinished[left]
-            if active.numel() == 0:
-                break
-            some = problem.select(active)
-        going = unfinished.any(0).nonzero().squeeze(-1)
+        if n_iter % every == 0:
+            left = moving[active].any(1).nonzero().squeeze(-1)
+            if 2 * len(left) <= len(active):
+                active = active[left]
+                if len(active) == 0:
+                    break
+                some = problem.select(active)
+            if every == 1:
+                going = moving[active].any(0).nonzero().squeeze(-1)
         # copies, not views: what is written below may be part of a derivative
         at = (active.unsqueeze(-1), going)
         n_iter += 1
@@ -273,7 +277,7 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
         known = scale[at] if near is not None or n_iter > 1 else None
         proposal, now = _step(some, here, search.final, known)
         before = _log_product(now)
-        falls = (objective[at] - before > tolerance) & unfinished[:, going]
+        falls = (objective[at] - before > tolerance) & moving[at]
         objective[at] = torch.minimum(objective[at], before)
         beta[at] = torch.where(falls.unsqueeze(-1), proposal, here)
         scale[at] = now

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import at_once
 from mkc_torch._support.small_factors import solve
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
@@ -138,7 +139,7 @@ class LeastEntropyLike(LinearEstimator):
         away = (starts - least_squares.unsqueeze(1)) / -length[:, None, None]
         directions = torch.cat([away, torch.ones_like(away[..., :1])], dim=-1)
         per_problem = problem.Y[0].numel() * (n + 1) * (n + 4) // 2
-        parts = torch.arange(starts.shape[0], device=starts.device).split(max(1, _CHUNK // per_problem))
+        parts = torch.arange(starts.shape[0], device=starts.device).split(at_once(starts, per_problem, _CHUNK))
         found = [self._descend(problem.select(part), remainder[part], directions[part]) for part in parts]
         minima = Minima(
             torch.cat([f.point for f in found]),

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import at_once
 from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
@@ -103,7 +104,7 @@ class LeastMedianOfSquares(LinearEstimator):
             raise ValueError(f"Expected argument `h` between {fewest} and the {N} samples but got {h}.")
         n = problem.num_coefficients
         per_problem = n * max(N * problem.num_channels * _CANDIDATES, (n + 1) * _number_of_sets(problem, self.starts))
-        parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
+        parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(at_once(problem.Y, per_problem, _CHUNK))
         found = [self._minimise(problem.select(part), h) for part in parts]
         beta = torch.cat([f.beta for f in found])
 
@@ -177,7 +178,7 @@ def _log_product(scale: Tensor) -> Tensor:
 def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S n"]) -> Float[Tensor, "B K n"]:
     """The candidates with the smallest objective, evaluated in parts that fit in memory."""
     values = problem.Y[0].numel() * problem.Y.shape[0]
-    parts = beta.split(max(1, _CHUNK // values), 1)
+    parts = beta.split(at_once(beta, values, _CHUNK), 1)
     objective = torch.cat([_log_product(rule.scale(problem, problem.residual(part))) for part in parts], 1)
     order = objective.topk(min(_CANDIDATES, beta.shape[1]), dim=1, largest=False).indices
     return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
