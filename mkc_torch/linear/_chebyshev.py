@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.side_by_side import side_by_side
+from mkc_torch._support.side_by_side import side_by_side, steps_between_tests
 from mkc_torch._support.small_factors import null_vector, solve
 
 if TYPE_CHECKING:
@@ -91,20 +91,26 @@ def minimax(
     moving = torch.ones(P, dtype=torch.bool, device=target.device)
     last = torch.zeros(n + 1, dtype=target.dtype, device=target.device)
     last[-1] = 1.0
+    every = steps_between_tests(target)
     for step in range(max_iter + 1):
-        at = moving.nonzero().squeeze(-1)
+        if step % every == 0:
+            at = moving.nonzero().squeeze(-1)
+            if len(at) == 0:
+                break
         matrix = torch.cat([_take(everywhere[at], basis[at]), sign[at].unsqueeze(-1)], -1)
         solution = solve(matrix, centred[at].gather(1, basis[at]).unsqueeze(-1)).squeeze(-1)
         beta[at], height[at] = solution[:, :n], solution[:, n]
         residual = centred[at] - torch.matmul(everywhere[at], beta[at].unsqueeze(-1)).squeeze(-1)
         over = torch.where(used[at], residual.abs(), 0.0) - height[at].unsqueeze(-1)
         beyond = over > torch.maximum(1e-12 * height[at], floor[at]).unsqueeze(-1)
-        left = beyond.any(-1)
-        moving[at[~left]] = False
-        if step == max_iter or not bool(left.any()):
+        left = moving[at] & beyond.any(-1)
+        moving[at] = left
+        if step == max_iter:
             break
-        at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
-        n_iter[at] += 1
+        if every == 1:
+            at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
+            left = left[left]
+        n_iter[at] += left
         grown = height[at] > best[at] + floor[at]
         stalled[at] = torch.where(grown, 0, stalled[at] + 1)
         best[at] = torch.maximum(best[at], height[at])
@@ -118,8 +124,9 @@ def minimax(
         ratio = torch.where(falls > 1e-12, (dual * sign[at]).clamp(min=0.0) / falls, torch.inf)
         ties = ratio <= ratio.amin(-1, keepdim=True) * (1 + 1e-12)
         leave = torch.where(ties, basis[at], R).argmin(-1, keepdim=True)
-        basis[at] = basis[at].scatter(1, leave, enter)
-        sign[at] = sign[at].scatter(1, leave, enter_sign)
+        stays = ~left.unsqueeze(-1)
+        basis[at] = torch.where(stays, basis[at], basis[at].scatter(1, leave, enter))
+        sign[at] = torch.where(stays, sign[at], sign[at].scatter(1, leave, enter_sign))
     return Minimax(beta + guess, height, n_iter, ~moving)
 
 

@@ -15,9 +15,10 @@ import torch
 from tests.device.agreement import print_agreement
 from tests.device.fits import print_fits
 from tests.device.other_losses import print_other_losses
+from tests.device.small_fits import print_small_fits
 from tests.device.speed import print_capture, print_steps, print_training, print_variants
 
-SECTIONS = ("agreement", "steps", "training", "capture", "compiled", "variants", "other", "fits")
+SECTIONS = ("agreement", "steps", "training", "capture", "compiled", "variants", "other", "fits", "small_fits")
 
 
 def main() -> None:
@@ -40,6 +41,13 @@ def main() -> None:
         "variants": lambda: print_variants(device, sizes[-1]),
         "other": lambda: print_other_losses(device),
         "fits": lambda: print_fits(device, large=1_000_000 if gpu else 20_000, many=10_000 if gpu else 50),
+        "small_fits": lambda: print_small_fits(
+            device,
+            many=100_000 if gpu else 20,
+            few=2000 if gpu else 4,
+            compared=2000,
+            ellipsoids=1_000_000 if gpu else 3,
+        ),
     }
     right = True
     for name in chosen.only:

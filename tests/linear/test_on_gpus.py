@@ -129,3 +129,36 @@ def test_many_float32_rows_keep_their_rank():
     X[:, 4] = X[:, 0] + X[:, 1]
     with forced(), pytest.raises(RankDeficientError):
         LeastSquares().fit(X, y)
+
+
+READS = ("local_scalar_dense", "nonzero", "is_nonzero", "unique", "unique2", "masked_select", "equal")
+
+
+class Reads(TorchDispatchMode):
+    """Counts the operations in which the host waits for values of the device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.split("::")[1].lstrip("_")
+        masks = name in ("index", "index_put") and any(i is not None and i.dtype == torch.bool for i in args[1])
+        self.count += masks or name in READS
+        return func(*args, **(kwargs or {}))
+
+
+def reads_of(estimator: LinearEstimator, X: Tensor, y: Tensor) -> int:
+    with forced(), Reads() as reads:
+        estimator.fit(X, y)
+    return reads.count
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
+def test_the_host_reads_every_fourth_step_and_no_more_for_more_problems(estimator: LinearEstimator):
+    few, many = reads_of(estimator, *sample(2)), reads_of(estimator, *sample(60))
+    steps = int(torch.as_tensor(getattr(estimator, "n_iter_", 0)).max())
+    # least median of squares counts its refits, each with exchanges of its own
+    constant = 70 if isinstance(estimator, LeastMedianOfSquares) else 30
+    assert many <= 0.25 * steps + constant
+    assert many <= few + 0.25 * steps + 10 or constant == 70

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.small_factors import definite_inverse
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
 from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
@@ -119,6 +120,7 @@ def stationary(problem: LinearProblem, fit_state: FitState) -> _StationaryPoint:
     point = Unknowns(fit_state.beta, fit_state.kappa, fit_state.log_d)
     rounding = (10 * eps * problem.Y.abs().amax((-2, -1)) / unit.squeeze(-1)).square()
     before = rounding.new_full((size,), torch.inf)
+    every = steps_between_tests(unit)
     for step in range(_POLISHING_STEPS + 1):
         gradient = data.gradient(point.beta, point.kappa, point.log_d)
         hessian, head = _hessian(problem, data, point)
@@ -129,7 +131,7 @@ def stationary(problem: LinearProblem, fit_state: FitState) -> _StationaryPoint:
         gain = -(move * gradient).sum(-1)
         near = gain <= eps * head + rounding
         done = ~strict | (near & ((gain <= (1e4 * eps) ** 2 * head) | (gain >= 0.25 * before)))
-        if bool(done.all()) or step == _POLISHING_STEPS:
+        if step == _POLISHING_STEPS or (step % every == 0 and bool(done.all())):
             break
         point, before = moved(fit_state, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
     cause = torch.where(
