@@ -26,7 +26,7 @@ def test_small_fits_agree_and_print_a_row_for_each_estimator(capsys):
     assert "a million in" in printed
 
 
-def test_a_wrong_device_result_is_reported(monkeypatch):
+def test_a_wrong_device_result_is_reported():
     X, y = small_fits.problems(CPU, 2, 30, 2)
     fit = SRegression().fit(X, y)
     assert small_fits.agreement(SRegression, fit, X, y) == (1.0, True)
@@ -39,7 +39,7 @@ def test_a_wrong_device_result_is_reported(monkeypatch):
 
 def test_errors_of_an_estimator_are_printed_and_fail(monkeypatch, capsys):
     class Failing(LeastSquares):
-        def fit(self, X, Y, sample_weight=None):
+        def fit(self, *data):  # noqa: ARG002
             raise RuntimeError("CUSOLVER_STATUS_INTERNAL_ERROR")
 
     monkeypatch.setattr(small_fits, "ESTIMATORS", {"Failing": (Failing, 1.0)})

@@ -1,5 +1,6 @@
 """What a GPU needs of a fit: no batched factorisation of cuSOLVER, in the path that is forced here on the CPU."""
 
+import contextlib
 import copy
 
 import pytest
@@ -8,6 +9,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mkc_torch._support.side_by_side import forced
+from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.covariance import MinimumCovarianceDeterminant
 from mkc_torch.linear import (
     FixedPointLinear,
     LeastAbsoluteDeviations,
@@ -162,3 +166,70 @@ def test_the_host_reads_every_fourth_step_and_no_more_for_more_problems(estimato
     constant = 70 if isinstance(estimator, LeastMedianOfSquares) else 30
     assert many <= 0.25 * steps + constant
     assert many <= few + 0.25 * steps + 10 or constant == 70
+
+
+def points_on_ellipsoids(problems: int, N: int = 150) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    unit = torch.randn(problems, N, 3, dtype=torch.float64, generator=generator)
+    unit = unit / torch.linalg.vector_norm(unit, dim=-1, keepdim=True)
+    noise = 0.2 * torch.randn(problems, N, 3, dtype=torch.float64, generator=generator)
+    return unit * torch.tensor([40.0, 50.0, 60.0]) + noise
+
+
+def test_ellipsoids_need_no_batched_factorisation_and_no_read_for_each():
+    expected = EllipsoidFit().fit(points_on_ellipsoids(4))
+    with forced(), Factorisations() as recorded, Reads() as reads:
+        fit = EllipsoidFit().fit(points_on_ellipsoids(4))
+    with forced(), Reads() as more:
+        EllipsoidFit().fit(points_on_ellipsoids(40))
+    assert recorded.found == set()
+    assert more.count <= reads.count + 10
+    for name in ("center_", "semi_axes_", "rotation_", "calibration_matrix_", "center_se_", "root_se_"):
+        torch.testing.assert_close(getattr(fit, name), getattr(expected, name), rtol=1e-7, atol=1e-9)
+    assert len(fit.coverage_) == 4
+    assert [c.fraction for c in fit.coverage_] == [c.fraction for c in expected.coverage_]
+    assert fit.coverage_[1:3] == [fit.coverage_[1], fit.coverage_[2]]
+
+
+def test_an_ellipsoid_of_too_few_directions_is_refused_by_its_number():
+    points = points_on_ellipsoids(4)
+    cap = 0.3 * points[2] / 50.0 + torch.tensor([0.0, 0.0, 1.0])
+    points[2] = 50.0 * cap / torch.linalg.vector_norm(cap, dim=-1, keepdim=True)
+    messages = []
+    for path in (contextlib.nullcontext, forced):
+        with path(), pytest.raises(NotIdentifiableError) as caught:
+            EllipsoidFit().fit(points)
+        messages.append(str(caught.value))
+    assert messages[0].startswith("Problem 2: Not identifiable")
+    assert messages[1][:60] == messages[0][:60]
+
+
+@pytest.mark.parametrize("estimator", [LeastSquares(), MKCRegression()], ids=repr)
+def test_derivatives_of_an_ellipsoid_are_those_of_the_cpu(estimator):
+    def matrix(points: Tensor) -> Tensor:
+        return EllipsoidFit(estimator).fit(points).calibration_matrix_.flatten()
+
+    points = points_on_ellipsoids(1, 30)[0]
+    expected = torch.autograd.functional.jacobian(matrix, points)
+    with forced():
+        found = torch.autograd.functional.jacobian(matrix, points)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_implicit_derivatives_need_no_batched_factorisation():
+    X, y = sample(4)
+    expected = torch.autograd.functional.jacobian(lambda t: MKCRegression().fit(X, t).coef_, y)
+    with forced(), Factorisations() as recorded:
+        found = torch.autograd.functional.jacobian(lambda t: MKCRegression().fit(X, t).coef_, y)
+    assert recorded.found == set()
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_covariance_determinant_needs_no_batched_eigenvalues_and_agrees():
+    points = points_on_ellipsoids(3, 60)
+    points[:, :10] += 500.0
+    expected = MinimumCovarianceDeterminant().fit(points)
+    with forced(), Factorisations() as recorded:
+        fit = MinimumCovarianceDeterminant().fit(points)
+    assert not {name for name in recorded.found if "cholesky" not in name}
+    torch.testing.assert_close(fit.covariance_, expected.covariance_)
