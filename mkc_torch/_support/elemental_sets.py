@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Int
 
 _STEP, _FIRST, _SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+_ORIGIN = 1
+"""Added to the seed, so that the state of seed 0 is not 0."""
+
 _BITS = 31
 """Bits of a hash that become a number below a limit."""
 
@@ -40,7 +43,7 @@ def mixed(z: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
 
 
 def _hashes(seed: int, sets: int, size: int, device: torch.device) -> Int[Tensor, "sets size"]:
-    first = mixed(torch.arange(sets, device=device).unsqueeze(-1) + _signed(seed * _SECOND))
+    first = mixed(torch.arange(sets, device=device).unsqueeze(-1) + _signed((seed + _ORIGIN) * _SECOND))
     return mixed(first ^ torch.arange(size, device=device))
 
 
