@@ -10,6 +10,7 @@ import torch
 from _pytest.doctest import DoctestModule
 
 from mkc_torch._parallel.processes import one_thread
+from mkc_torch._support.side_by_side import forced
 
 one_thread()
 gc.set_threshold(100_000)  # collecting makes a million objects that stay
@@ -22,6 +23,20 @@ if not torch.cuda.is_available():
 def pytest_collect_file():
     """Tests hold no doctests: with --doctest-modules every one of their files would be collected twice."""
     return [item for item in (yield) if not isinstance(item, DoctestModule)]
+
+
+SIDE_BY_SIDE = "cpu, side by side"
+DEVICES = ("cpu", SIDE_BY_SIDE, *(f"cuda:{i}" for i in range(min(1, torch.cuda.device_count()))))
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """Every device there is, and the CPU where problems are computed side by side, as on a GPU."""
+    if request.param == SIDE_BY_SIDE:
+        with forced():
+            yield torch.device("cpu")
+    else:
+        yield torch.device(request.param)
 
 
 @pytest.fixture(scope="session", autouse=True)

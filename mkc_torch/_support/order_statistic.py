@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import side_by_side
 from mkc_torch._support.torch_internals import forward_mode_is_active, is_wrapped
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def _kept(weight: Float[Tensor, "*batch N m"]) -> Bool[Tensor, " N"] | None:
 def _is_plain(values: Tensor) -> bool:
     """Whether NumPy may read the memory: on the CPU, float32 or float64, without derivatives and transforms."""
     return (
-        values.device.type == "cpu"
+        not side_by_side(values)
         and values.dtype in (torch.float32, torch.float64)
         and not values.requires_grad
         and not torch.compiler.is_compiling()

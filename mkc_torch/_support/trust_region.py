@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import side_by_side, steps_between_tests
+from mkc_torch._support.small_factors import symmetric_eigen
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
@@ -63,7 +66,7 @@ def _step(at: Quadratic, radius: Float[Tensor, " K"]) -> _Step:
 
     Where a step along the most negative curvature gains more, such as at a saddle, it is taken instead.
     """
-    curvature, vectors = torch.linalg.eigh(at.hessian)
+    curvature, vectors = symmetric_eigen(at.hessian)
     slope = torch.matmul(at.gradient.unsqueeze(-2), vectors).squeeze(-2)
     size = curvature.abs()
     largest = size.amax(-1)
@@ -76,7 +79,7 @@ def _step(at: Quadratic, radius: Float[Tensor, " K"]) -> _Step:
     gain = -(step * (slope + 0.5 * curvature * step)).sum(-1)
     # eigenvalues ascend: the first is the most negative
     convex = curvature[:, 0] >= -_NEGATIVE * largest
-    if not bool(convex.all()):
+    if side_by_side(step) or not bool(convex.all()):
         away = radius * slope[:, 0].abs() - 0.5 * curvature[:, 0] * radius.square()
         leave = ~convex & (away > gain)
         downhill = torch.zeros_like(step)
@@ -125,6 +128,8 @@ def minimise(
     _refuse_not_finite(at, torch.linalg.vector_norm(point, dim=-1) + radius)
     found, value = start.clone(), at.value.clone()
     n_iter, converged = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
+    every = steps_between_tests(start)
+    ended = torch.zeros_like(converged)
     for iteration in range(1, max_iter + 1):
         newton = _step(at, radius)
         scale = at.value.abs().clamp(min=1.0)
@@ -132,35 +137,37 @@ def minimise(
         size = torch.linalg.vector_norm(point, dim=-1)
         # a trust region of the size of rounding errors contains no lower point
         stuck = newton.length <= eps * size
-        done = last | stuck
-        if bool(done.any()):
+        new = (last | stuck) & ~ended
+        if every > 1 or bool(new.any()):
             # the last step is taken only if it is short, not along a flat direction
             short = last & (newton.length <= 1e-3 * size)
             ends = torch.where(short.unsqueeze(-1), retract(point + newton.step), point)
             near = newton.convex & (newton.whole_gain <= max(tol, 1e4 * eps) * scale)
-            where = active[done]
-            found[where], value[where], n_iter[where], converged[where] = (
-                ends[done],
-                at.value[done],
-                iteration,
-                near[done],
-            )
-            running = (~done).nonzero().squeeze(-1)
+            found[active] = torch.where(new.unsqueeze(-1), ends, found[active])
+            value[active] = torch.where(new, at.value, value[active])
+            n_iter[active] = torch.where(new, iteration, n_iter[active])
+            converged[active] = torch.where(new, near, converged[active])
+            ended = ended | new
+        if iteration % every == 0 and (every > 1 or bool(new.any())):
+            running = (~ended).nonzero().squeeze(-1)
             if running.numel() == 0:
                 return Minima(found, value, n_iter, converged)
+            ended = ended[running]
             active, point, radius, at = active[running], point[running], radius[running], at.select(running)
             newton = _Step(*(getattr(newton, f)[running] for f in ("step", "length", "gain", "whole_gain", "convex")))
         trial = retract(point + newton.step)
         there = function(trial, active)
         ratio = (at.value - there.value) / newton.gain
-        accept = (ratio > 1e-4) & torch.isfinite(there.gradient).all(-1)
-        if bool(accept.all()):
+        accept = ~ended & (ratio > 1e-4) & torch.isfinite(there.gradient).all(-1)
+        if every == 1 and bool(accept.all()):
             point, at = trial, there
         else:
             point, at = torch.where(accept.unsqueeze(-1), trial, point), at.moved(accept, there)
         kept = torch.where((ratio > 0.75) & (newton.length > 0.99 * radius), 2.0 * radius, radius)
         radius = torch.where(accept & (ratio > 0.25), kept, 0.25 * newton.length)
-    found[active], value[active], n_iter[active] = point, at.value, max_iter
+    found[active] = torch.where(ended.unsqueeze(-1), found[active], point)
+    value[active] = torch.where(ended, value[active], at.value)
+    n_iter[active] = torch.where(ended, n_iter[active], max_iter)
     return Minima(found, value, n_iter, converged)
 
 

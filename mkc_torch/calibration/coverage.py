@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import symmetric_eigen
+
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 NEAR_DEGREES = 15.0
 """Largest angle in ° between a covered direction and the nearest sample."""
@@ -100,6 +103,46 @@ def least_information(moment: Float[Tensor, "9 9"]) -> tuple[float, Float[Tensor
     relative = torch.linalg.solve_triangular(even, half.mT, upper=False)
     values, vectors = torch.linalg.eigh(relative)
     return float(values[0]), torch.linalg.solve_triangular(even.mT, vectors[:, :1], upper=True).squeeze(-1)
+
+
+def least_of_each(moments: Float[Tensor, "B 9 9"]) -> tuple[Float[Tensor, " B"], Float[Tensor, "B 9"]]:
+    """:func:`least_information` of many moments, on their device."""
+    even = _even_information().to(moments)
+    to_even = torch.linalg.solve_triangular(even, torch.eye(9, dtype=even.dtype, device=even.device), upper=False)
+    values, vectors = symmetric_eigen(to_even @ moments.detach() @ to_even.mT)
+    return values[:, 0], vectors[..., 0] @ to_even
+
+
+class CoverageOfEach(Sequence[Coverage]):
+    """Coverage by the directions in use of each of many problems, computed when it is asked for."""
+
+    def __init__(self, vectors: Float[Tensor, "B N 3"], used: Bool[Tensor, "B N"]) -> None:
+        self._vectors = vectors
+        self._used = used
+
+    def __len__(self) -> int:
+        return len(self._vectors)
+
+    @overload
+    def __getitem__(self, index: int) -> Coverage: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Coverage]: ...
+    def __getitem__(self, index: int | slice) -> Coverage | list[Coverage]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return coverage(self.directions(index))
+
+    def directions(self, index: int) -> Float[Tensor, "n 3"]:
+        """The directions in use of a problem."""
+        return self._vectors[index][self._used[index]]
+
+    def information(self) -> Float[Tensor, " B"]:
+        """Information of each problem, as of :class:`Coverage`."""
+        size = self._vectors.abs().amax(-1, keepdim=True)
+        scaled = self._vectors / torch.where(size > 0, size, 1.0)
+        length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
+        rows = tangents(scaled / torch.where(length > 0, length, 1.0)) * self._used.unsqueeze(-1)
+        return least_of_each(rows.mT @ rows / self._used.sum(-1)[:, None, None])[0]
 
 
 def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:

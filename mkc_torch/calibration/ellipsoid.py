@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import solve, symmetric_eigen
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -51,7 +53,7 @@ def ellipsoid_from_coefficients(coef: Float[Tensor, "*batch 9"]) -> Ellipsoid:
     a1, a2, a3, a4, a5, a6 = coef[..., :6].unbind(-1)
     rows = [a1, a4 / 2, a5 / 2, a4 / 2, a2, a6 / 2, a5 / 2, a6 / 2, a3]
     A = torch.stack(rows, -1).unflatten(-1, (3, 3))
-    solution, _ = torch.linalg.solve_ex(A, coef[..., 6:])
+    solution = solve(A, coef[..., 6:].unsqueeze(-1)).squeeze(-1)
     center = -0.5 * solution
     size = 1.0 + torch.einsum("...i,...ij,...j->...", center, A, center)
     return Ellipsoid(center, A / size[..., None, None])
@@ -69,7 +71,7 @@ def coefficients_from_ellipsoid(ellipsoid: Ellipsoid) -> Float[Tensor, "*batch 9
 
 def symmetric_root(shape: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Symmetric square root of positive definite matrices."""
-    values, vectors = torch.linalg.eigh(shape)
+    values, vectors = symmetric_eigen(shape)
     return vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
 
 
@@ -113,7 +115,7 @@ def distance_along(y: Float[Tensor, "*batch N 3"], root: Float[Tensor, "*batch 3
 
 def axes_of(shape: Tensor) -> tuple[Tensor, Tensor]:
     """Semi-axes in ascending order, and the rotation (determinant +1) whose columns are their directions."""
-    values, vectors = torch.linalg.eigh(shape)
+    values, vectors = symmetric_eigen(shape)
     vectors = vectors.flip(-1)
     # the largest component of each axis is positive, so that the result does not depend on the solver
     index = vectors.abs().argmax(-2, keepdim=True)

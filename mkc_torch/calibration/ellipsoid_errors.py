@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import solve, symmetric_eigenvalues
 from mkc_torch.calibration.ellipsoid import Ellipsoid, symmetric_root
 from mkc_torch.linear._implicit.layer import needs_derivatives
 
@@ -30,7 +31,7 @@ def derived_slopes(
 
     def quantities(theta: Tensor) -> Tensor:
         center, shape = ellipsoid_of(theta)
-        axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
+        axes = symmetric_eigenvalues(shape).flip(-1).rsqrt()
         return torch.cat([center, axes, shape.flatten(-2)], -1)
 
     jacobian = _jacobian(quantities, parameters.reshape(-1, 9))
@@ -38,8 +39,8 @@ def derived_slopes(
     root = symmetric_root(shape)
     eye = torch.eye(3, dtype=root.dtype, device=root.device)
     # the root W solves dW W + W dW = dA₁
-    lyapunov = torch.stack([torch.kron(w, eye) + torch.kron(eye, w) for w in root])
-    d_root = torch.linalg.solve(lyapunov, jacobian[:, 6:])
+    both = torch.einsum("bij,kl->bikjl", root, eye) + torch.einsum("kl,bij->bkilj", eye, root)
+    d_root = solve(both.reshape(-1, 9, 9), jacobian[:, 6:])
     # the matrix is radius · root, and the radius is det(A₁)^(-1/6)
     inverse = torch.linalg.inv(shape).flatten(1)
     d_log_radius = -torch.einsum("bi,bij->bj", inverse, jacobian[:, 6:]) / 6.0

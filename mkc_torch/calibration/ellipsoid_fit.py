@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -19,7 +19,9 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, refuse_other_type
 from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.order_statistic import order_statistic, robust_scale
-from mkc_torch.calibration.coverage import Coverage, coverage, least_information, tangents
+from mkc_torch._support.side_by_side import side_by_side
+from mkc_torch._support.small_factors import symmetric_eigenvalues
+from mkc_torch.calibration.coverage import Coverage, CoverageOfEach, least_information, least_of_each, tangents
 from mkc_torch.calibration.ellipsoid import (
     Ellipsoid,
     axes_of,
@@ -106,7 +108,7 @@ class EllipsoidFit(Fitted):
             of the finish, of the estimator's kind ("sandwich" if it has no kind). They include the bias by the noise
             of the points, as the root of the sum of squares, so that intervals cover it; except for
             ``max_scatter=inf``, where the scatter is not noise.
-        coverage_: :class:`mkc_torch.calibration.coverage.Coverage` of the points in use; a list of them for a batch.
+        coverage_: :class:`mkc_torch.calibration.coverage.Coverage` of the points in use; a sequence for a batch.
         root_se_: standard errors of ``calibration_matrix_ / radius_``, which maps the ellipsoid to a unit sphere.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
         finish_: the :class:`mkc_torch.nonlinear.NonlinearFit` of the finish, or None: residual, d and bound are in the
@@ -252,7 +254,7 @@ class EllipsoidFit(Fitted):
         return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
 
     def _refuse_unbounded(self, local: Ellipsoid, points: Tensor) -> None:
-        values = torch.linalg.eigvalsh(local.shape.nan_to_num(0.0, 0.0, 0.0))
+        values = symmetric_eigenvalues(local.shape.nan_to_num(0.0, 0.0, 0.0))
         # a surface a hundred times longer than wide is indistinguishable from a cylinder
         bounded = (values[..., 0] > 1e-4 * values[..., -1]).reshape(-1)
         if not bool(bounded.all()):
@@ -340,27 +342,34 @@ class EllipsoidFit(Fitted):
     ) -> None:
         field = self.calibrate(points).detach()
         flat = field.reshape(-1, *field.shape[-2:])
-        directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[:2]), strict=True)]
-        found = [coverage(d) for d in directions]
-        self.coverage_: Coverage | list[Coverage] = found[0] if field.dim() == 2 else found
-        for index, covered in enumerate(found):
-            where = _problem(index, field.dim() > 2)
+        each = CoverageOfEach(flat, in_use.reshape(flat.shape[:2]))
+        suspects: Sequence[int] = range(len(flat))
+        found: Sequence[Coverage] = each
+        if field.dim() > 2 and side_by_side(field):
+            # of many problems only those near the limits are examined one by one
+            low = (each.information() < 2.0 * MIN_INFORMATION).tolist()
+            suspects = [i for i, error in enumerate(errors[0]) if low[i] or error > MAX_STANDARD_ERROR]
+        else:
+            found = each[:]
+        self.coverage_: Coverage | Sequence[Coverage] = found[0] if field.dim() == 2 else found
+        for index in suspects:
+            covered, where = found[index], _problem(index, field.dim() > 2)
             if covered.information < MIN_INFORMATION:
                 raise not_identifiable(
                     f"{where}Not identifiable: too few directions are covered to separate the offset from the shape "
                     f"({covered.information:.1e} of the information of even coverage; {MIN_INFORMATION:g} is needed).",
-                    directions[index],
+                    each.directions(index),
                 )
             if MAX_STANDARD_ERROR < errors[0][index] < math.inf:
                 raise not_identifiable(
                     f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
                     f"{100.0 * errors[0][index]:.0f} % of the radius, more than {100.0 * MAX_STANDARD_ERROR:.0f} %.",
-                    directions[index],
+                    each.directions(index),
                 )
         self._refuse_scattered(field, scatter)
         if noise is not None:
-            self._refuse_lent(points, in_use, scatter, noise, directions)
-            self._refuse_biased(scatter.tolist(), errors[1], directions)
+            self._refuse_lent(points, in_use, scatter, noise, each)
+            self._refuse_biased(scatter.tolist(), errors[1], each)
 
     @torch.no_grad()
     def _scatter(self, field: Tensor, weight: Tensor | None) -> Tensor:
@@ -381,7 +390,7 @@ class EllipsoidFit(Fitted):
 
     @torch.no_grad()
     def _refuse_lent(
-        self, points: Tensor, in_use: Tensor, scatter: Tensor, noise: Tensor, directions: list[Tensor]
+        self, points: Tensor, in_use: Tensor, scatter: Tensor, noise: Tensor, each: CoverageOfEach
     ) -> None:
         """Raise an error if the directions seem covered only because of the scatter of the points."""
         flat = points.reshape(-1, *points.shape[-2:])
@@ -389,7 +398,15 @@ class EllipsoidFit(Fitted):
         center, root = self.center_.reshape(-1, 1, 3), (self.calibration_matrix_ / self.radius_[..., None, None])
         root = root.reshape(-1, 3, 3)
         moments = moments_of(lambda p: tangents((p - center) @ root), flat, use, noise)
-        for index, count in enumerate(use.sum(-1).tolist()):
+        counts, suspects = use.sum(-1).tolist(), list(range(len(flat)))
+        if points.dim() > 2 and side_by_side(flat):
+            # twice the largest share of spurious information that is subtracted below
+            most = 2.0 * (LENT_UNSURE + LENT_UNSURE_OF_ONE * min(counts) ** -0.5)
+            least_each, worst = least_of_each(moments.found - moments.lent)
+            lent_each = torch.einsum("bi,bij,bj->b", worst, moments.lent, worst).clamp(min=0.0)
+            suspects = (least_each < 2.0 * MIN_INFORMATION + most * lent_each).nonzero()[:, 0].tolist()
+        for index in suspects:
+            count = counts[index]
             least, along = least_information(moments.found[index] - moments.lent[index])
             lent = float(along @ moments.lent[index].double().cpu() @ along)
             needed = MIN_INFORMATION + (LENT_UNSURE + LENT_UNSURE_OF_ONE * count**-0.5) * max(lent, 0.0)
@@ -399,10 +416,10 @@ class EllipsoidFit(Fitted):
                     f"that scatter about the ellipsoid by {100.0 * float(scatter[index]):.0f} % of its shortest "
                     f"semi-axis. Without the spurious coverage by the scatter, {least:.1e} of the information of an "
                     f"even coverage remains; {needed:.1e} is needed.",
-                    directions[index],
+                    each.directions(index),
                 )
 
-    def _refuse_biased(self, scatter: list[float], errors: list[float], directions: list[Tensor]) -> None:
+    def _refuse_biased(self, scatter: list[float], errors: list[float], each: CoverageOfEach) -> None:
         """Raise an error if the bias by noise exceeds the largest accepted standard error."""
         for index, (wide, error) in enumerate(zip(scatter, errors, strict=True)):
             if MAX_STANDARD_ERROR < error < math.inf:
@@ -413,7 +430,7 @@ class EllipsoidFit(Fitted):
                     f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. Including the bias by that scatter, "
                     f"the centre or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
                     f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
-                    directions[index],
+                    each.directions(index),
                     covered=_LESS_NOISE,
                 )
 

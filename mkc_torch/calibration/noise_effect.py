@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import solve
 from mkc_torch.calibration.ellipsoid import monomials, sampson_distance
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def bias_by_noise(moments: NoisyMoments) -> Bias:
     p = moments.found.shape[-1] - 1
     without = (moments.found - moments.lent)[:, :p, :p]
     right = torch.cat([moments.found[:, :p, :p], -moments.lent[:, :p, p:]], -1)
-    solution, _ = torch.linalg.solve_ex(without, right)
+    solution = solve(without, right)
     return Bias(solution[..., p], solution[..., :p])
 
 

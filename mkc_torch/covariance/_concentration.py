@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._support.elemental_sets import drawn_samples, drawn_sets
 from mkc_torch.covariance._exchange import exchange
 
 if TYPE_CHECKING:
@@ -107,11 +108,10 @@ def _step(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Ell
     return Ellipsoids(*(torch.cat(part, dim=1) for part in zip(*moved, strict=True)))
 
 
-def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generator) -> Ellipsoids:
+def _starts(points: Float[Tensor, "B N p"], count: int, seed: int) -> Ellipsoids:
     """Ellipsoids of ``count`` random sets of p + 1 points, and the ellipsoid of all points."""
     N, p = points.shape[-2:]
-    keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(points.device)
-    elemental = _ellipsoids(_points_at(points, keys.topk(p + 1, dim=-1).indices.unsqueeze(0)))
+    elemental = _ellipsoids(_points_at(points, drawn_sets(seed, count, p + 1, N, points.device).unsqueeze(0)))
     whole = _ellipsoids(points.unsqueeze(1))
     return Ellipsoids(*(torch.cat(both, dim=1) for both in zip(elemental, whole, strict=True)))
 
@@ -142,13 +142,12 @@ def concentrate(
 
 
 def _concentrate(points: Float[Tensor, "B N p"], h: int, starts: int, max_iter: int, seed: int) -> Support:
-    generator = torch.Generator().manual_seed(seed)
     N = points.shape[-2]
     small, few = points, h
     if N > _SCREENING_SAMPLES:
-        keep = torch.randperm(N, generator=generator)[:_SCREENING_SAMPLES].sort().values
-        small, few = points[:, keep.to(points.device)], max(1, round(h / N * _SCREENING_SAMPLES))
-    found = _starts(small, starts, generator)
+        keep = drawn_samples(seed, _SCREENING_SAMPLES, N, points.device)
+        small, few = points[:, keep], max(1, round(h / N * _SCREENING_SAMPLES))
+    found = _starts(small, starts, seed)
     for _ in range(2):
         found = _step(small, found, few)
     candidates = min(50 if N <= _EXCHANGE_SAMPLES else 10, starts + 1)

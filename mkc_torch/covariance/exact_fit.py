@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.covariance._concentration import FAR, singular_below
 from mkc_torch.covariance._moments import moments_of
 
@@ -84,7 +85,7 @@ def refuse_exact_fit(sample: Sample, counts: Bool[Tensor, "B N"]) -> None:
     mean, covariance = moments_of(points, counts, torch.zeros_like(sample.centre))
     deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=singular_below(points.dtype))
     shape = covariance / deviation.unsqueeze(-1) / deviation.unsqueeze(-2)
-    least, direction = (part[..., 0] for part in torch.linalg.eigh(shape))
+    least, direction = (part[..., 0] for part in symmetric_eigen(shape))
     flat = least <= (2.0 * sample.resolution).square().clamp(min=singular_below(points.dtype))
     if not flat.any():
         return

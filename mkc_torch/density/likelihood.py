@@ -109,6 +109,17 @@ class DensityState:
         fields = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
         return replace(self, **{f: getattr(self, f)[index] for f in fields})
 
+    def moved(self, moves: Bool[Tensor, " B"], to: DensityState) -> DensityState:
+        """The state ``to`` for the problems that move, and this state for the others."""
+        mask = moves.unsqueeze(-1)
+        return replace(
+            self,
+            kappa=torch.where(mask, to.kappa, self.kappa),
+            log_d=torch.where(mask, to.log_d, self.log_d),
+            damping=torch.where(mask, to.damping, self.damping),
+            value=torch.where(mask, to.value, self.value),
+        )
+
 
 def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
     """Mean negative log-density of the residuals of each channel."""

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import side_by_side, steps_between_tests
+from mkc_torch._support.small_factors import null_vector, solve
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
@@ -27,8 +30,12 @@ class Minimax:
 
 def equal_heights(rows: Float[Tensor, "*batch k n"], target: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch n"]:
     """Chebyshev fit of k = n + 1 rows: all residuals have equal size. Not finite where the rows are dependent."""
-    q, upper = torch.linalg.qr(rows, mode="complete")
     n = rows.shape[-1]
+    if side_by_side(rows):
+        sign = torch.where(null_vector(rows) < 0, -1.0, 1.0).to(rows.dtype).unsqueeze(-1)
+        matrix = torch.cat([rows.expand(*target.shape, n), sign.expand(*target.shape, 1)], -1)
+        return solve(matrix, target.unsqueeze(-1))[..., :n, 0]
+    q, upper = torch.linalg.qr(rows, mode="complete")
     normal = q[..., n]
     height = (normal * target).sum(-1, keepdim=True) / normal.abs().sum(-1, keepdim=True)
     fitted = target - height * torch.where(normal < 0, -1.0, 1.0)
@@ -71,8 +78,9 @@ def minimax(
     basis = _first_rows(everywhere, centred, used)
     eps = torch.finfo(torch.float64).eps
     floor = 64 * eps * (target.abs() * used).amax(-1)
-    sign = torch.where(_null_vector(_take(everywhere, basis)) < 0, -1.0, 1.0).to(target)
-    negative = (_null_vector(_take(everywhere, basis)) * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
+    normal = null_vector(_take(everywhere, basis))
+    sign = torch.where(normal < 0, -1.0, 1.0).to(target)
+    negative = (normal * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
     sign = torch.where(negative, -sign, sign)
 
     beta = torch.zeros_like(guess)
@@ -83,20 +91,26 @@ def minimax(
     moving = torch.ones(P, dtype=torch.bool, device=target.device)
     last = torch.zeros(n + 1, dtype=target.dtype, device=target.device)
     last[-1] = 1.0
+    every = steps_between_tests(target)
     for step in range(max_iter + 1):
-        at = moving.nonzero().squeeze(-1)
+        if step % every == 0:
+            at = moving.nonzero().squeeze(-1)
+            if len(at) == 0:
+                break
         matrix = torch.cat([_take(everywhere[at], basis[at]), sign[at].unsqueeze(-1)], -1)
-        solution = torch.linalg.solve(matrix, centred[at].gather(1, basis[at]))
+        solution = solve(matrix, centred[at].gather(1, basis[at]).unsqueeze(-1)).squeeze(-1)
         beta[at], height[at] = solution[:, :n], solution[:, n]
         residual = centred[at] - torch.matmul(everywhere[at], beta[at].unsqueeze(-1)).squeeze(-1)
         over = torch.where(used[at], residual.abs(), 0.0) - height[at].unsqueeze(-1)
         beyond = over > torch.maximum(1e-12 * height[at], floor[at]).unsqueeze(-1)
-        left = beyond.any(-1)
-        moving[at[~left]] = False
-        if step == max_iter or not bool(left.any()):
+        left = moving[at] & beyond.any(-1)
+        moving[at] = left
+        if step == max_iter:
             break
-        at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
-        n_iter[at] += 1
+        if every == 1:
+            at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
+            left = left[left]
+        n_iter[at] += left
         grown = height[at] > best[at] + floor[at]
         stalled[at] = torch.where(grown, 0, stalled[at] + 1)
         best[at] = torch.maximum(best[at], height[at])
@@ -105,24 +119,19 @@ def minimax(
         enter_sign = torch.where(residual.gather(1, enter) < 0, -1.0, 1.0).to(target)
         column = torch.cat([_take(everywhere[at], enter).squeeze(1), enter_sign], -1)
         both = torch.stack([column, last.expand_as(column)], -1)
-        share, dual = torch.linalg.solve(matrix.mT, both).unbind(-1)
+        share, dual = solve(matrix.mT, both).unbind(-1)
         falls = share * enter_sign * sign[at]
         ratio = torch.where(falls > 1e-12, (dual * sign[at]).clamp(min=0.0) / falls, torch.inf)
         ties = ratio <= ratio.amin(-1, keepdim=True) * (1 + 1e-12)
         leave = torch.where(ties, basis[at], R).argmin(-1, keepdim=True)
-        basis[at] = basis[at].scatter(1, leave, enter)
-        sign[at] = sign[at].scatter(1, leave, enter_sign)
+        stays = ~left.unsqueeze(-1)
+        basis[at] = torch.where(stays, basis[at], basis[at].scatter(1, leave, enter))
+        sign[at] = torch.where(stays, sign[at], sign[at].scatter(1, leave, enter_sign))
     return Minimax(beta + guess, height, n_iter, ~moving)
 
 
 def _take(rows: Float[Tensor, "P R n"], index: Int[Tensor, "P k"]) -> Float[Tensor, "P k n"]:
     return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
-
-
-def _null_vector(rows: Float[Tensor, "P k n"]) -> Float[Tensor, "P k"]:
-    """The vector orthogonal to the columns of n + 1 rows of rank n."""
-    q = torch.linalg.qr(rows, mode="complete").Q
-    return q[..., -1]
 
 
 def _first_rows(

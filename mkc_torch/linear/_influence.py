@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import pinv, symmetric_pinv
 from mkc_torch.linear.covariance import RobustCovarianceKind, andrews_bandwidth, long_run_covariance
 
 if TYPE_CHECKING:
@@ -130,9 +131,9 @@ def influence(
         part = of_scale.of_samples if share is None else of_scale.of_samples * share
         moved = moved - torch.matmul(part, by_scale)
         if of_scale.of_coefficients is not None:
-            inverse = torch.linalg.pinv(hessian + torch.matmul(by_scale.mT, of_scale.of_coefficients))
+            inverse = pinv(hessian + torch.matmul(by_scale.mT, of_scale.of_coefficients))
             return torch.matmul(moved, inverse.mT)
-    return torch.matmul(moved, torch.linalg.pinv(hessian, hermitian=True))
+    return torch.matmul(moved, symmetric_pinv(hessian))
 
 
 def homoscedastic(problem: LinearProblem, equation: Scores) -> Float[Tensor, "B n n"]:
@@ -155,7 +156,7 @@ def homoscedastic(problem: LinearProblem, equation: Scores) -> Float[Tensor, "B 
     precision = equation.precision()
     least = equation.scale.amin(-1, keepdim=True).unsqueeze(-1).square()
     unit_weight = torch.ones_like(equation.psi)
-    inverse = torch.linalg.pinv(problem.normal_equations(unit_weight * precision)[0], hermitian=True)
+    inverse = symmetric_pinv(problem.normal_equations(unit_weight * precision)[0])
     middle = problem.normal_equations(unit_weight * precision * variance.unsqueeze(-2))[0]
     return least * torch.matmul(torch.matmul(inverse, middle), inverse)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 from mkc_torch.density.em import gaussian_state, normalised, replace_problems, weighted_rms
 from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
@@ -48,14 +49,19 @@ def _alternate(
     history = [value]
     weight = normalised(problem.sample_weight)
     stalled = torch.zeros(size, dtype=torch.int64, device=beta.device)
-    for _ in range(max_iter):
+    done = torch.zeros_like(stalled, dtype=torch.bool)
+    every = steps_between_tests(beta)
+    for step in range(1, max_iter + 1):
         residual = problem.residual(beta)
-        before = state
+        last, before = beta, state
         state = newton_step(residual, weight, before)
         kappa, d = state.kappa, torch.exp(state.log_d)
         for _ in range(2):
             beta = fixed_point_step(problem, residual, kappa, d)
             residual = problem.residual(beta)
+        if every > 1:
+            # problems that have ended wait for the next test
+            beta, state = torch.where(done.unsqueeze(-1), last, beta), before.moved(~done, state)
         now = state.value.sum(-1)
         rounding = 8 * torch.finfo(beta.dtype).eps * now.abs()
         improved = history[-1][index] - now > tol + rounding
@@ -63,15 +69,15 @@ def _alternate(
         current = history[-1].clone()
         current[index] = now
         history.append(current)
-        done = stalled >= patience
-        if bool(done.any()) or len(history) > max_iter:
+        done = done | (stalled >= patience)
+        if (step % every == 0 and bool(done.any())) or step == max_iter:
             out_beta[index] = beta
             out_state = replace_problems(out_state, index, state)
             converged[index] = done & torch.isfinite(now)
             keep = (~done).nonzero().squeeze(-1)
             if keep.numel() == 0:
                 break
-            index, beta, stalled = index[keep], beta[keep], stalled[keep]
+            index, beta, stalled, done = index[keep], beta[keep], stalled[keep], done[keep]
             state, problem = state.select(keep), problem.select(keep)
             weight = None if weight is None else weight[keep]
     return LikelihoodMaximum(out_beta, out_state, history[-1], converged, history)

@@ -11,8 +11,13 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_complex, refuse_no_tensor, refuse_not_real
+from mkc_torch._support.side_by_side import at_once, side_by_side
+from mkc_torch._support.small_factors import solve
+from mkc_torch._support.small_factors import solve_gram as solve_gram
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.linear._rank import rank_tolerance
+from mkc_torch.linear._basis import RankDeficientError as RankDeficientError
+from mkc_torch.linear._basis import orthonormalise
+from mkc_torch.linear._basis import refuse_dependent as refuse_dependent
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,12 +30,11 @@ _CHUNK = 1 << 22
 _BLOCK = 1 << 12
 """Values of rows that are weighted and multiplied at a time, so that they stay in the processor's cache."""
 
+_FEW_COLUMNS = 4
+"""Most columns whose outer products are kept off the CPU for a single set of weights."""
+
 _MAX_SETS_IN_BLOCKS = 10
 """Most sets of weights for which blocks are faster than outer products of rows that are not kept."""
-
-
-class RankDeficientError(ValueError):
-    """The columns of X are linearly dependent, so that the coefficients are not determined."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,10 @@ class LinearProblem:
             stack = stack * self.sample_weight.unsqueeze(1)
         n = self.num_coefficients
         sums: Tensor | None = None
-        step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
-        if step < self.num_samples and stack.shape[1] <= _MAX_SETS_IN_BLOCKS:
+        step = at_once(self.Y, n * n * self.num_channels * self.basis.shape[0], _CHUNK)
+        # off the CPU the products of many columns cost more memory traffic than weighted rows
+        wide = n > _FEW_COLUMNS and stack.shape[1] == 1 and side_by_side(stack)
+        if (step < self.num_samples and stack.shape[1] <= _MAX_SETS_IN_BLOCKS) or wide:
             gram, moment = self._sums_of_blocks(stack)
             return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
         for first in range(0, self.num_samples, step):
@@ -109,7 +115,10 @@ class LinearProblem:
         """Normal equations for a few sets of weights, block by block, without keeping outer products of rows."""
         gram: Tensor | None = None
         moment: Tensor | None = None
-        step = max(1, _BLOCK // self.num_channels)
+        each = self.num_channels
+        if side_by_side(stack):
+            each *= self.num_coefficients * stack.shape[0] * stack.shape[1]
+        step = at_once(stack, each, _BLOCK)
         for first in range(0, self.num_samples, step):
             part = slice(first, first + step)
             w, rows = stack[:, :, part].flatten(-2), self.basis[:, part].flatten(-3, -2).unsqueeze(1)
@@ -157,7 +166,7 @@ class LinearProblem:
     def in_basis(self, coef: Float[Tensor, "*batch n"]) -> Float[Tensor, "B n"]:
         """Coefficients in the basis from those of the user's columns."""
         flat = coef.expand(*self.batch, self.num_coefficients).reshape(-1, self.num_coefficients, 1)
-        return torch.linalg.solve(self.to_coef, flat).squeeze(-1)
+        return solve(self.to_coef, flat).squeeze(-1)
 
     def restore(self, values: Float[Tensor, B * rest]) -> Float[Tensor, "*batch *rest"]:
         """Reshape values of the flattened problems to the user's batch dimensions."""
@@ -194,37 +203,6 @@ def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         place = torch.zeros(n, n, dtype=torch.int64, device=device)
         place[i, j] = place[j, i] = torch.arange(i.shape[0], device=device)
         return i, j, place
-
-
-def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """Solve positive semi-definite systems by Cholesky, or by the pseudo-inverse where weights removed a direction."""
-    if gram.shape[-1] == 2 and not (gram.requires_grad or moment.requires_grad):
-        solution, least, most = _solve_two(gram, moment)
-    else:
-        factor, info = torch.linalg.cholesky_ex(gram)
-        solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
-        pivots = factor.diagonal(dim1=-2, dim2=-1)
-        least, most = torch.where(info > 0, 0.0, pivots.amin(-1)), pivots.amax(-1)
-    eps = torch.finfo(gram.dtype).eps
-    # a matrix without a factor has a pivot of 0 or NaN here
-    weak = ~(least > (gram.shape[-1] * eps) ** 0.5 * most)
-    if weak.any():
-        inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
-        repaired = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
-        solution = solution.masked_scatter(weak.unsqueeze(-1), repaired)
-    return solution
-
-
-def _solve_two(gram: Float[Tensor, "*batch 2 2"], moment: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Cholesky solution of many 2 × 2 systems at once, with the smaller and the larger pivot."""
-    first = gram[..., 0, 0].sqrt()
-    below = gram[..., 0, 1] / first
-    second = (gram[..., 1, 1] - below * below).sqrt()
-    x, y = moment.unbind(-1)
-    x = x / first
-    y = (y - below * x) / (second * second)
-    x = (x - below * y) / first
-    return torch.stack([x, y], -1), torch.minimum(first, second), torch.maximum(first, second)
 
 
 def _check_finite(name: str, value: Tensor) -> None:
@@ -359,7 +337,7 @@ def linear_problem(
     # weights of 0 that differ between problems give each problem its own basis; otherwise a shared X is kept once
     shared = v.X.shape[:-3].numel() == 1 and (v.sample_weight is None or bool((v.sample_weight > 0).all()))
     x_batch = v.X.shape[:-3] if shared else v.batch
-    basis, to_coef = _orthonormalise(v.X.expand(*x_batch, N, m, n).reshape(-1, N, m, n), v.sample_weight)
+    basis, to_coef = orthonormalise(v.X.expand(*x_batch, N, m, n).reshape(-1, N, m, n), v.sample_weight)
     weight = None if v.sample_weight is None else v.sample_weight.reshape(flat, N, m)
     return LinearProblem(basis, to_coef, v.Y.reshape(flat, N, m), weight, v.batch, v.single_channel)
 
@@ -408,43 +386,4 @@ def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
     if (weight.sum(-2) <= 0).any():
         raise ValueError(
             "Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros."
-        )
-
-
-def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Basis, and the matrix that maps its coefficients to those of the columns of X, on the samples in use."""
-    rows = X.flatten(-3, -2)
-    if weight is not None and rows.shape[0] == weight.shape[:-2].numel():
-        rows = rows * (weight > 0).reshape(rows.shape[0], -1, 1)
-    scale = rows.abs().amax(-2)
-    _, upper = torch.linalg.qr(rows / torch.where(scale > 0, scale, 1.0).unsqueeze(-2))
-    refuse_dependent(upper, scale, rows.shape[-2])
-    to_coef = torch.linalg.inv(upper) / scale.unsqueeze(-1)
-    return torch.matmul(X.flatten(-3, -2), to_coef).unflatten(-2, X.shape[-3:-1]), to_coef
-
-
-def refuse_dependent(upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*batch n"], num_rows: int) -> None:
-    """Refuse linearly dependent columns, given the R of their QR decomposition.
-
-    Args:
-        upper: R of the columns divided by ``scale``.
-        scale: scale of each column; 0 for a column that is 0 on every row.
-        num_rows: number of rows.
-
-    Raises:
-        RankDeficientError: columns are dependent, or a column is 0.
-    """
-    if (scale == 0).any():
-        column = int((scale == 0).nonzero()[0, -1])
-        raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
-    n = upper.shape[-1]
-    _, singular, right = torch.linalg.svd(upper)
-    # with fewer rows than columns there are fewer singular values than columns
-    ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(())
-    if (ratio <= rank_tolerance(num_rows, n, upper.dtype)).any():
-        worst = right[..., -1, :].reshape(-1, n)[int(ratio.reshape(-1).argmin())]
-        involved = [i for i in range(n) if float(worst[i].abs()) > 0.1 * float(worst.abs().max())]
-        raise RankDeficientError(
-            f"Expected `X` of full column rank but columns {involved} are linearly dependent "
-            f"(singular value ratio {float(ratio.min()):.1e}); remove a column of these."
         )

@@ -16,6 +16,10 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from mkc_torch._support.elemental_sets import drawn_of_used, drawn_samples
+from mkc_torch._support.side_by_side import at_once, side_by_side, steps_between_tests
+from mkc_torch._support.small_factors import solve
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -55,35 +59,27 @@ class ScaleMinimum:
     converged: Tensor
 
 
-def elemental_starts(problem: LinearProblem, count: int, generator: torch.Generator) -> Float[Tensor, "B count+1 n"]:
+def elemental_starts(problem: LinearProblem, count: int, seed: int) -> Float[Tensor, "B count+1 n"]:
     """Coefficients through ``count`` random sets of n values, and the least-squares coefficients."""
-    return _fits_through(problem, _drawn(problem, count, generator))
-
-
-def _drawn(problem: LinearProblem, count: int, generator: torch.Generator) -> Tensor:
-    """Indices of the values of each set, (count, n); with sample weights, random keys of all values."""
-    values = problem.num_samples * problem.num_channels
-    keys = torch.rand(count, values, generator=generator, dtype=torch.float64)
-    if problem.sample_weight is None:
-        keys = keys.topk(problem.num_coefficients, dim=-1).indices
-    return keys.to(problem.Y.device)
-
-
-def _fits_through(problem: LinearProblem, drawn: Tensor) -> Float[Tensor, "B count+1 n"]:
-    n, B = problem.num_coefficients, problem.Y.shape[0]
-    rows = problem.basis.flatten(-3, -2)
-    y = problem.Y.flatten(-2)
-    if problem.sample_weight is None:
-        chosen, target = rows[:, drawn], y[:, drawn]
-    else:
-        used = (problem.sample_weight > 0).flatten(-2).unsqueeze(1)
-        index = torch.where(used, drawn, -1.0).topk(n, dim=-1).indices
-        batch = torch.arange(B, device=y.device).view(B, 1, 1)
-        chosen, target = rows.expand(B, -1, -1)[batch, index], y[batch, index]
-    solution, info = torch.linalg.solve_ex(chosen.expand(B, -1, -1, -1), target)
-    usable = (info == 0).unsqueeze(-1) & torch.isfinite(solution)
+    B = problem.Y.shape[0]
+    chosen, target = values_of_sets(problem, count, problem.num_coefficients, seed)
+    solution = solve(chosen.expand(B, -1, -1, -1), target.unsqueeze(-1)).squeeze(-1)
+    usable = torch.isfinite(solution).all(-1, keepdim=True)
     least_squares = problem.weighted_fit(torch.ones_like(problem.Y))
     return torch.cat([torch.where(usable, solution, 0.0), least_squares.unsqueeze(1)], dim=1)
+
+
+def values_of_sets(
+    problem: LinearProblem, count: int, size: int, seed: int
+) -> tuple[Float[Tensor, "#B count size n"], Float[Tensor, "B count size"]]:
+    """Rows of the basis and targets of ``count`` random sets of ``size`` values of positive weight."""
+    rows, y, weight = problem.basis.flatten(-3, -2), problem.Y.flatten(-2), problem.sample_weight
+    used = None if weight is None else (weight > 0).flatten(-2)
+    index = drawn_of_used(seed, count, size, used, y.shape[-1], y.device)
+    if used is None:
+        return rows[:, index], y[:, index]
+    batch = torch.arange(y.shape[0], device=y.device).view(-1, 1, 1)
+    return rows.expand(y.shape[0], -1, -1)[batch, index], y[batch, index]
 
 
 def _log_product(scale: Tensor) -> Tensor:
@@ -180,7 +176,7 @@ class _Candidates:
 def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Candidates]) -> _Candidates:
     """Apply ``work`` to parts of the problems, sized so that ``values`` of each problem stay in the cache."""
     every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
-    parts = every.split(max(1, _BATCH // values))
+    parts = every.split(at_once(problem.Y, values, _BATCH))
     if len(parts) == 1:
         return work(problem, every)
     found = [work(problem.select(part), part) for part in parts]
@@ -197,15 +193,13 @@ def minimise_scale(problem: LinearProblem, search: ScaleSearch) -> ScaleMinimum:
     """Iterate a few steps from every start on some samples, then the best candidates on all until they converge."""
     size = problem.num_samples * problem.num_channels
     screened = min(size, search.screened * problem.num_channels) * (search.starts + 1)
-    generator = torch.Generator().manual_seed(search.seed)
-    some_samples: Tensor | None = None
+    small = problem
     if problem.num_samples > search.screened:
-        keep = torch.randperm(problem.num_samples, generator=generator)[: search.screened].sort().values
-        some_samples = keep.to(problem.Y.device)
-    small = problem if some_samples is None else problem.select_samples(some_samples)
-    drawn = _drawn(small, search.starts, generator)
-    found = _in_parts(small, screened, lambda some, _: _screened(some, drawn, search))
-    if some_samples is not None:
+        small = problem.select_samples(
+            drawn_samples(search.seed, search.screened, problem.num_samples, problem.Y.device)
+        )
+    found = _in_parts(small, screened, lambda some, _: _screened(some, search))
+    if small is not problem:
         found = replace(found, scale=None)
     for steps, left in search.narrowing:
         short = replace(search, final=search.screening, max_iter=min(steps, search.max_iter))
@@ -228,11 +222,12 @@ def _ended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> S
     return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.converged[:, 0])
 
 
-def _screened(problem: LinearProblem, drawn: Tensor, search: ScaleSearch) -> _Candidates:
+def _screened(problem: LinearProblem, search: ScaleSearch) -> _Candidates:
     """Screen the starts, in parts that stay in the cache for a large problem, and return the candidates."""
-    beta = _fits_through(problem, drawn)
-    at_once = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
-    found = [_screened_part(problem, part, search) for part in beta.split(at_once, dim=1)]
+    beta = elemental_starts(problem, search.starts, search.seed)
+    together = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
+    together = beta.shape[1] if side_by_side(beta) else together
+    found = [_screened_part(problem, part, search) for part in beta.split(together, dim=1)]
     beta, scale = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
     converged = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
     return _Candidates(beta, scale, converged).narrowed(search.candidates)
@@ -263,16 +258,18 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
     objective = torch.full(beta.shape[:2], math.inf, dtype=beta.dtype, device=beta.device)
     scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near.clone()
     active = torch.arange(beta.shape[0], device=beta.device)
-    some, n_iter = problem, 0
+    going = torch.arange(beta.shape[1], device=beta.device)
+    some, n_iter, every = problem, 0, steps_between_tests(beta)
     while n_iter < search.max_iter:
-        unfinished = moving[active]
-        left = unfinished.any(1)
-        if 2 * int(left.sum()) <= active.shape[0]:
-            active, unfinished = active[left], unfinished[left]
-            if active.numel() == 0:
-                break
-            some = problem.select(active)
-        going = unfinished.any(0).nonzero().squeeze(-1)
+        if n_iter % every == 0:
+            left = moving[active].any(1).nonzero().squeeze(-1)
+            if 2 * len(left) <= len(active):
+                active = active[left]
+                if len(active) == 0:
+                    break
+                some = problem.select(active)
+            if every == 1:
+                going = moving[active].any(0).nonzero().squeeze(-1)
         # copies, not views: what is written below may be part of a derivative
         at = (active.unsqueeze(-1), going)
         n_iter += 1
@@ -280,7 +277,7 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
         known = scale[at] if near is not None or n_iter > 1 else None
         proposal, now = _step(some, here, search.final, known)
         before = _log_product(now)
-        falls = (objective[at] - before > tolerance) & unfinished[:, going]
+        falls = (objective[at] - before > tolerance) & moving[at]
         objective[at] = torch.minimum(objective[at], before)
         beta[at] = torch.where(falls.unsqueeze(-1), proposal, here)
         scale[at] = now

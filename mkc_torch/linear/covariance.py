@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
+from mkc_torch._support.small_factors import symmetric_pinv
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -98,5 +99,5 @@ def sandwich(
         middle = long_run_covariance(score, lags)
     else:
         middle = torch.matmul(score.mT, score)
-    inverse = torch.linalg.pinv(curvature, hermitian=True)
+    inverse = symmetric_pinv(curvature)
     return dof[..., None, None] * torch.matmul(torch.matmul(inverse, middle), inverse)

@@ -18,6 +18,7 @@ from mkc_torch._support.arguments import (
     refuse_out_of_range,
 )
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
 from mkc_torch.linear._implicit.stationary import FitState
@@ -96,7 +97,8 @@ def descend(
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Apply (15) until a step lowers the loss by a share below ``tol``. Returns coefficients, convergence, losses."""
     tol = max(tol, 4 * torch.finfo(beta.dtype).eps)
-    history = []
+    every = steps_between_tests(beta)
+    history: list[Tensor] = []
     previous = beta.new_full(beta.shape[:-1], math.inf)
     moving = torch.ones_like(previous, dtype=torch.bool)
     for _ in range(max_iter + 1):
@@ -104,7 +106,7 @@ def descend(
         loss = mean_energy(problem, residual, kappa, d)
         history.append(loss)
         moving = moving & (previous - loss > tol * loss.abs())
-        if len(history) > max_iter or not bool(moving.any()):
+        if len(history) > max_iter or (len(history) % every == 0 and not bool(moving.any())):
             break
         beta = torch.where(moving.unsqueeze(-1), fixed_point_step(problem, residual, kappa, d), beta)
         previous = loss

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,8 +10,10 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import steps_between_tests
+from mkc_torch._support.small_factors import solve, solve_gram
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._problem import linear_problem, solve_gram
+from mkc_torch.linear._problem import linear_problem
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -148,6 +150,12 @@ class _Iterate:
         rest = (self.target, self.floor, self.beta, self.above, self.below, self.upper, self.lower)
         return _Iterate(rows, *(value[keep] for value in rest))
 
+    def where(self, ended: Bool[Tensor, " B"], other: _Iterate) -> _Iterate:
+        """This iterate for the problems that have ended, ``other`` for those that go on."""
+        names = ("beta", "above", "below", "upper", "lower")
+        mask = ended.unsqueeze(-1)
+        return replace(self, **{name: torch.where(mask, getattr(self, name), getattr(other, name)) for name in names})
+
     def residual(self) -> Float[Tensor, "B R"]:
         return self.target - _apply(self.rows, self.beta)
 
@@ -209,15 +217,20 @@ def _interior_point(
     bound, n_iter = torch.zeros_like(floor), torch.zeros_like(floor, dtype=torch.long)
     active = torch.arange(target.shape[0], device=target.device)
     iterate = _Iterate.first(rows, target, floor)
+    every = steps_between_tests(target)
+    ended, end = torch.zeros_like(active, dtype=torch.bool), torch.zeros_like(active)
     for iteration in range(max_iter + 1):
-        done = iterate.finished(tol) | (iteration == max_iter)
-        if done.any():
-            at, last = active[done], iterate.select(done)
-            solution[at], bound[at], n_iter[at] = last.beta, last.bound(), iteration
-            active, iterate = active[~done], iterate.select(~done)
-            if active.numel() == 0:
-                break
-        iterate = iterate.advance()
+        done = ended | iterate.finished(tol) | (iteration == max_iter)
+        end, ended = torch.where(done & ~ended, iteration, end), done
+        if iteration % every == 0 or iteration == max_iter:
+            left = (~done).nonzero().squeeze(-1)
+            if len(left) < len(active):
+                # those that go on are written again when they end
+                solution[active], bound[active], n_iter[active] = iterate.beta, iterate.bound(), end
+                active, iterate, ended, end = active[left], iterate.select(left), ended[left], end[left]
+                if len(left) == 0:
+                    break
+        iterate = iterate.advance() if every == 1 else iterate.where(ended, iterate.advance())
     return solution, bound, n_iter
 
 
@@ -255,5 +268,4 @@ def _solve_through(
 ) -> Float[Tensor, "B n"]:
     """Coefficients that fit the chosen rows exactly."""
     matrix = rows.expand(target.shape[0], -1, -1).gather(-2, chosen.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
-    solution: Tensor = torch.linalg.solve(matrix, target.gather(-1, chosen))
-    return solution
+    return solve(matrix, target.gather(-1, chosen).unsqueeze(-1)).squeeze(-1)

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import at_once, side_by_side
+from mkc_torch._support.small_factors import solve
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -137,7 +139,7 @@ class LeastEntropyLike(LinearEstimator):
         away = (starts - least_squares.unsqueeze(1)) / -length[:, None, None]
         directions = torch.cat([away, torch.ones_like(away[..., :1])], dim=-1)
         per_problem = problem.Y[0].numel() * (n + 1) * (n + 4) // 2
-        parts = torch.arange(starts.shape[0], device=starts.device).split(max(1, _CHUNK // per_problem))
+        parts = torch.arange(starts.shape[0], device=starts.device).split(at_once(starts, per_problem, _CHUNK))
         found = [self._descend(problem.select(part), remainder[part], directions[part]) for part in parts]
         minima = Minima(
             torch.cat([f.point for f in found]),
@@ -201,7 +203,7 @@ class LeastEntropyLike(LinearEstimator):
             coef = orthogonal_starts(first)
         else:
             coef = orthogonal_starts(_coefficients(problem, least_squares.unsqueeze(1)).squeeze(1))
-        return torch.linalg.solve(problem.to_coef, coef.mT).mT
+        return solve(problem.to_coef, coef.mT).mT
 
 
 def _least_squares(problem: LinearProblem) -> Float[Tensor, "B n"]:
@@ -256,6 +258,7 @@ class _Directions:
 
     def __init__(self, problem: LinearProblem, remainder: Float[Tensor, "B N m"], descents: int) -> None:
         self.descents = descents
+        self._index: Tensor | None = None
         B, m = problem.Y.shape[0], problem.num_channels
         # samples last, where sums over them are fastest
         columns = torch.cat([problem.basis.permute(0, 2, 3, 1).expand(B, -1, -1, -1), remainder.mT.unsqueeze(2)], dim=2)
@@ -280,12 +283,15 @@ class _Directions:
         """H with gradient and Hessian at directions ``c`` of the descents ``index``."""
         if self.columns.shape[0] == 1:
             return self._of(c.unsqueeze(0), slice(None))
-        problem = index // self.descents
-        under_way, place = problem.unique(return_inverse=True)
-        place = place * self.descents + index % self.descents
-        # descents that have ended get a copy of an active descent, which is dropped again
-        source = torch.zeros(under_way.shape[0] * self.descents, dtype=torch.long, device=c.device)
-        source[place] = torch.arange(c.shape[0], device=c.device)
+        # the running descents change only when some have ended
+        if self._index is not index:
+            under_way, place = (index // self.descents).unique(return_inverse=True)
+            place = place * self.descents + index % self.descents
+            # descents that have ended get a copy of an active descent, which is dropped again
+            source = torch.zeros(under_way.shape[0] * self.descents, dtype=torch.long, device=c.device)
+            source[place] = torch.arange(c.shape[0], device=c.device)
+            self._index, self._stacks = index, (under_way, place, source)
+        under_way, place, source = self._stacks
         stacks = c[source].unflatten(0, (-1, self.descents))
         return self._of(stacks, under_way).select(place)
 
@@ -302,7 +308,7 @@ class _Directions:
         size = counted.sum(-1, keepdim=True)
         # a channel that is fitted exactly has H = 0 and gradient 0
         unit, present = self.unit[problem], size > 0
-        if not bool(present.all()):
+        if side_by_side(size) or not bool(present.all()):
             unit, size = unit * present, torch.where(present, size, 1.0)
         log_size = size.log()
         log_square = square.clamp_(min=torch.finfo(square.dtype).tiny).log_()

@@ -12,10 +12,12 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.side_by_side import at_once
+from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import elemental_starts
+from mkc_torch.linear._scale_search import elemental_starts, values_of_sets
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, checked_h
 
 if TYPE_CHECKING:
@@ -102,7 +104,7 @@ class LeastMedianOfSquares(LinearEstimator):
             raise ValueError(f"Expected argument `h` between {fewest} and the {N} samples but got {h}.")
         n = problem.num_coefficients
         per_problem = n * max(N * problem.num_channels * _CANDIDATES, (n + 1) * _number_of_sets(problem, self.starts))
-        parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
+        parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(at_once(problem.Y, per_problem, _CHUNK))
         found = [self._minimise(problem.select(part), h) for part in parts]
         beta = torch.cat([f.beta for f in found])
 
@@ -121,13 +123,12 @@ class LeastMedianOfSquares(LinearEstimator):
 
     def _minimise(self, problem: LinearProblem, h: int) -> _Refined:
         rule = QuantileScale(h / problem.num_samples)
-        generator = torch.Generator().manual_seed(self.seed)
         if problem.num_channels > 1:
-            starts = elemental_starts(problem, self.starts, generator)
+            starts = elemental_starts(problem, self.starts, self.seed)
         elif h == problem.num_samples:
             starts = problem.weighted_fit(torch.ones_like(problem.Y)).unsqueeze(1)
         else:
-            starts = _level_starts(problem, self.starts, generator)
+            starts = _level_starts(problem, self.starts, self.seed)
         return _refine(problem, rule, _best(problem, rule, starts))
 
 
@@ -154,26 +155,17 @@ def _number_of_sets(problem: LinearProblem, starts: int) -> int:
     return math.comb(problem.num_samples, problem.num_coefficients + 1) if _few_sets(problem) else starts
 
 
-def _level_starts(problem: LinearProblem, count: int, generator: torch.Generator) -> Float[Tensor, "B S n"]:
+def _level_starts(problem: LinearProblem, count: int, seed: int) -> Float[Tensor, "B S n"]:
     """Least squares, and Chebyshev fits of sets of n + 1 values: all if they are few, else ``count`` random sets."""
     N, n = problem.num_samples, problem.num_coefficients
     least_squares = problem.weighted_fit(torch.ones_like(problem.Y)).unsqueeze(1)
     if n + 1 > N:
         return least_squares
-    device = problem.Y.device
     if _few_sets(problem):
-        index = torch.tensor(list(itertools.combinations(range(N), n + 1)), device=device)
+        index = torch.tensor(list(itertools.combinations(range(N), n + 1)), device=problem.Y.device)
+        chosen, target = problem.basis[:, :, 0][:, index], problem.Y[..., 0][:, index]
     else:
-        keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(device)
-        index = keys.topk(n + 1, dim=-1).indices
-        if problem.sample_weight is not None:
-            # samples of weight 0 are excluded
-            used = (problem.sample_weight > 0)[..., 0].unsqueeze(1)
-            index = torch.where(used, keys, -1.0).topk(n + 1, dim=-1).indices
-    rows, y = problem.basis[:, :, 0], problem.Y[..., 0]
-    batch = torch.arange(y.shape[0], device=device).view(-1, 1, 1)
-    chosen = rows[:, index] if index.dim() == 2 else rows.expand(y.shape[0], -1, -1)[batch, index]
-    target = y[:, index] if index.dim() == 2 else y[batch, index]
+        chosen, target = values_of_sets(problem, count, n + 1, seed)
     level = equal_heights(chosen, target)
     usable = torch.isfinite(level).all(-1, keepdim=True)
     return torch.cat([torch.where(usable, level, least_squares), least_squares], 1)
@@ -186,7 +178,7 @@ def _log_product(scale: Tensor) -> Tensor:
 def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S n"]) -> Float[Tensor, "B K n"]:
     """The candidates with the smallest objective, evaluated in parts that fit in memory."""
     values = problem.Y[0].numel() * problem.Y.shape[0]
-    parts = beta.split(max(1, _CHUNK // values), 1)
+    parts = beta.split(at_once(beta, values, _CHUNK), 1)
     objective = torch.cat([_log_product(rule.scale(problem, problem.residual(part))) for part in parts], 1)
     order = objective.topk(min(_CANDIDATES, beta.shape[1]), dim=1, largest=False).indices
     return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
@@ -236,6 +228,6 @@ def _determined(rows: Float[Tensor, "#B R n"], used: Tensor) -> Tensor:
     count = used.to(rows.dtype)
     outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
     gram = torch.matmul(count, outer[0] if outer.shape[0] == 1 else outer).unflatten(-1, (rows.shape[-1],) * 2)
-    values = torch.linalg.eigvalsh(gram)
+    values, _ = symmetric_eigen(gram)
     full: Tensor = values[..., 0] > 1e2 * torch.finfo(rows.dtype).eps * values[..., -1]
     return full & (count.sum(-1) > rows.shape[-1])

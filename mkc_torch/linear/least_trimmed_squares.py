@@ -14,6 +14,8 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.side_by_side import at_once, steps_between_tests
+from mkc_torch._support.small_factors import symmetric_pinv
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, coefficients_a_value
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -299,7 +301,7 @@ def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Te
     mask = torch.zeros(choice.shape[0], N, dtype=problem.Y.dtype, device=problem.Y.device).scatter_(1, choice, 1.0)
     per_problem = mask.shape[0] * max(N, n * n)
     best = []
-    for part in torch.arange(problem.Y.shape[0], device=choice.device).split(max(1, _CHUNK // per_problem)):
+    for part in torch.arange(problem.Y.shape[0], device=choice.device).split(at_once(problem.Y, per_problem, _CHUNK)):
         some = problem.select(part)
         beta = some.weighted_fit(mask.unsqueeze(-1).expand(part.shape[0], -1, -1, -1))
         first = rule.scale(some, some.residual(beta)).squeeze(-1).argmin(1)
@@ -310,7 +312,7 @@ def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Te
 def _exchange(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -> Float[Tensor, "B n"]:
     """Exchange a used sample for an unused one while the sum of squares after the refit falls."""
     N = problem.num_samples
-    parts = torch.arange(beta.shape[0], device=beta.device).split(max(1, _CHUNK // (N * N)))
+    parts = torch.arange(beta.shape[0], device=beta.device).split(at_once(beta, N * N, _CHUNK))
     return torch.cat([_exchange_part(problem.select(part), beta[part], h) for part in parts])
 
 
@@ -322,13 +324,21 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
     keep = torch.zeros_like(problem.Y[..., 0], dtype=torch.bool).scatter(1, first, True)
     magnitude = problem.Y.square().sum((-2, -1))
     active = torch.arange(beta.shape[0], device=beta.device)
-    while active.numel() > 0:
-        some = problem.select(active)
+    falls, some, step, every = torch.ones_like(active, dtype=torch.bool), problem, 0, steps_between_tests(beta)
+    while True:
+        if step % every == 0:
+            left = falls.nonzero().squeeze(-1)
+            if len(left) == 0:
+                break
+            if len(left) < len(active):
+                active = active[left]
+                some, falls = problem.select(active), torch.ones_like(left, dtype=torch.bool)
+        step += 1
         counts = keep[active].to(beta.dtype).unsqueeze(-1)
         gram, _ = some.normal_equations(counts)
         beta[active] = some.weighted_fit(counts)
         error = some.residual(beta[active])[..., 0]
-        inverse = torch.linalg.pinv(gram, hermitian=True)
+        inverse = symmetric_pinv(gram)
         mine = rows if rows.shape[0] == 1 else rows[active]
         leverage = torch.matmul(torch.matmul(mine, inverse), mine.mT)
         own = leverage.diagonal(dim1=-2, dim2=-1)
@@ -340,8 +350,8 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         allowed = keep[active].unsqueeze(-1) & ~keep[active].unsqueeze(-2)
         gain, pair = torch.where(allowed, change, torch.inf).flatten(-2).min(-1)
         total = (counts[..., 0] * error.square()).sum(-1)
-        falls = gain < -(1e3 * eps * total + eps * eps * magnitude[active])
-        active, pair = active[falls], pair[falls]
-        keep[active, pair // N] = False
-        keep[active, pair % N] = True
+        falls = falls & (gain < -(1e3 * eps * total + eps * eps * magnitude[active]))
+        out_of, into_it = (pair // N).unsqueeze(-1), (pair % N).unsqueeze(-1)
+        mask = keep[active].scatter(-1, out_of, False).scatter(-1, into_it, True)
+        keep[active] = torch.where(falls.unsqueeze(-1), mask, keep[active])
     return beta

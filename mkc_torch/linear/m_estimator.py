@@ -13,6 +13,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import m_scale_influence, scores
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -97,6 +98,7 @@ def reweight(
     n_iter = torch.zeros(beta.shape[0], dtype=torch.long, device=beta.device)
     residual = problem.residual(beta)
     root = math.sqrt(problem.num_samples)
+    every = steps_between_tests(beta)
     for step in range(max_iter):
         if next_scale is not None:
             proposal = torch.maximum(next_scale(residual, scale), floor)
@@ -113,7 +115,7 @@ def reweight(
         beta = updated
         residual = problem.residual(beta)
         moving = moving & (change > torch.maximum(tol * root * scale.amin(-1), rounding))
-        if not bool(moving.any()):
+        if (step + 1) % every == 0 and not bool(moving.any()):
             break
     return Reweighted(beta, scale, weight_of(residual / scale.unsqueeze(-2)), n_iter, ~moving)
 

@@ -11,6 +11,8 @@ from torch import Tensor
 from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.side_by_side import at_once
+from mkc_torch._support.small_factors import pinv, symmetric_eigen
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -173,7 +175,7 @@ class MinimumEntropy(LinearEstimator):
         else:
             rows = rows - rows.mean(-3, keepdim=True)
         gram = torch.matmul(rows.flatten(-3, -2).mT, rows.flatten(-3, -2))
-        values, vectors = torch.linalg.eigh(gram)
+        values, vectors = symmetric_eigen(gram)
         # the basis is orthonormal, so a direction without a constant part has eigenvalue 1
         seen = (values > 1e3 * torch.finfo(torch.float32).eps ** 2).to(rows)
         return torch.matmul(vectors * seen.unsqueeze(-2), vectors.mT)
@@ -191,7 +193,7 @@ class MinimumEntropy(LinearEstimator):
             used = (weight > 0).to(rows).unsqueeze(-1)
             level = (used * rows).sum(-3) / used.sum(-3)
         constant = torch.matmul(level, hidden)
-        shift = torch.matmul(torch.linalg.pinv(constant, rtol=1e-6), median.unsqueeze(-1)).squeeze(-1)
+        shift = torch.matmul(pinv(constant, rtol=1e-6), median.unsqueeze(-1)).squeeze(-1)
         return torch.matmul(hidden, shift.unsqueeze(-1)).squeeze(-1)
 
 
@@ -239,7 +241,7 @@ class _Kernel:
     def quadratic(self, beta: Float[Tensor, "K n"], index: Int[Tensor, " K"]) -> Quadratic:
         """Entropy, gradient and Hessian; directions that do not change the entropy get a zero gradient."""
         N = self.problem.num_samples
-        step = max(1, _PAIRS // (N * N))
+        step = at_once(beta, N * N, _PAIRS)
         parts = [
             self._of(self.problem.select(i), self.h[i], beta[j])
             for i, j in zip(index.split(step), torch.arange(len(index), device=index.device).split(step), strict=True)
@@ -310,5 +312,5 @@ def _gauss(u: Tensor) -> Tensor:
 
 def _chunks(r: Float[Tensor, "K N"]) -> list[slice]:
     K, N = r.shape
-    step = max(1, _PAIRS // (K * N))
+    step = at_once(r, K * N, _PAIRS)
     return [slice(first, first + step) for first in range(0, N, step)]

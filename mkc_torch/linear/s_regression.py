@@ -12,6 +12,8 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.side_by_side import steps_between_tests
+from mkc_torch._support.small_factors import symmetric_pinv
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import (
     ScaleInfluence,
@@ -72,7 +74,10 @@ class MScale:
         target = self.breakdown * (total - problem.coefficients_per_channel).clamp(min=1.0)
         tiny = torch.finfo(residual.dtype).tiny
         scale = self._first(problem, residual) if near is None else near
-        for _ in range(self.steps):
+        # off the CPU a test waits for the device, and steps from a near guess need none
+        every = steps_between_tests(residual)
+        steps = self.steps if near is None or every == 1 else min(self.steps, _FROM_NEAR)
+        for step_number in range(steps):
             inner = self._inner(square, scale)
             second = inner.square()
             third = inner * second
@@ -84,11 +89,18 @@ class MScale:
             step = ((total - outside - target) / slope.clamp(min=tiny)).clamp(min=-0.7, max=0.7)
             scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
             # the next error is about the square of this step
-            if bool((step.abs() < 0.5 * torch.finfo(step.dtype).eps ** 0.5).all()):
+            if (
+                (step_number + 1) % every == 0
+                and steps > _FROM_NEAR
+                and bool((step.abs() < 0.5 * torch.finfo(step.dtype).eps ** 0.5).all())
+            ):
                 return scale
         # a scale that collapsed is solved again without the first guess
-        return scale if near is None or self.steps < _EXACT else self._solved(problem, residual, square, None)
+        return scale if near is None or steps < _EXACT else self._solved(problem, residual, square, None)
 
+
+_FROM_NEAR = 8
+"""Newton steps from a near guess off the CPU, each of which doubles the correct digits."""
 
 _EXACT = 30
 """Newton steps that solve for the scale to rounding."""
@@ -243,7 +255,7 @@ def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) 
             * first.unsqueeze(-2)
         )
         curved = problem.normal_equations(at.slope / (at.scale.square() * slope_sum).unsqueeze(-2))[0]
-        inverse = torch.linalg.pinv(curved + (own - cross - cross.mT).sum(1), hermitian=True)
+        inverse = symmetric_pinv(curved + (own - cross - cross.mT).sum(1))
     return -torch.matmul(inverse, first.sum(1).unsqueeze(-1)).squeeze(-1)
 
 

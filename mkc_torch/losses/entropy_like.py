@@ -31,6 +31,7 @@ from mkc_torch._support.arguments import (
     refuse_not_real,
     seems_finite,
 )
+from mkc_torch._support.small_factors import orthonormal_columns
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.density.energy import as_computed
 from mkc_torch.losses._checks import refuse_other_reduction, refuse_other_shapes
@@ -276,9 +277,10 @@ def orthogonal_starts(theta: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch
     nearest = unit.abs().argmax(-1, keepdim=True)
     order = torch.where(axes == nearest, p, axes.expand(theta.shape)).argsort(-1)[..., : p - 1]
     others = torch.eye(p, dtype=theta.dtype, device=theta.device)[order]
-    basis, upper = torch.linalg.qr(torch.cat([unit.unsqueeze(-2), others], dim=-2).mT)
-    sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(theta.dtype)
-    rest = (basis * sign.unsqueeze(-2)).mT[..., 1:, :] * length.unsqueeze(-1)
+    # theta is the first column, unless it is 0
+    first = torch.where(length > 0, unit, (axes == nearest).to(theta))
+    basis = orthonormal_columns(torch.cat([first.unsqueeze(-2), others], dim=-2).mT)
+    rest = basis.mT[..., 1:, :] * length.unsqueeze(-1)
     return torch.cat([theta.unsqueeze(-2), rest], dim=-2)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import pinv, symmetric_eigen, symmetric_pinv
 from mkc_torch.linear.covariance import CovarianceKind, sandwich
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint, kernel_weights
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
@@ -34,9 +35,9 @@ def parameter_covariance(
     held = _active_normals(problem, point, quadratic.gradient, penalty) * size.unsqueeze(-2)
     length = torch.linalg.vector_norm(held, dim=-1, keepdim=True)
     held = held / positive(length)
-    free = eye - torch.matmul(torch.linalg.pinv(held), held)
+    free = eye - torch.matmul(pinv(held), held)
     curvature = free @ curvature @ free + (eye - free)
-    values, vectors = torch.linalg.eigh(curvature)
+    values, vectors = symmetric_eigen(curvature)
     eps = torch.finfo(size.dtype).eps
     blind = values.abs() <= 1e3 * eps * values.abs().amax(-1, keepdim=True)
     unknown = (vectors.square() * blind.unsqueeze(-2)).sum(-1) > 1e-6
@@ -53,7 +54,7 @@ def parameter_covariance(
     covariance = sandwich(curvature, score, used / left.clamp(min=1.0), kind, bandwidth)
     if problem.prior_precision is not None:
         # the prior is a further measurement with its own precision
-        inverse = torch.linalg.pinv(curvature, hermitian=True) @ free
+        inverse = symmetric_pinv(curvature) @ free
         extra = problem.prior_precision * size.unsqueeze(-1) * size.unsqueeze(-2)
         covariance = covariance + inverse @ extra @ inverse.mT
     covariance = free @ covariance @ free * size.unsqueeze(-1) * size.unsqueeze(-2)

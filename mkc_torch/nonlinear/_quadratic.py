@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.small_factors import symmetric_eigenvalues
 from mkc_torch.density.energy import energy_value
 from mkc_torch.nonlinear._problem import TRUST, Problem, ProblemPoint
 
@@ -112,7 +113,7 @@ def model_curvature(quadratic: _Quadratic) -> Tensor:
     own = quadratic.curvature * scale.unsqueeze(-1) * scale.unsqueeze(-2)
     half = torch.linalg.solve_triangular(factor, own, upper=False)
     share = torch.linalg.solve_triangular(factor, half.mT, upper=False).nan_to_num(0.0, 0.0, 0.0)
-    least = torch.linalg.eigvalsh(0.5 * (share + share.mT))[..., 0]
+    least = symmetric_eigenvalues(0.5 * (share + share.mT))[..., 0]
     trusted = (failed == 0) & (least > TRUST)
     return torch.where(trusted[:, None, None], quadratic.curvature, majoriser)
 

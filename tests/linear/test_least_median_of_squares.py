@@ -140,7 +140,7 @@ def test_no_channel_can_improve_without_another():
     X = torch.stack([torch.cat([torch.ones(60, 1).double(), sample(k, 60, 1)], 1) for k in range(2)], -2)
     Y = X.sum(-1) + 0.1 * sample(2, 60, 2) * torch.tensor([1.0, 50.0])
     Y[:20, 0] += 9.0
-    fit = LeastMedianOfSquares(starts=300).fit(X, Y)
+    fit = LeastMedianOfSquares(starts=300, seed=1).fit(X, Y)
 
     def quantiles(coef: Tensor) -> Tensor:
         return (Y - X @ coef).abs().sort(0).values[30]

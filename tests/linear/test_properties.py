@@ -32,6 +32,7 @@ from mkc_torch.linear import (
 from mkc_torch.linear._estimator import LinearEstimator
 
 N, n = 20, 3
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -111,12 +112,12 @@ def sample(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def data(seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+def data(seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device = CPU) -> tuple[Tensor, Tensor]:
     """X with an intercept column, y = X 1 + noise, and every fifth target far off."""
     X = torch.cat([torch.ones(N, 1).double(), sample(seed, N, n - 1)], 1)
     y = X.sum(-1) + 0.1 * sample(seed + 1, N)
     y[::5] += 5.0 + sample(seed + 2, N // 5)
-    return X.to(dtype), y.to(dtype)
+    return X.to(device, dtype), y.to(device, dtype)
 
 
 def close(got: Tensor, expected: Tensor) -> None:
@@ -133,16 +134,16 @@ def scale_of(fit: LinearEstimator) -> Tensor | None:
 
 
 @pytest.mark.parametrize("case", cases("regression"))
-def test_regression_equivariance(case, dtype):
-    X, y = data(dtype=dtype)
-    shift = sample(5, n).to(dtype)
+def test_regression_equivariance(case, dtype, device):
+    X, y = data(dtype=dtype, device=device)
+    shift = sample(5, n).to(device, dtype)
     close(fitted(case, X, y + X @ shift).coef_, fitted(case, X, y).coef_ + shift)
 
 
 @pytest.mark.parametrize("factor", [-2.5, 1e3])
 @pytest.mark.parametrize("case", cases("scale"))
-def test_scale_equivariance(case, factor, dtype):
-    X, y = data(dtype=dtype)
+def test_scale_equivariance(case, factor, dtype, device):
+    X, y = data(dtype=dtype, device=device)
     fit, scaled = fitted(case, X, y), fitted(case, X, factor * y)
     close(scaled.coef_, factor * fit.coef_)
     close(scaled.weights_, fit.weights_)
@@ -151,17 +152,17 @@ def test_scale_equivariance(case, factor, dtype):
 
 
 @pytest.mark.parametrize("case", cases("affine"))
-def test_affine_equivariance(case, dtype):
-    X, y = data(dtype=dtype)
-    A = (sample(6, n, n) * torch.tensor([1e-2, 1.0, 1e2])).to(dtype)
+def test_affine_equivariance(case, dtype, device):
+    X, y = data(dtype=dtype, device=device)
+    A = (sample(6, n, n) * torch.tensor([1e-2, 1.0, 1e2])).to(device, dtype)
     close(A @ fitted(case, X @ A, y).coef_, fitted(case, X, y).coef_)
 
 
 @pytest.mark.parametrize("case", cases("repetition"))
-def test_weight_is_repetition(case, dtype):
-    X, y = data(dtype=dtype)
-    count = 1 + torch.arange(N) % 2
-    weighted = fitted(case, X, y, count.to(dtype))
+def test_weight_is_repetition(case, dtype, device):
+    X, y = data(dtype=dtype, device=device)
+    count = 1 + torch.arange(N, device=device) % 2
+    weighted = fitted(case, X, y, count.to(device, dtype))
     repeated = fitted(case, X.repeat_interleave(count, 0), y.repeat_interleave(count))
     close(weighted.coef_, repeated.coef_)
     if scale_of(weighted) is not None:
@@ -169,17 +170,17 @@ def test_weight_is_repetition(case, dtype):
 
 
 @pytest.mark.parametrize("case", cases("order"))
-def test_the_order_of_the_samples_does_not_matter(case, dtype):
-    X, y = data(dtype=dtype)
-    order = torch.randperm(N, generator=torch.Generator().manual_seed(3))
+def test_the_order_of_the_samples_does_not_matter(case, dtype, device):
+    X, y = data(dtype=dtype, device=device)
+    order = torch.randperm(N, generator=torch.Generator().manual_seed(5)).to(device)
     fit, moved = fitted(case, X, y), fitted(case, X[order], y[order])
     close(moved.coef_, fit.coef_)
     close(moved.weights_, fit.weights_[order])
 
 
 @pytest.mark.parametrize("case", cases("batch"))
-def test_batch_equals_loop(case, dtype):
-    problems = [data(10 * s, dtype) for s in range(4)]
+def test_batch_equals_loop(case, dtype, device):
+    problems = [data(10 * s, dtype, device) for s in range(4)]
     X = torch.stack([p[0] for p in problems]).reshape(2, 2, N, 1, n)
     y = torch.stack([p[1] for p in problems]).reshape(2, 2, N, 1)
     together = case.make(N).fit(X, y)
@@ -190,9 +191,9 @@ def test_batch_equals_loop(case, dtype):
 
 
 @pytest.mark.parametrize("case", cases("exact"))
-def test_an_exact_fit_is_found(case, dtype):
-    X, _ = data(dtype=dtype)
-    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype)
+def test_an_exact_fit_is_found(case, dtype, device):
+    X, _ = data(dtype=dtype, device=device)
+    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype, device=device)
     fit = fitted(case, X, X @ coef)
     torch.testing.assert_close(fit.coef_, coef, rtol=0, atol=1e4 * torch.finfo(dtype).eps)
     assert bool(torch.isfinite(fit.weights_).all())
@@ -201,27 +202,27 @@ def test_an_exact_fit_is_found(case, dtype):
 
 
 @pytest.mark.parametrize("case", cases("exact", robust=True))
-def test_the_exact_fit_of_seventy_per_cent_is_found(case, dtype):
-    X, _ = data(dtype=dtype)
-    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype)
+def test_the_exact_fit_of_seventy_per_cent_is_found(case, dtype, device):
+    X, _ = data(dtype=dtype, device=device)
+    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype, device=device)
     y = X @ coef
-    y[:6] += 5.0 + sample(9, 6).to(dtype)
+    y[:6] += 5.0 + sample(9, 6).to(device, dtype)
     fit = fitted(case, X, y)
     torch.testing.assert_close(fit.coef_, coef, rtol=0, atol=1e5 * torch.finfo(dtype).eps)
     assert bool(torch.isfinite(fit.weights_).all())
 
 
 @pytest.mark.parametrize("case", cases("zero"))
-def test_targets_of_zero_give_coefficients_of_zero(case, dtype):
-    fit = fitted(case, data(dtype=dtype)[0], torch.zeros(N, dtype=dtype))
+def test_targets_of_zero_give_coefficients_of_zero(case, dtype, device):
+    fit = fitted(case, data(dtype=dtype, device=device)[0], torch.zeros(N, dtype=dtype, device=device))
     assert fit.coef_.tolist() == [0.0] * n
     assert bool(torch.isfinite(fit.weights_).all())
 
 
 @pytest.mark.parametrize("case", cases("channels"))
-def test_channels_share_the_coefficients(case):
-    X = torch.stack([data(0)[0], 2.0 * data(20)[0]], -2)
-    Y = X.sum(-1) + 0.1 * sample(30, N, 2)
+def test_channels_share_the_coefficients(case, device):
+    X = torch.stack([data(0, device=device)[0], 2.0 * data(20, device=device)[0]], -2)
+    Y = X.sum(-1) + 0.1 * sample(30, N, 2).to(device)
     Y[::5, 0] += 5.0
     fit = case.make(N).fit(X, Y)
     assert fit.coef_.shape == (n,)
@@ -231,16 +232,16 @@ def test_channels_share_the_coefficients(case):
 
 
 @pytest.mark.parametrize("case", cases("dtype"))
-def test_float32_stays_float32_and_agrees_with_float64(case):
-    X, y = data()
+def test_float32_stays_float32_and_agrees_with_float64(case, device):
+    X, y = data(device=device)
     fit = fitted(case, X.float(), y.float())
     assert fit.coef_.dtype == fit.weights_.dtype == torch.float32
     torch.testing.assert_close(fit.coef_.double(), fitted(case, X, y).coef_, rtol=5e-3, atol=5e-3)
 
 
 @pytest.mark.parametrize("case", cases("rank"))
-def test_what_cannot_be_fitted_is_refused(case):
-    X, y = data()
+def test_what_cannot_be_fitted_is_refused(case, device):
+    X, y = data(device=device)
     estimator = case.make(N)
     bad = y.clone()
     bad[3] = float("nan")

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.side_by_side import steps_between_tests
+from mkc_torch._support.small_factors import definite_inverse
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
 from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
 from mkc_torch.density.normalizer import _log_partition_and_slopes
@@ -124,6 +126,7 @@ def stationary(problem: LinearProblem, fit_state: FitState) -> _StationaryPoint:
     point = Unknowns(fit_state.beta, fit_state.kappa, fit_state.log_d)
     rounding = (10 * eps * problem.Y.abs().amax((-2, -1)) / unit.squeeze(-1)).square()
     before = rounding.new_full((size,), torch.inf)
+    every = steps_between_tests(unit)
     for step in range(_POLISHING_STEPS + 1):
         gradient = data.gradient(point.beta, point.kappa, point.log_d)
         hessian, head = _hessian(problem, data, point)
@@ -134,7 +137,7 @@ def stationary(problem: LinearProblem, fit_state: FitState) -> _StationaryPoint:
         gain = -(move * gradient).sum(-1)
         near = gain <= eps * head + rounding
         done = ~strict | (near & ((gain <= (1e4 * eps) ** 2 * head) | (gain >= 0.25 * before)))
-        if bool(done.all()) or step == _POLISHING_STEPS:
+        if step == _POLISHING_STEPS or (step % every == 0 and bool(done.all())):
             break
         point, before = moved(fit_state, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
     cause = torch.where(
@@ -210,12 +213,8 @@ def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"]
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     root = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     outer = root.unsqueeze(-1) * root.unsqueeze(-2)
-    factor, info = torch.linalg.cholesky_ex(outer * hessian)
-    pivots = factor.diagonal(dim1=-2, dim2=-1).square().amin(-1)
-    strict = (info == 0) & (pivots > 1e2 * hessian.shape[-1] * torch.finfo(hessian.dtype).eps)
-    safe = torch.where(strict[:, None, None], factor, torch.eye(factor.shape[-1]).to(factor))
-    inverse = outer * torch.cholesky_inverse(safe)
-    return torch.where(both & strict[:, None, None], inverse, 0.0), strict
+    inverse, strict = definite_inverse(outer * hessian)
+    return torch.where(both & strict[:, None, None], outer * inverse, 0.0), strict
 
 
 def moved(fit_state: FitState, point: Unknowns, move: Float[Tensor, "B p"], unit: Tensor, m: int) -> Unknowns:

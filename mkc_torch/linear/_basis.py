@@ -1,0 +1,98 @@
+"""An orthonormal basis of the columns of X, and the test of their rank."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.side_by_side import side_by_side
+from mkc_torch._support.small_factors import LARGEST, orthonormalising
+from mkc_torch.linear._rank import rank_tolerance
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class RankDeficientError(ValueError):
+    """The columns of X are linearly dependent, so that the coefficients are not determined."""
+
+
+def orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Basis, and the matrix that maps its coefficients to those of the columns of X, on the samples in use."""
+    rows = X.flatten(-3, -2)
+    used = rows
+    if weight is not None and rows.shape[0] == weight.shape[:-2].numel():
+        used = rows * (weight > 0).reshape(rows.shape[0], -1, 1)
+    scale = used.abs().amax(-2)
+    scaled = used / torch.where(scale > 0, scale, 1.0).unsqueeze(-2)
+    if not side_by_side(X) or X.shape[-1] > LARGEST:
+        inverse = _inverse_triangle(scaled, scale)
+    else:
+        upper, inverse, well = orthonormalising(scaled)
+        if not bool(well.all()):
+            weak = (~well).nonzero().squeeze(-1)
+            own = _inverse_triangle(scaled[weak].cpu(), scale[weak].cpu())
+            inverse = inverse.index_copy(0, weak, own.to(inverse))
+        # sums in float64 lose no rank with the number of rows
+        _refuse_small_ratio(upper[well], inverse[well], min(rows.shape[-2], _MOST_ROWS) * torch.finfo(X.dtype).eps)
+    to_coef = inverse / scale.unsqueeze(-1)
+    basis = torch.matmul(rows.to(to_coef.dtype), to_coef).unflatten(-2, X.shape[-3:-1])
+    return basis.to(X.dtype), to_coef.to(X.dtype)
+
+
+_MOST_ROWS = 1000
+"""Rows beyond which the tolerance of the rank does not grow, where sums are in float64."""
+
+
+def _inverse_triangle(rows: Float[Tensor, "B K n"], scale: Float[Tensor, "B n"]) -> Float[Tensor, "B n n"]:
+    """Inverse of the R of rows divided by ``scale``; refuses dependent columns."""
+    upper = torch.linalg.qr(rows).R
+    return refuse_dependent(upper, scale, rows.shape[-2])
+
+
+def refuse_dependent(
+    upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*batch n"], num_rows: int
+) -> Float[Tensor, "*batch n n"]:
+    """Return the inverse of the R of a QR decomposition; refuse linearly dependent columns.
+
+    Args:
+        upper: R of the columns divided by ``scale``.
+        scale: scale of each column; 0 for a column that is 0 on every row.
+        num_rows: number of rows.
+
+    Raises:
+        RankDeficientError: columns are dependent, or a column is 0.
+    """
+    if (scale == 0).any():
+        column = int((scale == 0).nonzero()[0, -1])
+        raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
+    k, n = upper.shape[-2:]
+    tolerance = rank_tolerance(num_rows, n, upper.dtype)
+    # with fewer rows than columns there is no inverse
+    inverse = torch.linalg.inv_ex(upper).inverse if k == n else upper.new_full((*upper.shape[:-2], n, n), torch.inf)
+    _refuse_small_ratio(upper, inverse, tolerance)
+    return inverse
+
+
+def _refuse_small_ratio(upper: Tensor, inverse: Tensor, tolerance: float) -> None:
+    """Refuse an R whose smallest singular value is at most ``tolerance`` times its largest."""
+    # the product of the Frobenius norms is an upper bound of the condition number, and cheap
+    bound = torch.linalg.vector_norm(upper.detach(), dim=(-2, -1)) * torch.linalg.vector_norm(
+        inverse.detach(), dim=(-2, -1)
+    )
+    unclear = ~(bound * tolerance < 1.0)
+    if not bool(unclear.any()):
+        return
+    n = upper.shape[-1]
+    _, singular, right = torch.linalg.svd(upper.detach()[unclear].cpu())
+    # with fewer rows than columns there are fewer singular values than columns
+    ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(singular.shape[:-1])
+    if (ratio <= tolerance).any():
+        worst = right[..., -1, :].reshape(-1, n)[int(ratio.reshape(-1).argmin())]
+        involved = [i for i in range(n) if float(worst[i].abs()) > 0.1 * float(worst.abs().max())]
+        raise RankDeficientError(
+            f"Expected `X` of full column rank but columns {involved} are linearly dependent "
+            f"(singular value ratio {float(ratio.min()):.1e}); remove a column of these."
+        )
