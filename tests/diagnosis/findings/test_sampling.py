@@ -27,7 +27,9 @@ def test_stribeck_friction_is_drawn_to_a_hundredth_of_its_range():
     assert drawn_error(value, torch.linspace(0, 799, 80).long()) > 0.1  # evenly spaced points miss the peak
 
 
-@pytest.mark.parametrize("value", [torch.zeros(800, 2), torch.linspace(0.0, 1.0, 800, dtype=torch.float64).unsqueeze(-1)])
+@pytest.mark.parametrize(
+    "value", [torch.zeros(800, 2), torch.linspace(0.0, 1.0, 800, dtype=torch.float64).unsqueeze(-1)]
+)
 def test_a_line_has_evenly_spaced_points(value):
     chosen = bending_points(value.double(), 80)
     assert int(chosen[0]) == 0
