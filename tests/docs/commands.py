@@ -108,8 +108,8 @@ def commands(line: str) -> list[list[str]]:
     return [part for part in parts if part]
 
 
-def run(words: list[str], folder: Path) -> None:
-    """Run a command in the folder, or its small variant.
+def run(words: list[str], folder: Path) -> str:
+    """Run a command in the folder, or its small variant; returns what `mkc` prints.
 
     Raises:
         AssertionError: the command fails, or is of an unknown kind.
@@ -122,7 +122,7 @@ def run(words: list[str], folder: Path) -> None:
         case ["python", "-m", "pytest", "-q", "-n", "auto"]:
             pass  # .ci/run runs the tests
         case ["mkc", *arguments]:
-            run_mkc(arguments)
+            return run_mkc(arguments)
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
         case ["python", "-m", module, *_] if module.startswith(
@@ -149,10 +149,11 @@ def run(words: list[str], folder: Path) -> None:
             shutil.copy(folder / source, folder / target)
         case _:
             raise AssertionError(f"no case runs `{shlex.join(words)}`")
+    return ""
 
 
-def run_mkc(arguments: list[str]) -> None:
-    """Run the command `mkc` in this process."""
+def run_mkc(arguments: list[str]) -> str:
+    """Run the command `mkc` in this process, and return what it prints."""
     small = SMALL.get(shlex.join(["mkc", *arguments]), "").split()
     result = CliRunner().invoke(app, [*arguments, *small])
     assert result.exit_code == 0, f"mkc {shlex.join(arguments)}:\n{result.output}\n{result.exception!r}"
@@ -160,6 +161,7 @@ def run_mkc(arguments: list[str]) -> None:
         arguments[0] == "challenge" and "--help" not in small
     ):  # a recording that could not be diagnosed only counts against the proof
         assert re.search(r"^failed +none", result.output, re.MULTILINE), result.output
+    return result.stdout
 
 
 def run_example(script: str, arguments: list[str], folder: Path) -> None:
