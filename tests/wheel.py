@@ -66,11 +66,12 @@ def main() -> None:
     parser.add_argument("tests", nargs="*", default=["tests"], help="paths of the sdist")
     options = parser.parse_args()
     wanted = "torch" if options.torch == "newest" else f"torch=={options.torch}"
+    tools = ["build", "twine", "hatchling>=1.24", *([] if options.bare else [wanted])]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         venv.create(place / "env", with_pip=True)
         python = place / "env" / "bin" / "python"
-        if run(python, "-m", "pip", "install", "-q", "build", "twine", "hatchling>=1.24", wanted):
+        if run(python, "-m", "pip", "install", "-q", *tools):
             sys.exit(1)
         if run(python, "-m", "build", "--no-isolation", "--outdir", place / "dist", ROOT):
             sys.exit(1)
