@@ -161,9 +161,12 @@ def filled(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
             lines.append(line)
         elif line and not line.startswith(" "):
             found = (i for i in range(at, len(printed)) if _first_word(printed[i]) == _first_word(line))
-            if (at := next(found, -1)) < 0:
+            if (place := next(found, -1)) < 0:
                 raise ValueError(f"No printed line begins like {line!r}; edit the block by hand.")
-            lines.append(printed[at])
+            if place > at and lines[-1:] != [REST]:
+                lines.append(REST)
+            lines.append(printed[place])
+            at = place
             at += 1
             while at < len(printed) and printed[at].startswith(" "):
                 lines.append(printed[at])

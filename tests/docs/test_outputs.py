@@ -39,5 +39,6 @@ def test_blocks_are_filled_in():
     assert filled(["…", "noise  9 µT", "…"], PRINTED) == ["…", "noise      0.473 µT", "…"]
     two_lines = ["noise  9 µT,", "       white", "rejected   1"]
     assert filled(["noise", "       old", "…"], two_lines) == ["noise  9 µT,", "       white", "…"]
+    assert filled(["offset", "rejected", "…"], PRINTED) == [PRINTED[0], "…", PRINTED[3], "…"]
     with pytest.raises(ValueError, match="begins like 'bias 3'"):
         filled(["…", "bias 3"], PRINTED)
