@@ -16,6 +16,13 @@ _TOGETHER = re.compile(r"^    ((?:\w+, )+\w+):((?:.*\n?)(?:     .*\n?)*)", re.MU
 class Docstrings(griffe.Extension):
     """Bring what this project writes, and editors and people read, into what griffe's style "google" takes."""
 
+    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+        """Called by griffe once a package is read: ``MKCLoss`` comes first on the page of the losses."""
+        losses = pkg.members.get("losses")
+        loss = None if losses is None else losses.members.get("MKCLoss")
+        if isinstance(loss, griffe.Alias):
+            loss.alias_lineno = 0
+
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         """Called by griffe once an object and what is in it are read."""
         if obj.docstring is not None:

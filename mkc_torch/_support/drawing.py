@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-__all__ = ["BLUE", "GREY", "INK", "ORANGE", "PALE", "SHADE", "STYLE", "array", "axes_or_new", "style"]
+__all__ = ["BLUE", "DARK_ORANGE", "GREY", "INK", "ORANGE", "PALE", "SHADE", "STYLE", "array", "axes_or_new", "style"]
 
 # Okabe and Ito's colours, distinguishable with any colour vision
-BLUE, ORANGE, INK, GREY, PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
-SHADE = "#F3D9C6"
+BLUE, ORANGE, INK, GREY = "#0072B2", "#D55E00", "#222222", "#8A8A8A"
+DARK_ORANGE = "#9A4300"
+# translucent, for pages with a light or a dark background
+PALE, SHADE = "#5A708040", "#D55E0038"
 STYLE = {
     "font.family": "sans-serif",
     "font.size": 10.0,
     "axes.edgecolor": GREY,
     "axes.labelcolor": INK,
     "axes.linewidth": 0.7,
+    "text.color": INK,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10.5,

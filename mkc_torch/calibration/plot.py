@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, PALE, SHADE, array, axes_or_new
+from mkc_torch._support.drawing import BLUE, DARK_ORANGE, GREY, INK, ORANGE, PALE, SHADE, array, axes_or_new
 from mkc_torch._words.terms import term
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.calibration.file import Matrix, Vector
@@ -287,8 +287,7 @@ def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
 
     lon, lat = np.meshgrid(np.radians(np.linspace(-180, 180, 121)), np.radians(np.linspace(-90, 90, 61)))
     covered = _covered(lon, lat, directions)
-    ax.set_facecolor("#FFFFFF")
-    palette = ListedColormap(["#F6E3D5", "#CFE3F0"])
+    palette = ListedColormap(["#D55E002C", "#0072B232"])
     ax.pcolormesh(lon, lat, covered, cmap=palette, vmin=0, vmax=1, shading="gouraud", rasterized=True)
     if not covered.all():
         ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["///"])
@@ -310,7 +309,7 @@ def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
             term("picture.gap", axis=nearest_axis(gap.direction).replace("-", "−"), degrees=f"{gap.degrees:.0f}"),
             (float(lon_gap[0]), float(lat_gap[0])),
             xytext=(0, -9), textcoords="offset points", ha="center", va="top",
-            color="#9A4300", weight="bold", bbox=_BOX,
+            color=DARK_ORANGE, weight="bold", bbox=_BOX,
         )  # fmt: skip
     ax.set_xticks([])
     ax.set_yticks([])

@@ -89,10 +89,10 @@ def checked_sample(name: str, value: Data) -> Sample:
         centre = points.median(-2).values
         error = points - centre.unsqueeze(-2)
         scale = error.abs().median(-2).values
-        # half of the values may be equal
+        # if half of the values of a column are equal, their median absolute deviation is 0
         scale = torch.where(scale > 0, scale, error.abs().mean(-2))
         scale = torch.where(scale > 0, scale, 1.0)
-        # far outside the data, and squares stay finite
+        # squares of the standardised values must stay finite
         bound = float(torch.finfo(points.dtype).max) ** 0.2
         standardised = (error / scale.unsqueeze(-2)).clamp(-bound, bound)
         resolution = torch.finfo(X.dtype).eps * (1.0 + (centre.abs() / scale).amax(-1))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX, energy_value
-from mkc_torch.density.energy import energy_terms as energy_terms  # `linear/` imports it from here
+from mkc_torch.density.energy import energy_terms
 from mkc_torch.density.head import head_rule, integrate, tail_density
 from mkc_torch.density.normalizer import log_partition_value
 

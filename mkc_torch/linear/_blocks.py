@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.density.likelihood import Derivatives, energy_terms
+from mkc_torch.density.energy import energy_terms
+from mkc_torch.density.likelihood import Derivatives
 from mkc_torch.linear.summary import LIGHT
 
 if TYPE_CHECKING:

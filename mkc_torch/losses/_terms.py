@@ -41,7 +41,15 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class LossSettings:
-    """Fixed numbers, state and options of a loss."""
+    """Fixed numbers, state and options of a loss.
+
+    Attributes:
+        fixed_kappa, fixed_d: 1/σ² and d where they are not learned, (m,); None where they are.
+        state: scale, bound and schedule of each channel.
+        follows: whether d follows the scale of the residuals.
+        normalize: whether the density term has its log-normaliser.
+        reduction: of the values: "mean", "sum" or "none".
+    """
 
     fixed_kappa: Tensor | None
     fixed_d: Tensor | None

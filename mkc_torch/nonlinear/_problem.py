@@ -1,4 +1,4 @@
-"""A flattened batch of problems, and its state at given parameters."""
+"""A batch of nonlinear problems with one leading dimension, and its residuals and derivatives at given parameters."""
 
 from __future__ import annotations
 
@@ -38,28 +38,40 @@ TANGENTS: dict[str, Callable[[Residual], Residual]] = {
 Constraint = Callable[[Tensor], Tensor]
 
 NONLINEAR = 0.03
-"""Share of a step's effect that the Jacobian did not predict from which a new Jacobian is computed."""
+"""A new Jacobian is computed if the last one mispredicted at least this share of a step's change of the residuals."""
 
 TRUST = 0.1
-"""Least share of the majoriser's curvature, in every direction, at which the objective's curvature is used."""
+"""The objective's curvature is used if it is at least this share of the majoriser's in every direction."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A batch of problems, flattened to B of them."""
+    """B problems: their residual function, data, prior and constraints.
+
+    Attributes:
+        function: parameters (p,), and data if there are any, to residuals (N, m).
+        data: tensors with leading dimension B, or None.
+        batch: the user's batch dimensions, whose product is B.
+        jacobian: a name in ``TANGENTS``.
+        weight, used: weights of the residuals, and which residuals are used; None for all.
+        prior_mean, prior_precision: of the parameters.
+        box: lower and upper bounds of the parameters, (p,) each.
+        equality, inequality: functions of the parameters that are 0, or at most 0.
+        is_inequality: which of the k constraints are inequalities, (k,); None without constraints.
+    """
 
     function: Residual
     data: Any
     batch: torch.Size
     jacobian: str
     weight: Tensor | None = None
-    used: Tensor | None = None  # None: all residuals are used
+    used: Tensor | None = None
     prior_mean: Tensor | None = None
     prior_precision: Tensor | None = None
-    box: tuple[Tensor, Tensor] | None = None  # (p,) each
+    box: tuple[Tensor, Tensor] | None = None
     equality: Constraint | None = None
     inequality: Constraint | None = None
-    is_inequality: Tensor | None = None  # (k,); None: unconstrained
+    is_inequality: Tensor | None = None
 
     def _over_batch(self, function: Callable[..., Tensor], theta: Tensor) -> Tensor:
         arguments = (theta,) if self.data is None else (theta, self.data)
@@ -136,12 +148,17 @@ class Problem:
 
 @dataclass(frozen=True)
 class ProblemPoint:
+    """Residuals, constraints and their derivatives at parameters ``theta``.
+
+    ``stale`` derivatives are those of a nearby point.
+    """
+
     theta: Float[Tensor, "B p"]
     residual: Float[Tensor, "B N m"]
     tangents: Float[Tensor, "B p N*m"]
     constraint: Float[Tensor, "B k"] | None = None
     normals: Float[Tensor, "B k p"] | None = None
-    stale: bool = False  # the derivatives are those of a nearby point
+    stale: bool = False
 
     def moved(self, accept: Tensor, theta: Tensor, residual: Tensor, constraint: Tensor | None) -> ProblemPoint:
         return replace(
@@ -192,8 +209,10 @@ class Descent:
 
 
 def kernel_weights(residual: Tensor, kappa: Tensor, d: Tensor) -> Tensor:
+    """Weights exp(-κ e² / (2 d²)) of the residuals."""
     return torch.exp((-0.5 * kappa / d.square()).unsqueeze(-2) * residual.square())
 
 
 def shaped_jacobian(problem: Problem, point: ProblemPoint) -> Tensor:
+    """The Jacobian in the user's batch dimensions, (*, N, m, p)."""
     return problem.restore(point.tangents.unflatten(-1, point.residual.shape[1:]).movedim(1, -1))

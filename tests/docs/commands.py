@@ -93,8 +93,8 @@ def commands(line: str) -> list[list[str]]:
     return [part for part in parts if part]
 
 
-def run(words: list[str], folder: Path) -> None:
-    """Run a command in the folder, or its small variant.
+def run(words: list[str], folder: Path) -> str:
+    """Run a command in the folder, or its small variant; returns what `mkc` prints.
 
     Raises:
         AssertionError: the command fails, or is of an unknown kind.
@@ -107,7 +107,7 @@ def run(words: list[str], folder: Path) -> None:
         case ["python", "-m", "pytest", "-q", "-n", "auto"]:
             pass  # .ci/run runs the tests
         case ["mkc", *arguments]:
-            run_mkc(arguments)
+            return run_mkc(arguments)
         case ["python", "-m", "examples.blind_proof", *arguments]:
             run_proof(arguments, folder)
         case ["python", "-m", module, *arguments] if module.startswith("examples."):
@@ -138,12 +138,14 @@ def run(words: list[str], folder: Path) -> None:
             shutil.copy(folder / source, folder / target)
         case _:
             raise AssertionError(f"no case runs `{shlex.join(words)}`")
+    return ""
 
 
-def run_mkc(arguments: list[str]) -> None:
-    """Run the command `mkc` in this process."""
+def run_mkc(arguments: list[str]) -> str:
+    """Run the command `mkc` in this process, and return what it prints."""
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, f"mkc {shlex.join(arguments)}:\n{result.output}\n{result.exception!r}"
+    return result.stdout
 
 
 def run_proof(arguments: list[str], folder: Path) -> None:

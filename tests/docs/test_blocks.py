@@ -1,7 +1,5 @@
 """Every fenced block of the README and of the manual runs, in the order of the page."""
 
-from importlib.util import find_spec
-
 import pytest
 
 pytest.importorskip("lightning")
@@ -10,6 +8,7 @@ pytest.importorskip("polars")
 
 from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run
 from tests.docs.files import write_examples
+from tests.docs.outputs import differences, run_page
 from tests.docs.pages import PAGES, ROOT, RUN, SHOWN, blocks
 from tests.simulation.fmu.made import COMPILER
 
@@ -51,22 +50,6 @@ def folder(examples, tmp_path, monkeypatch):
     return tmp_path
 
 
-def run_python(block, names, folder):
-    first, _, _ = block.text.partition("\n")
-    if first.startswith("# ") and first.endswith(".py"):  # "save this as"
-        (folder / first.removeprefix("# ")).write_text(block.text, encoding="utf-8")
-    # the line numbers of a traceback are those of the page
-    code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec")
-    exec(code, names)
-
-
-def run_shell(block, folder):
-    for line in block.text.splitlines():
-        assert not line.endswith("\\"), f"{block}: write a command on one line"
-        for words in commands(line):
-            run(words, folder)
-
-
 @pytest.mark.manual
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.stem)
 def test_every_block_of_a_page_runs(page, folder):
@@ -74,17 +57,12 @@ def test_every_block_of_a_page_runs(page, folder):
         pytest.importorskip(NEEDS[page.stem])
     if page.stem == "own_simulation" and COMPILER is None:
         pytest.skip("there is no compiler of C for its FMU")
-    names = {"__name__": page.stem}
-    for block in blocks(page):
-        print(f"{block}:")  # shown if the block fails
-        if block.needs is not None and find_spec(block.needs) is None:
-            continue  # the next test reports it
-        if block.language == "python":
-            run_python(block, names, folder)
-        elif block.language == "sh":
-            run_shell(block, folder)
+    names, shown = run_page(page, folder)
     found = {name: names[name].findings[0].effect for name in FOUND.get(page.stem, {})}
     assert found == FOUND.get(page.stem, {})
+    for block, printed in shown:
+        wrong = list(differences(block.text.splitlines(), printed))
+        assert not wrong, f"{block}: `python -m tests.docs.outputs` fills in\n" + "\n".join(wrong)
 
 
 @pytest.mark.parametrize("block", OPTIONAL, ids=str)

@@ -70,6 +70,14 @@ def test_errors_with_wrong_labels_equal_those_of_the_page_of_measurements():
     assert list(found.groups()) == [cell.split(" ")[0] for cell in measured]
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_first_figure_is_that_of_the_page_of_measurements(page):
+    times = re.search(r"error is \[?(\d+) times\s+smaller", (ROOT / page).read_text(encoding="utf-8"))[1]
+    text = (ROOT / "docs" / "measured.md").read_text(encoding="utf-8").partition("### The loss in a network")[2]
+    ratio = float(re.search(r"^\| \*\*MKC, as it comes\*\* \| \*\*([\d.]+)\*\*", text, re.MULTILINE)[1])
+    assert int(times) == int(1.0 / ratio)
+
+
 def test_the_table_of_sigma_equals_the_density():
     table = rows(LOSS, "(∞|\\d)")
     assert [row[0] for row in table] == ["∞", "5", "4", "3", "2", "1"]

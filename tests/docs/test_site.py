@@ -1,6 +1,7 @@
 """The manual as a site: it builds without warnings, loads nothing from elsewhere, and documents every public name."""
 
 import importlib
+import json
 import re
 import shutil
 import subprocess
@@ -15,6 +16,8 @@ from tests.docs.pages import PAGES, ROOT
 
 API = ROOT / "docs" / "api"
 ROOMS = re.findall(r"^::: (\S+)\n(?! )", "\n".join(page.read_text(encoding="utf-8") for page in API.glob("*.md")), re.M)
+VERSION = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M)[1]
+DATE = re.search(r"date-released: (\S+)", (ROOT / "CITATION.cff").read_text(encoding="utf-8"))[1]
 LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "object": "data"}
 
 
@@ -81,6 +84,34 @@ def test_every_public_name_is_documented(site):
     names = {f"{room}.{name}" for room in ("mkc_torch", *ROOMS) for name in importlib.import_module(room).__all__}
     assert len(names) > 150
     assert names - ids == set()
+
+
+@pytest.mark.manual
+def test_the_loss_comes_first_in_the_reference(site):
+    page = (site / "api" / "losses.html").read_text(encoding="utf-8")
+    assert re.search(r'<h2 id="([\w.]+)"', page)[1] == "mkc_torch.losses.MKCLoss"
+    names = re.findall(r"^\| \[`(\w+)`\]", (API / "index.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert names[0] == "MKCLoss"
+
+
+@pytest.mark.manual
+def test_every_page_shows_the_version_and_its_date(site):
+    for path in site.rglob("*.html"):
+        assert f"mkc_torch {VERSION}, {DATE}" in path.read_text(encoding="utf-8"), path.name
+
+
+def test_version_and_date_are_the_same_everywhere():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {VERSION}\ndate-released: {DATE}\n" in citation
+    assert f"\n## {VERSION}, {DATE}\n" in (ROOT / "docs" / "changelog.md").read_text(encoding="utf-8")
+    assert f'copyright = "mkc_torch {VERSION}, {DATE}.' in (ROOT / ".zensical.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.manual
+def test_every_page_can_be_searched(site):
+    index = json.loads((site / "search.json").read_text(encoding="utf-8"))
+    found = {item["location"].partition("#")[0] for item in index["items"]}
+    assert {"loss.html", "calibrate.html", "diagnose.html", "api/losses.html"} <= found
 
 
 @pytest.mark.manual

@@ -43,7 +43,7 @@ def test_drag_of_a_light_ball_is_confirmed_by_its_second_drop(loaded, tmp_path):
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
     assert before > 5.0
     assert after < 0.25 * before
-    loaded("held_out").picture(proof, tmp_path / "drop.png", "drop", "m")
+    loaded("held_out").picture(proof, tmp_path / "drop.png", "drop", "height", "m")
     assert (tmp_path / "drop.png").stat().st_size > 10_000
 
 

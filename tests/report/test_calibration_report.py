@@ -17,8 +17,7 @@ from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.density import ChannelTails
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording
-from mkc_torch.report import Comparison, calibration_report, refusal_report
-from mkc_torch.report.calibration import pictures
+from mkc_torch.report import Comparison, calibration_report, panels, refusal_report
 from mkc_torch.report.words import numbers as wording
 from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
 
@@ -76,7 +75,8 @@ def page(calibration, recording):
 
 def test_page_is_well_formed_with_four_pictures_and_unique_ids(page):
     tags = parsed(page)
-    assert page.count("<svg ") == 4
+    assert page.count("<figure") == 4
+    assert page.count("<svg ") == 6 + 2 + 2 + 1  # a panel each
     assert len(tags.ids) == len(set(tags.ids))
 
 
@@ -279,18 +279,18 @@ def test_no_text_of_a_picture_is_cut_at_its_edge_or_covers_another_panel(recordi
     columns = {name: values * (times if name.startswith("mag") else 1.0) for name, values in recording.columns.items()}
     counts = Recording(columns, units=dict.fromkeys(("mag_x", "mag_y", "mag_z"), "counts"))
     figures = []
-    monkeypatch.setattr(pictures, "svg", lambda figure, *_: figures.append(figure) or "")
+    monkeypatch.setattr(panels, "svg", lambda figure, *_: figures.append(figure) or "")
     calibration_report(calibrate(counts), counts)
-    assert len(figures) == 4
+    assert len(figures) == 11
     for figure in figures:
         FigureCanvasAgg(figure).draw()
-        panels = [_texts(ax) for ax in figure.axes]
-        for box in itertools.chain(*panels):
+        texts = [_texts(ax) for ax in figure.axes]
+        for box in itertools.chain(*texts):
             assert box.x0 >= -2.0
             assert box.y0 >= -2.0
             assert box.x1 <= figure.bbox.width + 2.0
             assert box.y1 <= figure.bbox.height + 2.0
-        for item, other in itertools.combinations(panels, 2):
+        for item, other in itertools.combinations(texts, 2):
             assert not any(a.overlaps(b) for a in item for b in other)
 
 

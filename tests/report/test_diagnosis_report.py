@@ -56,7 +56,7 @@ def three():
 def test_page_is_well_formed_with_unique_ids(three):
     tags = parsed(three)
     assert len(tags.ids) == len(set(tags.ids))
-    assert three.count("<svg ") == 4
+    assert three.count("<figure") == 4
 
 
 def test_page_loads_nothing(three):
@@ -82,7 +82,7 @@ def test_references_inside_the_pictures_resolve(three):
 def test_every_shape_has_a_page(findings, channels, has_time):
     page = page_of(findings, channels=channels, has_time=has_time, samples=240)
     text = text_of(page)
-    assert page.count("<svg ") == 1 + findings
+    assert page.count("<figure") == 1 + findings
     assert "nan" not in text.lower()
     assert "None" not in text
     for name in CHANNELS[:channels]:
@@ -209,7 +209,7 @@ def test_pages_without_candidates_curves_and_separability():
     empty = Separability((), torch.zeros(0, 0), torch.zeros(0))
     diagnosis = make_diagnosis(1, samples=300, candidates=0, separability=empty, ceiling=None, advice=(), warnings=())
     page = diagnosis_report(first_changed(diagnosis, curve=None))
-    assert page.count("<svg ") == 1
+    assert page.count("<figure") == 1
     text = text_of(page)
     assert "The candidates" not in text
     assert "Separability of the candidates" not in text
@@ -405,7 +405,7 @@ def test_warnings_name_effects_and_set_their_numbers():
     assert "Hard-iron step by load (onset −6.1 s): p = 4 × 10⁻⁵ at (−0.2, +0.9)." in text
 
 
-def test_candidates_are_in_the_order_of_their_bars():
+def test_candidates_are_in_the_order_of_the_search():
     weak = CandidateScore("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
     strong = CandidateScore("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
     never = CandidateScore("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
@@ -415,8 +415,8 @@ def test_candidates_are_in_the_order_of_their_bars():
     assert "penalised gap to the first, nats" in text
     assert "offset dependence (motor_1) 294 24.2 31.5" in text
     assert "not possible" in text
-    assert text.index("offset dependence (motor_1) 294") < text.index("current field (current) 253")
-    assert [bar.candidate for bar in bars((weak, strong, never))] == [strong, weak, never]
+    assert text.index("current field (current) 253") < text.index("offset dependence (motor_1) 294")
+    assert [bar.candidate for bar in bars((weak, strong, never))] == [weak, strong, never]
     assert "Bars: gain of the linearised model" in text
 
 

@@ -42,10 +42,10 @@ document.getElementById("phone").onload = (event) => {{
 }};</script>"""
 
 
-def dumped(folder):
+def dumped(folder, *flags):
     """The frame of a folder as the browser dumps it after its scripts have run."""
     command = [
-        CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--allow-file-access-from-files",
+        CHROMIUM, *FLAGS, *flags, f"--user-data-dir={folder / 'profile'}", "--allow-file-access-from-files",
         "--virtual-time-budget=5000", "--dump-dom", (folder / "frame.html").as_uri(),
     ]  # fmt: skip
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

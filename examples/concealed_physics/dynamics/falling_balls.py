@@ -21,7 +21,9 @@ def main() -> None:
         errors.append((before, after))
         print(f"{case.name:20s} {finding_text(proof.diagnosis):60s} other drop {before:6.2f} -> {after:5.2f} m")
         if options.output and case.name == "Whiffle_Ball_1":
-            picture(proof, options.output, "A whiffle ball's second drop, predicted from its first second", "m")
+            picture(
+                proof, options.output, "A whiffle ball's second drop, predicted from its first second", "height", "m"
+            )
     before, after = torch.tensor(errors).mean(0).tolist()
     print(f"mean over {len(errors)} balls: {before:.2f} -> {after:.2f} m")
 

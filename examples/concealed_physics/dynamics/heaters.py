@@ -16,7 +16,7 @@ def main() -> None:
     before, after = proof.root_mean_square()
     print(f"{finding_text(proof.diagnosis)}\nother run: {before:.2f} -> {after:.2f} °C")
     if options.output:
-        picture(proof, options.output, "The other run of the heaters, first sensor", "°C")
+        picture(proof, options.output, "The other run of the heaters, first sensor", "temperature", "°C")
 
 
 if __name__ == "__main__":

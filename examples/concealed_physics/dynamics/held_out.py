@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from PIL import Image
 
 from mkc_torch import Diagnosis, Recording, diagnose
 from mkc_torch.simulation import Dynamics
@@ -65,22 +67,29 @@ def finding_text(diagnosis: Diagnosis) -> str:
     return "; then ".join(parts)
 
 
-def picture(proof: Proof, path: Path, title: str, unit: str, rows: slice = slice(None)) -> None:
-    """Unseen runs as measured and as simulated, and the errors of both simulations."""
+def picture(proof: Proof, path: Path, title: str, quantity: str, unit: str, rows: slice = slice(None)) -> None:
+    """Unseen runs as measured and as simulated, and the errors of both simulations, over time if it is one run."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
-    x = torch.arange(len(proof.time))[rows]
-    above.plot(x, proof.measured[rows, 0], color="black", linewidth=2.0, label="measured, not seen by the fit")
-    above.plot(x, proof.before[rows, 0], color="tab:red", label="the simulation")
-    above.plot(x, proof.after[rows, 0], color="tab:blue", label="with what was found")
-    above.set_ylabel(unit)
+    time = proof.time[rows]
+    one_run = bool((time.diff() > 0).all())
+    x = time if one_run else torch.arange(len(time))
+    measured, before, after = (series[rows, 0] for series in (proof.measured, proof.before, proof.after))
+    above.plot(x, measured, color="black", linewidth=2.0, label="measured, not used in the fit")
+    above.plot(x, before, color="#D55E00", label="simulation")
+    above.plot(x, after, color="#0072B2", label="simulation with the findings")
+    above.set_ylabel(f"{quantity} ({unit})")
     above.set_title(title)
     above.legend(loc="best")
-    below.plot(x, (proof.measured - proof.before)[rows, 0], color="tab:red")
-    below.plot(x, (proof.measured - proof.after)[rows, 0], color="tab:blue")
-    below.set_ylabel(f"error, {unit}")
-    below.set_xlabel("sample")
-    figure.savefig(path, dpi=110)
+    below.axhline(0.0, color="black", linewidth=0.6)
+    below.plot(x, measured - before, color="#D55E00")
+    below.plot(x, measured - after, color="#0072B2")
+    below.set_ylabel(f"error ({unit})")
+    below.set_xlabel("time (s)" if one_run else "sample of the joined runs")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110)
     plt.close(figure)
+    # few colours halve the file
+    Image.open(buffer).convert("P", palette=Image.Palette.ADAPTIVE, colors=48).save(path, optimize=True)
 
 
 def arguments(description: str) -> argparse.Namespace:

@@ -17,7 +17,7 @@ def main() -> None:
     before, after = proof.mean_absolute()
     print(f"{finding_text(proof.diagnosis)}\nopen loop at the other gains: {before:.3f} -> {after:.3f} rad")
     if options.output:
-        picture(proof, options.output, "The first runs at a gain that the fit has not seen", "rad", slice(0, 400))
+        picture(proof, options.output, "The first runs at another gain", "angle", "rad", slice(0, 400))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ def main() -> None:
         before, after = proof.root_mean_square(proof.time - proof.time[0] > case.scored_from)
         print(f"free run on {len(proof.time)} samples of the {name}: {1e3 * before:.2f} -> {1e3 * after:.3f} mV")
     if options.output:
-        picture(proofs[0], options.output, "Free run on a multisine that the fit has not seen", "V", slice(1000, 1200))
+        picture(proofs[0], options.output, "Open loop on another multisine", "voltage", "V", slice(1000, 1200))
 
 
 if __name__ == "__main__":

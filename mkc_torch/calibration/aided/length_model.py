@@ -1,4 +1,4 @@
-"""The sensor model for unrecorded turns: it uses the length and the inclination of the place's field."""
+"""A magnetometer whose turns were not recorded: its fit uses length and inclination of the field at a known place."""
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.experiment_design import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
+from mkc_torch.diagnosis.findings.sampling import FINE_POINTS, drawn_points
 from mkc_torch.diagnosis.findings.shape import formulas
 from mkc_torch.diagnosis.model.shapes import reach_of
 from mkc_torch.diagnosis.model.term import Term
@@ -126,9 +127,6 @@ _MOST_GAIN = 0.9
 
 _CONCENTRATED = 0.35
 """Largest share of best blocks for which the gain counts as concentrated."""
-
-_POINTS = 80
-"""Number of points of a curve."""
 
 _NORMAL_95 = 1.959964
 """Half-width of a 95 % interval in standard errors."""
@@ -332,35 +330,38 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
     slope = torch.func.jacfwd(change)(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
     channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
-    return Curve(driver, unit, x, change(gamma), _NORMAL_95 * variance.sqrt(), channels, value_unit)
+    value = change(gamma).detach()
+    # formulas are fitted to evenly spaced points of a free curve
+    kept = drawn_points(value, evenly=term.effect.is_curve or driver == "time")
+    return Curve(driver, unit, x[kept], value[kept], _NORMAL_95 * variance.sqrt()[kept], channels, value_unit)
 
 
 def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
     if context.parts and term.driver is None:
         return _along_part(term, context)
-    flat = context.signal.median(0).values.expand(_POINTS, -1)
+    flat = context.signal.median(0).values.expand(FINE_POINTS, -1)
     if term.driver is not None:
         values = context.drivers
         if values.shape[1] == 1:
-            x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
+            x = torch.linspace(float(values.min()), float(values.max()), FINE_POINTS, dtype=values.dtype)
             drivers, name, unit = x.unsqueeze(-1), term.columns[0], term.driver.units[0]
             shown = x + term.driver.reference
         else:
             direction = torch.linalg.svd(values - values.mean(0), full_matrices=False).Vh[0]
             along = values @ direction
-            x = torch.linspace(float(along.min()), float(along.max()), _POINTS, dtype=values.dtype)
+            x = torch.linspace(float(along.min()), float(along.max()), FINE_POINTS, dtype=values.dtype)
             drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
             name = f"{term.columns[0].rpartition('_')[0]}, main direction"
-        time = torch.arange(_POINTS, dtype=values.dtype)
+        time = torch.arange(FINE_POINTS, dtype=values.dtype)
         return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
     if term.effect.follows_signal:
         reach = float(context.signal.abs().max())
-        x = torch.linspace(-reach, reach, _POINTS, dtype=context.signal.dtype)
+        x = torch.linspace(-reach, reach, FINE_POINTS, dtype=context.signal.dtype)
         signal = x.unsqueeze(-1).expand(-1, context.signal.shape[1])
-        time = torch.arange(_POINTS, dtype=x.dtype)
-        none = context.drivers.new_zeros(_POINTS, 0)
+        time = torch.arange(FINE_POINTS, dtype=x.dtype)
+        none = context.drivers.new_zeros(FINE_POINTS, 0)
         return "field on the axis", context.signal_unit, x, replace(context, time=time, signal=signal, drivers=none)
-    index = torch.linspace(0, len(context.time) - 1, 4 * _POINTS).long()
+    index = torch.linspace(0, len(context.time) - 1, FINE_POINTS).long()
     time, signal = context.time[index], context.signal[index]
     none = context.drivers.new_zeros(len(index), 0)
     return "time", "s", time, replace(context, time=time, drivers=none, signal=signal)
@@ -373,11 +374,11 @@ def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context
         return None
     name = context.parts[part]
     values = context.component(name)
-    x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
-    signal = context.signal.median(0).values.expand(_POINTS, -1).clone()
+    x = torch.linspace(float(values.min()), float(values.max()), FINE_POINTS, dtype=values.dtype)
+    signal = context.signal.median(0).values.expand(FINE_POINTS, -1).clone()
     signal[:, (context.carries or context.channels).index(name)] = x
-    time = torch.arange(_POINTS, dtype=x.dtype)
-    synthetic = replace(context, time=time, signal=signal, drivers=context.drivers.new_zeros(_POINTS, 0))
+    time = torch.arange(FINE_POINTS, dtype=x.dtype)
+    synthetic = replace(context, time=time, signal=signal, drivers=context.drivers.new_zeros(FINE_POINTS, 0))
     return name, context.unit_of(part), x, synthetic
 
 

@@ -11,7 +11,16 @@ from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import CandidateScore, Finding, Separability, Traces
-from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, draw_map, named, of_time, short
+from mkc_torch.diagnosis.plot.curves import (
+    MOST_LETTERS,
+    draw_course,
+    draw_curve,
+    draw_map,
+    named,
+    of_time,
+    short,
+    units_of_outputs,
+)
 from mkc_torch.diagnosis.plot.residual import (
     MOMENTS,
     acting_channels,
@@ -19,6 +28,7 @@ from mkc_torch.diagnosis.plot.residual import (
     draw_residual,
     mark_findings,
     of_channel,
+    unit_of_channel,
 )
 from mkc_torch.effects import words_of
 
@@ -80,7 +90,7 @@ class DiagnosisPlot:
             raise ValueError("Expected argument `corrected` to be False: the diagnosis has no findings.")
         ax = axes_or_new(ax)
         mark_findings(ax, self._findings)
-        draw_residual(ax, t, array(t.time), which, after=after)
+        draw_residual(ax, t, array(t.time), which, unit_of_channel(t, self._environment, which), after=after)
         floor = [fit.noise_floor for fit in self._environment.goodness_of_fit if fit.output == t.channels[which]]
         draw_floor(ax, floor[0] if floor else None)
         ax.set_title(of_channel(MOMENTS[after] if self._findings else "label.residual", t.channels[which]))
@@ -120,7 +130,8 @@ class DiagnosisPlot:
             )
         which = acting_channels(t, found)[0] if channel is None else self._channel(channel)
         ax = axes_or_new(ax)
-        draw_residual(ax, t, array(t.drivers[name]), which, after=corrected)
+        unit = unit_of_channel(t, self._environment, which)
+        draw_residual(ax, t, array(t.drivers[name]), which, unit, after=corrected)
         ax.set_title(of_channel(MOMENTS[corrected], t.channels[which]))
         ax.set_xlabel(named(name, t.driver_units.get(name, "")))
         return ax
@@ -151,7 +162,7 @@ class DiagnosisPlot:
         if found.map is None:
             raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no map over two states.")
         ax = axes_or_new(ax)
-        draw_map(ax, found.map)
+        draw_map(ax, found.map, units_of_outputs(self._environment))
         return ax
 
     def held_out(self, ax: Any = None) -> Any:
@@ -174,7 +185,7 @@ class DiagnosisPlot:
         return ax
 
     def candidates(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
-        """Draw the gains of the leading candidates, in nats; findings are orange.
+        """Draw the gains of the leading candidates, in nats, in the order of the search; findings are orange.
 
         Args:
             most: maximum number of candidates.
@@ -187,7 +198,7 @@ class DiagnosisPlot:
             raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; the report shows 12.")
         if not self._candidates:
             raise ValueError("There are no candidates to draw.")
-        shown = sorted(self._candidates[:most], key=lambda candidate: -candidate.log_likelihood_gain)
+        shown = self._candidates[:most]
         found = {(finding.effect, finding.drivers) for finding in self._findings}
         ax = axes_or_new(ax)
         for row, candidate in enumerate(shown):

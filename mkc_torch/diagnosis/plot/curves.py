@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,20 @@ from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, array
 from mkc_torch._support.unit_text import tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
-from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate
+from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, NoiseEnvironment
 from mkc_torch.diagnosis.parts import StateMap
 
-__all__ = ["CURVE_COLORS", "MOST_LETTERS", "draw_course", "draw_curve", "draw_map", "named", "of_time", "short"]
+__all__ = [
+    "CURVE_COLORS",
+    "MOST_LETTERS",
+    "draw_course",
+    "draw_curve",
+    "draw_map",
+    "named",
+    "of_time",
+    "short",
+    "units_of_outputs",
+]
 
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 MOST_LETTERS = 26
@@ -70,8 +81,16 @@ def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.insert(values, apart, np.nan)
 
 
-def draw_map(ax: Any, found: StateMap, colorbar_axes: Any = None) -> None:
-    """Draw gains and losses in nats over two states, with a colour bar on ``colorbar_axes`` or next to the map."""
+def units_of_outputs(environment: NoiseEnvironment) -> dict[str, str]:
+    """Return the known units of outputs, by name."""
+    return {fit.output: tidy(fit.unit) for fit in environment.goodness_of_fit if fit.unit}
+
+
+def draw_map(ax: Any, found: StateMap, units: Mapping[str, str], colorbar_axes: Any = None) -> None:
+    """Draw gains and losses in nats over two states, with a colour bar on ``colorbar_axes`` or next to the map.
+
+    ``units`` are those of outputs, for states that are measured.
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
     # figures are transparent, so a background colour would be lost
@@ -82,13 +101,23 @@ def draw_map(ax: Any, found: StateMap, colorbar_axes: Any = None) -> None:
     x, y = (array(edge) for edge in found.edges)
     drawn = ax.pcolormesh(x, y, shown.T, cmap=gain, vmin=-limit, vmax=limit, rasterized=True)
     for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
-        axis.set_label_text(named(name, unit))
+        axis.set_label_text(named(name, unit or units.get(name, "")))
     ax.set_title(term("picture.map"))
     bar = ax.figure.colorbar(drawn, cax=colorbar_axes, ax=None if colorbar_axes is not None else ax)
     bar.ax.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
     ticks = [tick for tick in bar.get_ticks() if bar.ax.get_ylim()[0] <= tick <= limit]
-    bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
+    bar.set_ticks(ticks, labels=[_gain(np.sign(tick) * tick**2) for tick in ticks])
     bar.ax.set_ylabel(term("unit.nats"))
+
+
+def _gain(nats: float) -> str:
+    """Format the label of a colour bar.
+
+    Example:
+        >>> _gain(-1600.0), _gain(0.25)
+        ('−1,600', '0.25')
+    """
+    return (f"{nats:,.0f}" if abs(nats) >= 100.0 else f"{nats:.3g}").replace("-", "−")
 
 
 def of_time(has_time: bool) -> str:

@@ -12,8 +12,9 @@ import numpy as np
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, SHADE, array
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital
+from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import Finding, Traces
-from mkc_torch.diagnosis.plot.curves import named, short
+from mkc_torch.diagnosis.plot.curves import named, short, units_of_outputs
 
 __all__ = [
     "MOMENTS",
@@ -25,6 +26,7 @@ __all__ = [
     "mark_rejected",
     "of_channel",
     "onsets",
+    "unit_of_channel",
 ]
 
 MOMENTS = ("table.before", "table.after")
@@ -45,16 +47,13 @@ class _Bins:
     rms: np.ndarray
 
 
-def draw_residuals(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) -> None:
+def draw_residuals(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int, unit: str) -> None:
     """Draw the residual before and, on the second axes, after."""
     for ax, after in zip(axes, (False, True), strict=False):
-        draw_residual(ax, t, x, channel, after=after)
-    for ax in axes[1:]:
-        ax.set_ylabel("")
-        ax.tick_params(labelleft=False)
+        draw_residual(ax, t, x, channel, unit, after=after)
 
 
-def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, *, after: bool) -> None:
+def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, unit: str, *, after: bool) -> None:
     """Draw samples, and mean and RMS of the samples in use; with ``after``, also the RMS before."""
     before, used = array(t.before[:, channel]), array(t.weight[:, channel]) >= 0.5
     limit, earlier, shown = _limit(before[used]), _binned(x[used], before[used]), _apart(x)
@@ -74,7 +73,7 @@ def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, *, after: boo
     ax.margins(x=0.01)
     ax.locator_params(axis="y", nbins=5)
     ax.locator_params(axis="x", nbins=6)
-    ax.set_ylabel(named(term("label.residual"), t.unit))
+    ax.set_ylabel(named(term("label.residual"), unit))
 
 
 def _envelope(ax: Any, bins: _Bins, **style: Any) -> None:
@@ -144,6 +143,11 @@ def draw_floor(ax: Any, size: float | None) -> None:
     """Draw the noise floor on both sides of zero."""
     for side in (-1.0, 1.0) if size is not None and math.isfinite(size) else ():
         ax.axhline(side * (size or 0.0), color=GREY, lw=1.1, ls=":", zorder=6)
+
+
+def unit_of_channel(t: Traces, environment: NoiseEnvironment, channel: int) -> str:
+    """Return the unit of a channel: that of all channels, or of the output with its name; empty if unknown."""
+    return t.unit or units_of_outputs(environment).get(t.channels[channel], "")
 
 
 def of_channel(key: str, channel: str) -> str:

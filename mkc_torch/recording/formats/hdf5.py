@@ -16,6 +16,7 @@ __all__ = ["HDF5", "h5py", "hdf5_root"]
 
 
 _TRIAL = Path(__file__).with_name("hdf5_objects.py").read_text(encoding="utf-8")
+"""Source that a process of its own runs first: a damaged file can end the process that reads it."""
 
 
 def h5py(extra: str) -> Any:

@@ -25,6 +25,7 @@ from mkc_torch.report.diagnosis import (
     unseen,
     verdict,
 )
+from mkc_torch.report.drawing import themed
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 
@@ -97,7 +98,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         forced=drawn[3 * count :],
         floors=pictures.floors(d),
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
-        curve_colors=CURVE_COLORS,
+        curve_colors=[themed(color) for color in CURVE_COLORS],
         bars=bars(d.candidates),
         heat=heat_map(d.separability),
         most=_MOST_SHOWN,
@@ -110,8 +111,8 @@ def _markup(svg: str | None) -> Markup | None:
 
 
 def bars(candidates: tuple[CandidateScore, ...]) -> list[Bar]:
-    """Return the best candidates by gain, with bars in proportion to it."""
-    shown = sorted(candidates[:_MOST_SHOWN], key=lambda c: -c.log_likelihood_gain)
+    """Return the best candidates in the order of the search, with bars in proportion to their gain."""
+    shown = candidates[:_MOST_SHOWN]
     best = max((c.log_likelihood_gain for c in shown), default=0.0)
     return [
         Bar(i, c, 100.0 * max(c.log_likelihood_gain, 0.0) / best if best > 0 else 0.0) for i, c in enumerate(shown, 1)

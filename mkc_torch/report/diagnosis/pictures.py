@@ -6,11 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from matplotlib.figure import Figure
-
-from mkc_torch._support.drawing import array, style
+from mkc_torch._support.drawing import DARK_ORANGE, array, style
 from mkc_torch._words.terms import term
-from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_curve, draw_map, named, of_time
+from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_curve, draw_map, named, of_time, units_of_outputs
 from mkc_torch.diagnosis.plot.residual import (
     MOMENTS,
     acting_channels,
@@ -20,19 +18,16 @@ from mkc_torch.diagnosis.plot.residual import (
     mark_rejected,
     of_channel,
     onsets,
+    unit_of_channel,
 )
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.report.diagnosis.panels import LEFT, PanelGrid, title
-from mkc_torch.report.drawing import svg
+from mkc_torch.report.panels import Margins, Panels, title
 
 __all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
 
-_DARK = "#9A4300"
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
 _CLOSE = 0.03
 """Distance, as a share of the axis, below which numbers would overlap."""
-
-_MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
 
 
 @dataclass(frozen=True)
@@ -49,29 +44,22 @@ def over_time(diagnosis: Diagnosis) -> str:
     Without findings there is no column "after".
     """
     t, findings = diagnosis.traces, diagnosis.findings
-    rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
     above, known = numbered(diagnosis), floors(diagnosis)
-    grid = PanelGrid(rows, columns, top=0.55 if above else 0.35, below=0.42)
+    panels = Panels(2 if findings else 1, margins=Margins(top=0.55 if above else 0.35))
     with style():
-        figure = grid.figure()
-        for row in range(rows):
-            axes = [grid.axes(figure, row, column) for column in range(columns)]
+        for row in range(min(len(t.channels), _MOST_ROWS)):
+            axes = [panels.axes() for _ in MOMENTS[: 2 if findings else 1]]
             for ax in axes:
                 mark_findings(ax, findings)
                 mark_rejected(ax, diagnosis.rejected_intervals)
-            draw_residuals(axes, t, array(t.time), row)
-            for ax in axes:
-                draw_floor(ax, known.get(t.channels[row]))
-            if above and row == 0:
-                for ax in axes:
-                    _number(ax, findings)
+            draw_residuals(axes, t, array(t.time), row, unit_of_channel(t, diagnosis.environment, row))
             for ax, moment in zip(axes, MOMENTS if findings else ("label.residual",), strict=True):
-                title(ax, of_channel(moment, t.channels[row]), above=above and row == 0)
-                if row == rows - 1:
-                    ax.set_xlabel(of_time(t.has_time))
-                else:
-                    ax.tick_params(labelbottom=False)
-        return svg(figure, "time", term("picture.about_time"))
+                draw_floor(ax, known.get(t.channels[row]))
+                ax.set_xlabel(of_time(t.has_time))
+                title(ax, of_channel(moment, t.channels[row]), above=above)
+                if above:
+                    _number(ax, findings)
+        return panels.markup("time", term("picture.about_time"))
 
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
@@ -92,25 +80,27 @@ def numbered(diagnosis: Diagnosis) -> bool:
 def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
     """Draw the curve of a finding and the residual over its drivers; None if there is neither."""
     t, finding = diagnosis.traces, diagnosis.findings[index]
-    panels, curve = driver_panels(diagnosis, index), finding.curve
-    if curve is None and not panels:
+    rows, curve = driver_panels(diagnosis, index), finding.curve
+    if curve is None and not rows:
         return None
-    side_by_side = curve is not None and len(panels) == 1
-    above = int(curve is not None and not side_by_side)
-    grid = PanelGrid(len(panels) + above, 3 if side_by_side else 2, top=0.3, below=0.72)
+    together = curve is not None and len(rows) == 1
+    panels = Panels(3 if together else 2)
+    alone = panels if together else Panels(1)
     with style():
-        figure = grid.figure()
-        for row, panel in enumerate(panels, above):
-            axes = [grid.axes(figure, row, column) for column in range(2)]
-            draw_residuals(axes, t, array(t.drivers[panel.driver]), panel.channel)
+        for row in rows:
+            axes = [panels.axes() for _ in MOMENTS]
+            unit = unit_of_channel(t, diagnosis.environment, row.channel)
+            draw_residuals(axes, t, array(t.drivers[row.driver]), row.channel, unit)
             for ax, moment in zip(axes, MOMENTS, strict=True):
-                title(ax, of_channel(moment, t.channels[panel.channel]))
-                ax.set_xlabel(named(panel.driver, t.driver_units.get(panel.driver, "")))
+                title(ax, of_channel(moment, t.channels[row.channel]))
+                ax.set_xlabel(named(row.driver, t.driver_units.get(row.driver, "")))
         if curve is not None:
-            ax = grid.axes(figure, 0, 2) if side_by_side else grid.axes(figure, 0, 0, wide=True)
-            draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if side_by_side else 3 * MOST_LETTERS)
+            ax = alone.axes()
+            draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if together else 2 * MOST_LETTERS)
             title(ax, term("picture.curve"))
-        return svg(figure, f"finding{index + 1}", term("picture.about_finding", number=index + 1))
+        name, about = f"finding{index + 1}", term("picture.about_finding", number=index + 1)
+        above = alone.markup(f"{name}-curve", about) if curve is not None and not together else ""
+        return above + (panels.markup(name, about) if rows else "")
 
 
 def over_states(diagnosis: Diagnosis, index: int) -> str | None:
@@ -118,11 +108,13 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
     found = diagnosis.findings[index].map
     if found is None:
         return None
+    panels = Panels(1, height=2.55, margins=Margins(right=1.1))
     with style():
-        figure = Figure(figsize=(_MAP, _MAP_HEIGHT))
-        ax = figure.add_axes((LEFT / _MAP, 0.5 / _MAP_HEIGHT, 0.72, 1.0 - 0.85 / _MAP_HEIGHT))
-        draw_map(ax, found, figure.add_axes((0.86, 0.5 / _MAP_HEIGHT, 0.025, 1.0 - 0.85 / _MAP_HEIGHT)))
-        return svg(figure, f"map{index + 1}", term("picture.about_map", number=index + 1))
+        ax = panels.axes()
+        low, width = ax.get_position().y0, ax.get_position().x1
+        bar = ax.figure.add_axes((width + 0.03, low, 0.025, ax.get_position().height))
+        draw_map(ax, found, units_of_outputs(diagnosis.environment), bar)
+        return panels.markup(f"map{index + 1}", term("picture.about_map", number=index + 1))
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
@@ -149,7 +141,7 @@ def _number(ax: Any, findings: Sequence[Finding]) -> None:
     for place, names in placed:
         ax.text(
             place, 1.02, names, transform=ax.get_xaxis_transform(), ha="center", va="bottom",
-            color=_DARK, fontsize=9, weight="bold",
+            color=DARK_ORANGE, fontsize=9, weight="bold",
         )  # fmt: skip
 
 
