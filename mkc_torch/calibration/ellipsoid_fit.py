@@ -35,7 +35,7 @@ from mkc_torch.calibration.ellipsoid import (
 )
 from mkc_torch.calibration.ellipsoid_errors import derived_slopes
 from mkc_torch.calibration.noise_effect import Bias, algebraic_rows, bias_by_noise, distance_rows, moments_of
-from mkc_torch.calibration.not_identifiable import (
+from mkc_torch.calibration.not_identifiable import LESS_NOISE, (
     NotIdentifiableError,
     equal_points_message,
     flat_points_message,
@@ -431,7 +431,7 @@ class EllipsoidFit(Fitted):
                     f"the centre or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
                     f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
                     each.directions(index),
-                    covered=_LESS_NOISE,
+                    covered=LESS_NOISE,
                 )
 
     def _refuse_scattered(self, field: Tensor, scatter: Tensor) -> None:
@@ -444,13 +444,6 @@ class EllipsoidFit(Fitted):
                 f"more than {100.0 * self.max_scatter:.0f} %, like the noise of a sensor that hardly turns. Turn the "
                 "sensor through all directions."
             )
-
-
-_LESS_NOISE = (
-    "All directions are covered, so more turns do not help. Record with less noise: away from motors and wires, more "
-    "slowly, or with averaged samples."
-)
-"""Advice if noise, and not the motion, makes the result uncertain."""
 
 
 def _problem(index: int, several: bool) -> str:

@@ -28,6 +28,13 @@ def middle_of(points: Tensor) -> Tensor:
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
+LESS_NOISE = (
+    "All directions are covered, so more turns do not help. Record with less noise: away from motors and wires, more "
+    "slowly, or with averaged samples."
+)
+"""Advice if noise, and not the motion, makes the result uncertain."""
+
+
 def not_identifiable(
     message: str, vectors: Tensor, *, seen: str = "", covered: str = "Turn the sensor through all directions."
 ) -> NotIdentifiableError:

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.density.energy import KAPPA_MAX, energy_value
-from mkc_torch.density.energy import energy_terms
+from mkc_torch.density.energy import KAPPA_MAX, energy_terms, energy_value
 from mkc_torch.density.head import head_rule, integrate, tail_density
 from mkc_torch.density.normalizer import log_partition_value
 
