@@ -35,7 +35,8 @@ from mkc_torch.calibration.ellipsoid import (
 )
 from mkc_torch.calibration.ellipsoid_errors import derived_slopes
 from mkc_torch.calibration.noise_effect import Bias, algebraic_rows, bias_by_noise, distance_rows, moments_of
-from mkc_torch.calibration.not_identifiable import LESS_NOISE, (
+from mkc_torch.calibration.not_identifiable import (
+    LESS_NOISE,
     NotIdentifiableError,
     equal_points_message,
     flat_points_message,
@@ -406,10 +407,9 @@ class EllipsoidFit(Fitted):
             lent_each = torch.einsum("bi,bij,bj->b", worst, moments.lent, worst).clamp(min=0.0)
             suspects = (least_each < 2.0 * MIN_INFORMATION + most * lent_each).nonzero()[:, 0].tolist()
         for index in suspects:
-            count = counts[index]
             least, along = least_information(moments.found[index] - moments.lent[index])
             lent = float(along @ moments.lent[index].double().cpu() @ along)
-            needed = MIN_INFORMATION + (LENT_UNSURE + LENT_UNSURE_OF_ONE * count**-0.5) * max(lent, 0.0)
+            needed = MIN_INFORMATION + (LENT_UNSURE + LENT_UNSURE_OF_ONE * counts[index] ** -0.5) * max(lent, 0.0)
             if least < needed:
                 raise not_identifiable(
                     f"{_problem(index, points.dim() > 2)}Not identifiable: too few directions are covered for points "
