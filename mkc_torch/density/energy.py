@@ -105,7 +105,7 @@ def energy_value(z: Tensor, kappa: Tensor) -> Tensor:
     if not torch.compiler.is_compiling():
         return torch.where(x > 0, -torch.expm1(-x) / divisor, q)
     # compiled code computes expm1 as exp - 1 on some processors, which is 0 for small x
-    small = x < NEAR
+    small = x < 0.5  # NEAR as a literal: a compiler makes a global number an input, which nested functions refuse
     series = relative_series(torch.where(small, x, 0.0))
     return torch.where(small, q * series, (1.0 - torch.exp(-x)) / divisor)
 
@@ -126,7 +126,7 @@ def energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
     """``-(1 - exp(-x) (1 + x)) / kappa^2`` with ``x = kappa z^2 / 2``, smooth at ``kappa = 0`` where it is -z^4/8."""
     q = (0.5 * z * z).clamp(max=torch.finfo(z.dtype).max)  # finite, so that 0 times it is 0
     x = kappa * q
-    small = x < NEAR
+    small = x < 0.5
     near_x = torch.where(small, x, 0.0)
     near = _near(near_x)
     # capped, so that 0 times it stays 0 where kappa = 0 and z² overflows

@@ -85,7 +85,7 @@ def test_the_name_is_in_the_calibration_the_report_and_on_the_terminal(done):
     folder, result = done
     calibration = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
     assert (calibration.name, calibration.recording) == ("mast", "good")
-    assert result.stdout.split()[0] == "mast"
+    assert result.stdout.split()[0] == "mast:"
     shown = (folder / "report.html").read_text(encoding="utf-8")
     assert "Calibration of mast" in shown
     assert "mast · good" in shown

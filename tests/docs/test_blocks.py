@@ -6,7 +6,8 @@ pytest.importorskip("lightning")
 pytest.importorskip("typer")
 pytest.importorskip("polars")
 
-from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run
+from examples.blind_proof import __main__ as proof
+from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run, script_of
 from tests.docs.files import write_examples
 from tests.docs.outputs import differences, run_page
 from tests.docs.pages import PAGES, ROOT, RUN, SHOWN, blocks
@@ -82,8 +83,11 @@ def test_every_block_has_a_known_language(page):
 def test_every_small_variant_belongs_to_a_shown_command():
     shown = [words for page in PAGES for b in blocks(page) if b.language == "sh" for line in b.text.splitlines()
              for words in commands(line)]  # fmt: skip
-    assert set(SMALL) <= {" ".join(words) for words in shown}
+    proofs = [words[3:] for words in shown if words[:3] == ["python", "-m", "examples.blind_proof"]]
+    assert set(SMALL) == {proof.parser().parse_args(words).kind for words in proofs}
     scripts = {words[1] for words in shown if words[0] == "python" and words[1].startswith("examples/")}
+    modules = {words[2] for words in shown if words[:2] == ["python", "-m"] and words[2].startswith("examples.")}
+    scripts |= {script_of(module) for module in modules - {"examples.blind_proof"}}
     assert set(EXAMPLES) | set(TESTED) == scripts
     assert all((ROOT / script).is_file() for script in scripts)
 

@@ -97,7 +97,7 @@ BAD = {
     # columns
     "no magnetometer": (
         "time,speed\n0,1\n1,2\n",
-        "no magnetometer is recognised among `time`, `speed`; name its columns",
+        "no magnetometer is recognised among `time`, `speed`; it needs three columns",
     ),
     "three that may be one": (
         "time,ux,uy,uz\n0,1,2,3\n1,2,3,4\n",

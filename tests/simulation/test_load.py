@@ -49,7 +49,7 @@ def test_a_relative_path(file, monkeypatch):
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        ("my.py", "names no simulation; write FILE.py:NAME"),
+        ("my.py", "defines 2 simulations; give --simulation my.py:Decay or"),
         ("my.txt:Decay", "names no simulation"),
         ("other.py:Decay", "there is no such file"),
         ("my.py:Missing", "defines no `Missing`; simulations in it: Decay, ready."),

@@ -122,7 +122,7 @@ class _Compared(Generic[V]):
     def with_fault(self) -> V:
         """The view, with the fault of its turns in ``faults``."""
         fault = self.fault()
-        self.view.faults = (fault[:1].upper() + fault[1:],)
+        self.view.faults = (fault[:1].upper() + fault[1:],) if fault else ()
         return self.view
 
     def fault(self) -> str:

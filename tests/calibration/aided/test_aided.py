@@ -53,7 +53,7 @@ def test_the_aid_is_reported_and_its_standard_errors_hold(drawn, found):
     aid = found.aid
     assert (aid.by, aid.response) == ("gyroscope", "full matrix")
     assert {name for name, value in aid.evidence if value == 0.0} == {"full matrix"}
-    assert any("the gyroscope replaces the missing turns" in w and "Not identifiable" not in w for w in found.warnings)
+    assert any("the gyroscope replaces the missing turns" in w and "Not identifiable" not in w for w in found.notes)
     off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
     assert float(off.abs().max()) < 4.0
     assert 0.0 < aid.heading_error < 1.5

@@ -59,6 +59,7 @@ def test_keys_are_those_of_the_format(content):
         "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "goodness_of_fit", "reasons",
         "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
+        "notes", "rejected_intervals",
     }  # fmt: skip
     assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
     assert set(content["findings"][0]) == {

@@ -756,7 +756,7 @@ def test_rows_that_are_not_finite_are_dropped():
     angle[[3, 40]] = np.nan
     prepared = Pendulum().prepare(table(time=TIME, angle=angle))
     assert len(prepared.time) == 498
-    assert "Dropped 2 of 500" in prepared.recording.warnings[0]
+    assert "Dropped 2 of 500" in prepared.recording.notes[0]
 
 
 def test_solving_starts_from_a_trajectory_nearby(monkeypatch):

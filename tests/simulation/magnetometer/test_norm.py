@@ -123,7 +123,7 @@ def test_samples_are_sorted_and_finite():
     view = Magnetometer().prepare(shuffled)
     assert len(view.time) == 599
     assert bool((view.time.diff() > 0).all())
-    assert "Dropped 1 of 600 samples" in " ".join(view.recording.warnings)
+    assert "Dropped 1 of 600 samples" in " ".join(view.recording.notes)
 
 
 def test_a_turn_about_a_single_axis_is_refused_with_the_missing_directions():
