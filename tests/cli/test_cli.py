@@ -390,7 +390,7 @@ def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
     path = table(odd, noisy_ellipsoid(300))
     result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit-label", ":X:[b]")
     assert result.exit_code == 0
-    assert "no:X:[b]file\n" in result.stdout
+    assert "no:X:[b]file: Calibrated" in result.stdout
     assert "± SE, :X:[b] " in result.stdout
     assert str(tmp_path / "out" / "no:X:[b]file" / "report.html") in result.stdout
 

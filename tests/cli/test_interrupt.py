@@ -85,7 +85,7 @@ def test_an_interrupted_calibrate_names_the_recordings_without_results(tmp_path,
     result = mkc("calibrate", *paths, "--output", tmp_path / "out")
     reported(result, f"nothing was written for {paths[1]}, {paths[2]}.")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a"]
-    assert "a\noffset" in result.stdout
+    assert "a: Calibrated.\noffset" in result.stdout
 
 
 def test_an_interrupted_diagnose_names_the_recordings_without_results(tmp_path, monkeypatch):

@@ -126,7 +126,7 @@ def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypat
             if seen.count("\n") >= 2:
                 break
             threading.Event().wait(0.02)
-    line = r"mkc: after 0 s: 0 of 2 done, calibrating log\.bin, sensor MAG \(1 of 3\)\n"
+    line = r"mkc: after \d s: 0 of 2 done, calibrating log\.bin, sensor MAG \(1 of 3\)\n"
     assert re.fullmatch(f"({line}){{2,}}", seen)
 
 

@@ -60,7 +60,7 @@ def test_there_are_a_hundred_tables_nearly_all_with_standard_errors():
 def test_robustbase(name):
     table = TABLES[name]
     X, y = table["X"], table["y"]
-    fit, start = MMRegression().fit(X, y), SRegression().fit(X, y)
+    fit, start = MMRegression(seed=2).fit(X, y), SRegression(seed=2).fit(X, y)
     scale, error = float(fit.scale_), fit.standard_error_.numpy()
     if name in LOWER:
         assert scale < table["scale"] * (1 - 1e-4)
