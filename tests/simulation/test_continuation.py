@@ -70,6 +70,9 @@ class RecordedStarts:
         self.starts.append(near)
         return Answer(theta.unsqueeze(-1), Found(float(theta)))
 
+    def compiled(self, meaning, size):  # noqa: ARG002
+        return None
+
 
 class Found:
     def __init__(self, value, whole=True):
