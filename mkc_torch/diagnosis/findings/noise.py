@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.unit_text import sized
 from mkc_torch.density.tails import time_series_tails
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, Offset, ProcessNoise, Run
 from mkc_torch.diagnosis.goodness_of_fit import units_of
@@ -168,7 +169,8 @@ def _sentences(process: ProcessNoise, course: DisturbancePath, prepared: Prepare
     step = float(prepared.time.diff().median())
     if process.correlation_time > 0.0:
         sentences = [
-            f"The disturbance of {what} is not white: its correlation time is about {process.correlation_time:.2g} s."
+            f"The disturbance of {what} is not white: its correlation time is about "
+            f"{sized(float(f'{process.correlation_time:.2g}'), 's')}."
         ]
     else:
         sentences = [f"The disturbance of {what} is white."]

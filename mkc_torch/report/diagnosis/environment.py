@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mkc_torch._support.unit_text import tidy
+from mkc_torch._support.unit_text import sized, tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
@@ -135,11 +135,13 @@ def process_noise_sentence(process: ProcessNoise) -> str:
         'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white noise.'
         >>> process_noise_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
         'Drift of `angle` in addition to its white noise: 0.0100 ± 0.0020 rad, correlation time 30 s.'
+        >>> process_noise_sentence(ProcessNoise("temp", False, 463.0, 0.053, 0.0071, "°C", 12.0)).split(", ")[1]
+        'correlation time 460 s.'
     """
     amount = measured(process.size, process.standard_error, tidy(process.unit))[0]
     memory = term("environment.white")
     if process.correlation_time > 0.0:
-        memory = term("environment.correlation_time", seconds=f"{process.correlation_time:.2g}")
+        memory = term("environment.correlation_time", seconds=sized(float(f"{process.correlation_time:.2g}")))
     key = "environment.process_noise" if process.at_rate else "environment.drift"
     return term(key, place=plain(process.place), size=amount, memory=memory)
 
@@ -152,7 +154,9 @@ def process_noise_table(environment: NoiseEnvironment) -> Table | None:
         (
             term("environment.rate_of", place=plain(process.place)) if process.at_rate else plain(process.place),
             measured(process.size, process.standard_error, tidy(process.unit))[0],
-            f"{process.correlation_time:.3g} s" if process.correlation_time > 0.0 else term("unit.sample"),
+            f"{sized(float(f'{process.correlation_time:.3g}'))} s"
+            if process.correlation_time > 0.0
+            else term("unit.sample"),
             size(process.log_likelihood_gain)
             if math.isfinite(process.log_likelihood_gain)
             else term("number.not_known"),
