@@ -31,7 +31,7 @@ _MOST_WARNINGS = 2
 
 
 class SensorResult(NamedTuple):
-    """A sensor of a file with its calibration and files, or the reason why there is none."""
+    """A sensor of a file with its calibration and files, or the reason why it has no calibration."""
 
     name: str
     calibration: Calibration | None

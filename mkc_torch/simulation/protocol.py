@@ -219,7 +219,7 @@ class PreparedSimulation(Protocol):
         ...
 
     def finer(self) -> PreparedSimulation | None:
-        """The simulation with half the step of integration; None where the step is fixed, or there is none."""
+        """The simulation with half the step of integration; None with a fixed step or without steps."""
         ...
 
 

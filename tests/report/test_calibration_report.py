@@ -253,7 +253,9 @@ def test_many_rejected_samples_lead_to_the_diagnosis():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     doubtful = recorded(points)
-    assert "--simulation magnetometer" in text_of(calibration_report(calibrate(doubtful), doubtful))
+    assert "mkc diagnose RECORDING.csv --simulation magnetometer" in text_of(
+        calibration_report(calibrate(doubtful), doubtful)
+    )
 
 
 def test_a_refusal_reports_the_value_that_was_left_out():

@@ -144,7 +144,7 @@ def role_of(name: str, unit: str) -> str:
 
 
 def _own_role(name: str, roles: frozenset[str]) -> str:
-    """Return the longest role of a user's effects that the column's name begins with; empty if there is none."""
+    """Return the longest role of a user's effects that the column's name begins with; empty without such a role."""
     fitting = [role for role in roles - {ANY, "position"} if (name == role or name.startswith(f"{role}_"))]
     return max(fitting, key=len, default="")
 

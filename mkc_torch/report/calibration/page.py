@@ -39,7 +39,7 @@ def calibration_report(
     note: str = "",
     comparison: Sequence[Comparison] = (),
     against: Differences | None = None,
-    source: str = "NEW.csv",
+    source: str = "RECORDING.csv",
     result: str = "calibration.json",
 ) -> str:
     """Return the page of a calibration and its recording.
