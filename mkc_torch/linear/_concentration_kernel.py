@@ -33,14 +33,14 @@ def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
 
 @triton.jit
 def concentration_kernel(
-    x, y, w, start, near, options, beta_out, scale_out, steps_out,
+    x, y, w, start, near, settings, beta_out, scale_out, steps_out,
     starts, samples, x_batch, w_batch, max_iter,
     N: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr, RULE: tl.constexpr, NEWTON: tl.constexpr,
     HAS_WEIGHT: tl.constexpr, HAS_NEAR: tl.constexpr, KEEPS: tl.constexpr, EXACT: tl.constexpr,
 ):  # fmt: skip
     """One start of one problem: steps until the log scale falls by no more than the tolerance, at most ``max_iter``.
 
-    ``x`` holds the columns (B, N, samples). ``options`` holds the rank of the order statistic, c, the share of the
+    ``x`` holds the columns (B, N, samples). ``settings`` holds the rank of the order statistic, c, the share of the
     total weight that the sum of ρ is, the coefficients that it loses, the tolerance and the smallest scale. ``KEEPS``:
     the scale before a step is the first guess of the next.
     """
@@ -53,13 +53,13 @@ def concentration_kernel(
     if HAS_WEIGHT:
         own = tl.load(w + problem * w_batch + lane, mask=valid, other=0.0).to(tl.float64)
         total = tl.sum(own, 0)
-        rank = tl.load(options) * total / samples * (1.0 - 1e-12)
+        rank = tl.load(settings) * total / samples * (1.0 - 1e-12)
     else:
         own = tl.where(valid, 1.0, 0.0).to(tl.float64)
         total = samples.to(tl.float64)
-        rank = tl.load(options)
-    c, breakdown, lost = tl.load(options + 1), tl.load(options + 2), tl.load(options + 3)
-    tolerance, tiny = tl.load(options + 4), tl.load(options + 5)
+        rank = tl.load(settings)
+    c, breakdown, lost = tl.load(settings + 1), tl.load(settings + 2), tl.load(settings + 3)
+    tolerance, tiny = tl.load(settings + 4), tl.load(settings + 5)
     x += problem * x_batch + lane
     beta = tl.load(start + program * N + column, mask=column < N, other=0.0).to(tl.float64)
     scale = tl.zeros((), tl.float64)
@@ -79,7 +79,7 @@ def concentration_kernel(
             scale = _order_statistic(tl.abs(residual), own, valid, rank, HAS_WEIGHT)
         elif RULE == 1:
             threshold = _order_statistic(square, own, valid, rank, HAS_WEIGHT)
-            kept = tl.load(options) * total / samples if HAS_WEIGHT else rank
+            kept = tl.load(settings) * total / samples if HAS_WEIGHT else rank
             weight = tl.where(square <= threshold, own, 0.0)
             # of tied values only as many as needed enter
             trimmed = tl.sum(weight * square, 0) - (tl.sum(weight, 0) - kept) * threshold
