@@ -28,7 +28,7 @@ _MOST_COLUMNS = 12
 _MOST_SAMPLES = 4096
 """Most samples, all of which a program holds in registers."""
 
-_IN_ONE_WARP = 256
+_IN_ONE_WARP = 512
 """Most samples of a program of one warp, whose sums need no barrier."""
 
 QUANTILE, TRIMMED, M_SCALE = 0, 1, 2
@@ -82,12 +82,13 @@ def suits_kernel(problem: LinearProblem) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _kernel() -> CachedKernel:
+def _kernels() -> tuple[CachedKernel, CachedKernel]:
+    """Kernels of concentration steps and of weighted fits."""
     # these modules need Triton
-    from mkc_torch.linear._concentration_kernel import concentration_kernel
+    from mkc_torch.linear._concentration_kernel import concentration_kernel, weighted_fit_kernel
     from mkc_torch.losses.kernels.cached import CachedKernel
 
-    return CachedKernel(concentration_kernel)
+    return CachedKernel(concentration_kernel), CachedKernel(weighted_fit_kernel)
 
 
 @lru_cache(maxsize=64)
@@ -97,12 +98,34 @@ def _on_device(values: tuple[float, ...], device: torch.device) -> Float[Tensor,
         return torch.tensor(values, dtype=torch.float64, device=device)
 
 
-def _columns(problem: LinearProblem) -> Float[Tensor, "#B n N"]:
-    """Columns of the basis, each contiguous; kept for the next launch."""
-    kept: Tensor | None = problem.__dict__.get("_kept_columns")
-    if kept is None:
-        kept = problem.basis.detach()[:, :, 0].mT.contiguous()
-        problem.__dict__["_kept_columns"] = kept
+class _Data(NamedTuple):
+    """A problem as the kernels take it: columns, targets and sample weights with their numbers, and constants."""
+
+    tensors: tuple[Tensor, Tensor, Tensor]
+    numbers: tuple[int, int, int]
+    columns: int
+    block: int
+    warps: int
+    weighted: bool
+
+
+def _data(problem: LinearProblem) -> _Data:
+    kept: _Data | None = problem.__dict__.get("_kept_data")
+    if kept is not None:
+        return kept
+    columns = problem.basis.detach()[:, :, 0].mT.contiguous()
+    y = problem.Y.detach().contiguous()
+    weight = y if problem.sample_weight is None else problem.sample_weight.detach().contiguous()
+    block = 1 << max(problem.num_samples - 1, 31).bit_length()
+    kept = _Data(
+        (columns, y, weight),
+        (problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(), weight[0].numel()),
+        max(1 << (problem.num_coefficients - 1).bit_length(), 2),
+        block,
+        1 if block <= _IN_ONE_WARP else 2 * block // _IN_ONE_WARP,
+        problem.sample_weight is not None,
+    )
+    problem.__dict__["_kept_data"] = kept
     return kept
 
 
@@ -128,29 +151,38 @@ def concentrate(
         keeps: whether the scale before a step is the first guess after it.
     """
     count, starts, n = beta.shape
-    columns, y = _columns(problem), problem.Y.detach().contiguous()
-    weight = None if problem.sample_weight is None else problem.sample_weight.detach().contiguous()
+    given = _data(problem)
     beta, near = beta.detach().contiguous(), None if near is None else near.detach().contiguous()
     found, scale = torch.empty_like(beta), beta.new_empty(count, starts, 1)
     steps = torch.empty(count, starts, dtype=torch.int32, device=beta.device)
     tiny = torch.finfo(torch.float64).tiny ** 0.5
     values = (options.rank, options.c, options.breakdown, options.lost, tolerance, tiny)
-    block = 1 << max(problem.num_samples - 1, 31).bit_length()
-    _kernel().launch(
+    _kernels()[0].launch(
         (count * starts, 1, 1),
         (
-            columns, y, y if weight is None else weight, beta, scale if near is None else near,
-            _on_device(values, beta.device), found, scale, steps,
+            *given.tensors, beta, scale if near is None else near, _on_device(values, beta.device), found, scale, steps,
         ),
+        (starts, *given.numbers, max_iter),
         (
-            starts, problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(),
-            0 if weight is None else weight[0].numel(), max_iter,
+            n, given.columns, given.block, options.rule, options.newton,
+            given.weighted, near is not None, keeps, options.exact,
         ),
-        (
-            n, max(1 << (n - 1).bit_length(), 2), block, options.rule, options.newton,
-            weight is not None, near is not None, keeps, options.exact,
-        ),
-        1 if block <= _IN_ONE_WARP else block // _IN_ONE_WARP,
+        given.warps,
     )  # fmt: skip
     most = int(torch.where(steps < 0, -steps - 1, steps).max()) if max_iter > 0 and tolerance > -torch.inf else max_iter
     return Concentrated(found, scale, steps >= 0, most)
+
+
+def weighted_fits(problem: LinearProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:
+    """Weighted least-squares coefficients in the basis; a direction without weight gets no part of the solution."""
+    count, sets = weight.shape[:2]
+    given, n = _data(problem), problem.num_coefficients
+    found = weight.new_empty(count, sets, n)
+    _kernels()[1].launch(
+        (count * sets, 1, 1),
+        (*given.tensors, weight.detach().contiguous(), found),
+        (sets, *given.numbers),
+        (n, given.columns, given.block, given.weighted),
+        given.warps,
+    )
+    return found

@@ -1,11 +1,11 @@
-"""Triton kernel of concentration steps on many small problems; ``_concentration`` launches it."""
+"""Triton kernels of weighted fits and concentration steps on many small problems; ``_concentration`` launches them."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-__all__ = ["concentration_kernel"]
+__all__ = ["concentration_kernel", "weighted_fit_kernel"]
 
 
 @triton.jit
@@ -29,6 +29,36 @@ def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
         else:
             low = middle
     return high.to(tl.float64, bitcast=True)
+
+
+@triton.jit
+def _weighted_fit(x, target_y, weight, valid, samples, N: tl.constexpr, COLUMNS: tl.constexpr):
+    """Weighted least-squares coefficients; ``x`` points to the samples of the first column."""
+    column = tl.arange(0, COLUMNS)
+    gram = tl.zeros((COLUMNS, COLUMNS), tl.float64)
+    moment = tl.zeros((COLUMNS,), tl.float64)
+    for j in tl.static_range(N):
+        weighted = weight * tl.load(x + j * samples, mask=valid, other=0.0).to(tl.float64)
+        moment = tl.where(column == j, tl.sum(weighted * target_y, 0), moment)
+        for k in tl.static_range(j + 1):
+            other = tl.load(x + k * samples, mask=valid, other=0.0).to(tl.float64)
+            place = (column[:, None] == j) & (column[None, :] == k)
+            place = place | ((column[:, None] == k) & (column[None, :] == j))
+            gram = tl.where(place, tl.sum(weighted * other, 0), gram)
+    diagonal = tl.where(column[:, None] == column[None, :], gram, 0.0)
+    least = N * 2.3e-16 * tl.max(tl.max(diagonal, 1), 0)
+    for j in tl.static_range(N):
+        by_column = tl.sum(tl.where(column[None, :] == j, gram, 0.0), 1)
+        by_row = tl.sum(tl.where(column[:, None] == j, gram, 0.0), 0)
+        pivot = tl.sum(tl.where(column == j, by_row, 0.0), 0)
+        value = tl.sum(tl.where(column == j, moment, 0.0), 0)
+        # a direction without weight gets no part of the solution
+        inverse = tl.where(pivot > least, 1.0 / tl.where(pivot > least, pivot, 1.0), 0.0)
+        here = column == j
+        moment = tl.where(here, value * inverse, moment - by_column * (value * inverse))
+        others = gram - by_column[:, None] * (by_row * inverse)[None, :]
+        gram = tl.where(here[:, None], (by_row * inverse)[None, :], others)
+    return moment
 
 
 @triton.jit
@@ -117,32 +147,29 @@ def concentration_kernel(
         objective = tl.minimum(objective, before)
         going = falling & (step < max_iter)
         if going:
-            gram = tl.zeros((COLUMNS, COLUMNS), tl.float64)
-            moment = tl.zeros((COLUMNS,), tl.float64)
-            for j in tl.static_range(N):
-                weighted = weight * tl.load(x + j * samples, mask=valid, other=0.0).to(tl.float64)
-                moment = tl.where(column == j, tl.sum(weighted * target_y, 0), moment)
-                for k in tl.static_range(j + 1):
-                    other = tl.load(x + k * samples, mask=valid, other=0.0).to(tl.float64)
-                    place = (column[:, None] == j) & (column[None, :] == k)
-                    place = place | ((column[:, None] == k) & (column[None, :] == j))
-                    gram = tl.where(place, tl.sum(weighted * other, 0), gram)
-            diagonal = tl.where(column[:, None] == column[None, :], gram, 0.0)
-            least = N * 2.3e-16 * tl.max(tl.max(diagonal, 1), 0)
-            for j in tl.static_range(N):
-                by_column = tl.sum(tl.where(column[None, :] == j, gram, 0.0), 1)
-                by_row = tl.sum(tl.where(column[:, None] == j, gram, 0.0), 0)
-                pivot = tl.sum(tl.where(column == j, by_row, 0.0), 0)
-                value = tl.sum(tl.where(column == j, moment, 0.0), 0)
-                # a direction without weight gets no part of the solution
-                inverse = tl.where(pivot > least, 1.0 / tl.where(pivot > least, pivot, 1.0), 0.0)
-                here = column == j
-                moment = tl.where(here, value * inverse, moment - by_column * (value * inverse))
-                others = gram - by_column[:, None] * (by_row * inverse)[None, :]
-                gram = tl.where(here[:, None], (by_row * inverse)[None, :], others)
-            beta = moment
+            beta = _weighted_fit(x, target_y, weight, valid, samples, N, COLUMNS)
             step += 1
     tl.store(beta_out + program * N + column, beta, mask=column < N)
     tl.store(scale_out + program, scale)
     # the sign says whether the last step lowered the scale
     tl.store(steps_out + program, tl.where(falling, -step - 1, step))
+
+
+@triton.jit
+def weighted_fit_kernel(
+    x, y, w, weights, beta_out,
+    sets, samples, x_batch, w_batch,
+    N: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr, HAS_WEIGHT: tl.constexpr,
+):  # fmt: skip
+    """Weighted least squares of one problem with one of its sets of weights (B, sets, samples)."""
+    program = tl.program_id(0).to(tl.int64)
+    problem = program // sets
+    lane = tl.arange(0, BLOCK)
+    valid = lane < samples
+    column = tl.arange(0, COLUMNS)
+    target_y = tl.load(y + problem * samples + lane, mask=valid, other=0.0).to(tl.float64)
+    weight = tl.load(weights + program * samples + lane, mask=valid, other=0.0).to(tl.float64)
+    if HAS_WEIGHT:
+        weight *= tl.load(w + problem * w_batch + lane, mask=valid, other=0.0).to(tl.float64)
+    beta = _weighted_fit(x + problem * x_batch + lane, target_y, weight, valid, samples, N, COLUMNS)
+    tl.store(beta_out + program * N + column, beta, mask=column < N)

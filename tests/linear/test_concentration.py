@@ -4,8 +4,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from mkc_torch.linear import LeastTrimmedSquares, SRegression, _concentration, _scale_search
-from mkc_torch.linear._problem import LinearProblem, linear_problem
+from mkc_torch.linear import (
+    LeastTrimmedSquares,
+    MKCRegression,
+    SRegression,
+    _concentration,
+    _problem,
+    _scale_search,
+)
+from mkc_torch.linear._problem import LinearProblem, linear_problem, solve_gram
 from mkc_torch.linear._scale_search import ScaleSearch, elemental_starts
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale
 from mkc_torch.linear.s_regression import MScale
@@ -17,7 +24,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 @pytest.fixture(autouse=True)
 def _runs():
-    if DEVICE == "cpu" and not _concentration._kernel().is_interpreted:
+    if DEVICE == "cpu" and not _concentration._kernels()[0].is_interpreted:
         pytest.skip("the kernel was imported before TRITON_INTERPRET=1 was set")
 
 
@@ -64,6 +71,16 @@ def test_the_kernel_makes_the_steps_of_plain_operations(rule, n, kind):
     found = _concentration.concentrate(problem, start, rule.options(problem), max_iter=2, keeps=False)
     torch.testing.assert_close(found.beta, beta, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(found.scale, rule.scale(problem, problem.residual(beta)), rtol=1e-10, atol=0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_kernel_has_the_weighted_fits_of_plain_operations(kind, dtype):
+    problem = weighted_problem(kind, 4, dtype)
+    weight = torch.rand(2, 3, 30, 1, generator=torch.Generator().manual_seed(0), dtype=dtype).to(DEVICE)
+    expected = solve_gram(*problem.normal_equations(weight))
+    tolerance = 1e-10 if dtype == torch.float64 else 1e-4
+    torch.testing.assert_close(_concentration.weighted_fits(problem, weight), expected, rtol=tolerance, atol=tolerance)
 
 
 def test_a_descent_ends_with_the_coefficients_and_the_convergence_of_plain_operations():
@@ -114,20 +131,37 @@ def test_an_exact_fit_has_scale_zero_and_converges():
         torch.testing.assert_close(found.beta, beta)
 
 
-@pytest.mark.parametrize("make", [lambda: SRegression(starts=8), lambda: LeastTrimmedSquares(starts=8)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_fit_by_the_kernel_is_the_fit_by_plain_operations(make, dtype, monkeypatch):
-    X, y = (v.to(dtype) for v in sample(2, N=30))
+@pytest.mark.parametrize(
+    "make",
+    [lambda: SRegression(starts=8), lambda: LeastTrimmedSquares(starts=8), MKCRegression],
+    ids=["S", "LTS", "MKC"],
+)
+def test_a_fit_by_the_kernels_is_the_fit_by_plain_operations(make, dtype, monkeypatch):
+    X, y = (v.to(dtype) for v in sample(2))
     plain = make().fit(X.cpu(), y.cpu())
     launches = []
-    kernel = _scale_search.concentrate
-    monkeypatch.setattr(_scale_search, "runs_kernel", _concentration.suits_kernel)
-    monkeypatch.setattr(_scale_search, "concentrate", lambda *a, **k: launches.append(a) or kernel(*a, **k))
+    for module, name in ((_scale_search, "concentrate"), (_problem, "weighted_fits")):
+        kernel = getattr(module, name)
+        counted = lambda *a, kernel=kernel, name=name, **k: launches.append(name) or kernel(*a, **k)  # noqa: E731 - in a loop
+        monkeypatch.setattr(module, name, counted)
+        monkeypatch.setattr(module, "runs_kernel", _concentration.suits_kernel)
     fit = make().fit(X, y)
-    assert len(launches) >= 2
+    assert launches.count("concentrate") >= 2
+    assert "weighted_fits" in launches
     tolerance = 1e-8 if dtype == torch.float64 else 1e-4
-    for name in ("coef_", "scale_", "weights_", "covariance_"):
+    for name in ("coef_", "weights_", "covariance_"):
         torch.testing.assert_close(getattr(fit, name).cpu(), getattr(plain, name), rtol=tolerance, atol=tolerance)
+
+
+def test_derivatives_take_plain_operations(monkeypatch):
+    monkeypatch.setattr(_problem, "runs_kernel", _concentration.suits_kernel)
+    X, y = sample(2)
+    y.requires_grad_(True)
+    problem = linear_problem(X, y)
+    assert problem.weighted_fit(torch.ones_like(problem.Y)).requires_grad
+    with torch.no_grad():
+        assert not problem.weighted_fit(torch.ones_like(problem.Y)).requires_grad
 
 
 def test_large_problems_and_several_channels_take_plain_operations():

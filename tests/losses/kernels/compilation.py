@@ -20,7 +20,7 @@ from triton.compiler import ASTSource
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
 from mkc_torch.linear._blocks import Density
-from mkc_torch.linear._concentration import concentrate
+from mkc_torch.linear._concentration import concentrate, weighted_fits
 from mkc_torch.linear._fused_pass import fused_pass
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_trimmed_squares import TrimmedScale
@@ -112,6 +112,12 @@ def training_steps() -> Iterator[str]:
         concentrate(problem, beta, rule.options(problem), max_iter=20, **options)
         return f"starts, {name}"
 
+    def fits(name: str, samples: int, columns: int) -> str:
+        X, y = torch.eye(samples, columns, dtype=torch.float64) + 1.0, torch.ones(samples, dtype=torch.float64)
+        weighted_fits(linear_problem(X, y, y), torch.ones(1, 3, samples, 1, dtype=torch.float64))
+        return f"fits, {name}"
+
+    yield fits("six columns, weighted", 300, 6)
     yield starts("two columns, M-scale", 100, 2, MScale(30))
     yield starts("six columns, trimmed", 300, 6, TrimmedScale(0.5))
     yield starts("twelve columns, many weighted samples", 1500, 12, MScale(2), weighted=True)
