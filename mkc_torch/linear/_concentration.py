@@ -28,8 +28,14 @@ _MOST_COLUMNS = 12
 _MOST_SAMPLES = 4096
 """Most samples, all of which a program holds in registers."""
 
-_IN_ONE_WARP = 512
-"""Most samples of a program of one warp, whose sums need no barrier."""
+_VALUES = 96
+"""Most values of X of a thread, which registers hold in part; a program of one warp needs no barriers."""
+
+_OWN_VALUES = 6
+"""Values that a thread holds of a sample besides those of X."""
+
+_MOST_WARPS = 16
+"""Most warps of a program."""
 
 QUANTILE, TRIMMED, M_SCALE = 0, 1, 2
 """Numbers of the scales in the kernel."""
@@ -122,11 +128,17 @@ def _data(problem: LinearProblem) -> _Data:
         (problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(), weight[0].numel()),
         max(1 << (problem.num_coefficients - 1).bit_length(), 2),
         block,
-        1 if block <= _IN_ONE_WARP else 2 * block // _IN_ONE_WARP,
+        _warps(block * max(problem.num_coefficients, _OWN_VALUES)),
         problem.sample_weight is not None,
     )
     problem.__dict__["_kept_data"] = kept
     return kept
+
+
+def _warps(values: int) -> int:
+    """Warps of a program that holds so many values."""
+    threads = -(-values // _VALUES)
+    return min(1 << max(0, -(-threads // 32) - 1).bit_length(), _MOST_WARPS)
 
 
 def concentrate(
@@ -162,11 +174,11 @@ def concentrate(
         (
             *given.tensors, beta, scale if near is None else near, _on_device(values, beta.device), found, scale, steps,
         ),
-        (starts, *given.numbers, max_iter),
         (
-            n, given.columns, given.block, options.rule, options.newton,
-            given.weighted, near is not None, keeps, options.exact,
+            starts, *given.numbers, max_iter,
+            int(near is not None), int(keeps), options.newton, int(options.exact),
         ),
+        (n, given.columns, given.block, options.rule, given.weighted),
         given.warps,
     )  # fmt: skip
     most = int(torch.where(steps < 0, -steps - 1, steps).max()) if max_iter > 0 and tolerance > -torch.inf else max_iter

@@ -7,6 +7,11 @@ import triton.language as tl
 
 __all__ = ["concentration_kernel", "weighted_fit_kernel"]
 
+_NUMBERS = (
+    "starts", "sets", "samples", "x_batch", "w_batch", "max_iter", "has_near", "keeps", "newton_steps", "is_exact",
+)  # fmt: skip
+"""Numbers of which the compiled form does not depend: with many columns it takes seconds to compile."""
+
 
 @triton.jit
 def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
@@ -61,18 +66,17 @@ def _weighted_fit(x, target_y, weight, valid, samples, N: tl.constexpr, COLUMNS:
     return moment
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_NUMBERS)
 def concentration_kernel(
     x, y, w, start, near, settings, beta_out, scale_out, steps_out,
-    starts, samples, x_batch, w_batch, max_iter,
-    N: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr, RULE: tl.constexpr, NEWTON: tl.constexpr,
-    HAS_WEIGHT: tl.constexpr, HAS_NEAR: tl.constexpr, KEEPS: tl.constexpr, EXACT: tl.constexpr,
+    starts, samples, x_batch, w_batch, max_iter, has_near, keeps, newton_steps, is_exact,
+    N: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr, RULE: tl.constexpr, HAS_WEIGHT: tl.constexpr,
 ):  # fmt: skip
     """One start of one problem: steps until the log scale falls by no more than the tolerance, at most ``max_iter``.
 
     ``x`` holds the columns (B, N, samples). ``settings`` holds the rank of the order statistic, c, the share of the
-    total weight that the sum of ρ is, the coefficients that it loses, the tolerance and the smallest scale. ``KEEPS``:
-    the scale before a step is the first guess of the next.
+    total weight that the sum of ρ is, the coefficients that it loses, the tolerance and the smallest scale. ``keeps``:
+    the scale before a step is the first guess of the next. ``is_exact``: Newton steps solve for an M-scale to rounding.
     """
     program = tl.program_id(0).to(tl.int64)
     problem = program // starts
@@ -92,10 +96,8 @@ def concentration_kernel(
     tolerance, tiny = tl.load(settings + 4), tl.load(settings + 5)
     x += problem * x_batch + lane
     beta = tl.load(start + program * N + column, mask=column < N, other=0.0).to(tl.float64)
-    scale = tl.zeros((), tl.float64)
-    if HAS_NEAR:
-        scale = tl.load(near + program).to(tl.float64)
-    known = HAS_NEAR
+    known = has_near > 0
+    scale = tl.load(near + program, mask=known, other=0.0).to(tl.float64)
     objective = tl.zeros((), tl.float64) + float("inf")
     step, going, falling = 0, True, True
     while going:
@@ -121,7 +123,7 @@ def concentration_kernel(
                 if not known:
                     scale = 1.4826 * _order_statistic(tl.abs(residual), own, valid, rank, HAS_WEIGHT)
                 newton, exact = 0, False
-                while (newton < NEWTON) & (not exact):
+                while (newton < newton_steps) & (not exact):
                     size = c * tl.maximum(scale, tiny)
                     inner = tl.maximum(1.0 - square / (size * size), 0.0)
                     second = own * inner * inner
@@ -132,20 +134,20 @@ def concentration_kernel(
                     move = gap / tl.maximum(tl.maximum(slope, tl.abs(gap)), tiny)
                     move = tl.minimum(tl.maximum(move, -0.7), 0.7)
                     # the next error is about the square of this step
-                    exact = EXACT & (tl.abs(move) < 0.7e-8)
+                    exact = (is_exact > 0) & (tl.abs(move) < 0.7e-8)
                     scale = scale * tl.exp(tl.where(scale > 0.0, move, 0.0))
                     newton += 1
                 # a scale that collapsed is solved again without the first guess
-                solving = EXACT & known & (not exact)
+                solving = (is_exact > 0) & known & (not exact)
                 known = False
             size = c * tl.maximum(scale, tiny)
             inner = tl.maximum(1.0 - square / (size * size), 0.0)
             weight = own * inner * inner
-        known = KEEPS
+        known = keeps > 0
         before = tl.log(tl.maximum(scale, tiny))
         falling = objective - before > tolerance
         objective = tl.minimum(objective, before)
-        going = falling & (step < max_iter)
+        going = falling & (step < max_iter) & (RULE > 0)
         if going:
             beta = _weighted_fit(x, target_y, weight, valid, samples, N, COLUMNS)
             step += 1

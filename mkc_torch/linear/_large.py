@@ -18,7 +18,6 @@ from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import Density, PassResult
-from mkc_torch.linear._concentration import runs_kernel
 from mkc_torch.linear._descent import Descent, PassDerivatives, sandwich_of
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
@@ -205,10 +204,7 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
     if drawn is None:
         return None
     problem, alike = drawn
-    on_device = problem.to(values.Y.device)
-    # on a GPU the search is a few kernels; all that follows is a few numbers at a time
-    begin = robust_start(on_device if runs_kernel(on_device) else problem, known.start, seed=seed, pilot=True)
-    begin = RobustStart(begin.beta.cpu(), begin.scale.cpu(), begin.exact.cpu())
+    begin = robust_start(problem, known.start, seed=seed, pilot=True)
     if bool(begin.exact.any()):
         return None
     rough = rough_fit(problem, known, begin, max_iter=max_iter, tails=_TAILS)

@@ -193,17 +193,6 @@ class LinearProblem:
             batch=torch.Size([index.shape[0]]),
         )
 
-    def to(self, device: torch.device) -> LinearProblem:
-        """Return the problem on another device."""
-        weight = self.sample_weight
-        return replace(
-            self,
-            basis=self.basis.to(device),
-            to_coef=self.to_coef.to(device),
-            Y=self.Y.to(device),
-            sample_weight=None if weight is None else weight.to(device),
-        )
-
     def select_samples(self, index: Tensor) -> LinearProblem:
         """Return the same problems on the samples at ``index``; the basis is then only nearly orthonormal."""
         return replace(
