@@ -47,7 +47,7 @@ def main() -> None:
             device,
             many=100_000 if gpu else 20,
             few=2000 if gpu else 4,
-            compared=2000,
+            compared=300,
             ellipsoids=1_000_000 if gpu else 3,
         ),
     }
