@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -19,7 +19,6 @@ from mkc_torch._support.torch_internals import is_wrapped
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-    from mkc_torch.linear._problem import LinearProblem
     from mkc_torch.losses.kernels.cached import CachedKernel
 
 _MOST_COLUMNS = 12
@@ -32,13 +31,35 @@ _VALUES = 96
 """Most values of X of a thread, which registers hold in part; a program of one warp needs no barriers."""
 
 _OWN_VALUES = 6
-"""Values that a thread holds of a sample besides those of X."""
+"""Values of a sample that a thread holds in addition to those of X."""
 
 _MOST_WARPS = 16
 """Most warps of a program."""
 
 QUANTILE, TRIMMED, M_SCALE = 0, 1, 2
 """Numbers of the scales in the kernel."""
+
+
+class SmallProblem(Protocol):
+    """What the kernels need of a :class:`LinearProblem`."""
+
+    @property
+    def basis(self) -> Float[Tensor, "#B N m n"]: ...
+
+    @property
+    def Y(self) -> Float[Tensor, "B N m"]: ...
+
+    @property
+    def sample_weight(self) -> Float[Tensor, "B N m"] | None: ...
+
+    @property
+    def num_samples(self) -> int: ...
+
+    @property
+    def num_channels(self) -> int: ...
+
+    @property
+    def num_coefficients(self) -> int: ...
 
 
 class ScaleOptions(NamedTuple):
@@ -70,12 +91,12 @@ class Concentrated(NamedTuple):
     n_iter: int
 
 
-def runs_kernel(problem: LinearProblem) -> bool:
+def runs_kernel(problem: SmallProblem) -> bool:
     """Whether concentration steps on this problem are one kernel: one channel, few columns and samples, on a GPU."""
     return problem.Y.is_cuda and suits_kernel(problem)
 
 
-def suits_kernel(problem: LinearProblem) -> bool:
+def suits_kernel(problem: SmallProblem) -> bool:
     """Whether the kernel takes problems of this size."""
     return (
         problem.num_samples > 1
@@ -115,7 +136,7 @@ class _Data(NamedTuple):
     weighted: bool
 
 
-def _data(problem: LinearProblem) -> _Data:
+def _data(problem: SmallProblem) -> _Data:
     kept: _Data | None = problem.__dict__.get("_kept_data")
     if kept is not None:
         return kept
@@ -142,7 +163,7 @@ def _warps(values: int) -> int:
 
 
 def concentrate(
-    problem: LinearProblem,
+    problem: SmallProblem,
     beta: Float[Tensor, "B S n"],
     options: ScaleOptions,
     *,
@@ -185,8 +206,8 @@ def concentrate(
     return Concentrated(found, scale, steps >= 0, most)
 
 
-def weighted_fits(problem: LinearProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:
-    """Weighted least-squares coefficients in the basis; a direction without weight gets no part of the solution."""
+def weighted_fits(problem: SmallProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:
+    """Weighted least-squares coefficients in the basis; the coefficient of a direction without weight is 0."""
     count, sets = weight.shape[:2]
     given, n = _data(problem), problem.num_coefficients
     found = weight.new_empty(count, sets, n)

@@ -57,7 +57,7 @@ def _weighted_fit(x, target_y, weight, valid, samples, N: tl.constexpr, COLUMNS:
         by_row = tl.sum(tl.where(column[:, None] == j, gram, 0.0), 0)
         pivot = tl.sum(tl.where(column == j, by_row, 0.0), 0)
         value = tl.sum(tl.where(column == j, moment, 0.0), 0)
-        # a direction without weight gets no part of the solution
+        # the coefficient of a direction without weight is 0
         inverse = tl.where(pivot > least, 1.0 / tl.where(pivot > least, pivot, 1.0), 0.0)
         here = column == j
         moment = tl.where(here, value * inverse, moment - by_column * (value * inverse))
@@ -153,7 +153,7 @@ def concentration_kernel(
             step += 1
     tl.store(beta_out + program * N + column, beta, mask=column < N)
     tl.store(scale_out + program, scale)
-    # the sign says whether the last step lowered the scale
+    # negative where the last step lowered the scale
     tl.store(steps_out + program, tl.where(falling, -step - 1, step))
 
 
