@@ -31,11 +31,8 @@ from mkc_torch.linear import (
     Ridge,
     SRegression,
 )
+from tests.draws import normal as sample
 from tests.shared_data import shared_data
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def rotation(seed: int) -> Tensor:

@@ -24,16 +24,9 @@ from mkc_torch.density.likelihood import (
     normaliser_derivatives,
 )
 from mkc_torch.linear import LeastSquares, MKCRegression
+from tests.draws import normal, uniform
 
 KAPPAS = [0.0, 1e-9, 1e-3, 0.019, 0.021, 0.049, 0.051, 1.0, 50.0, 400.0]
-
-
-def normal(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def uniform(seed: int, *shape: int) -> Tensor:
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def contaminated(seed: int, count: int, share: float = 0.2, low: float = -20.0, high: float = 20.0) -> Tensor:

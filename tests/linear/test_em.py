@@ -16,14 +16,8 @@ from mkc_torch.functional import mkc_nll
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, RankDeficientError
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._robust_start import robust_start
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def uniform(seed: int, *shape: int) -> Tensor:
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+from tests.draws import normal as sample
+from tests.draws import uniform
 
 
 def line(seed: int, N: int = 100, n: int = 3, share: float = 0.2) -> tuple[Tensor, Tensor]:

@@ -15,13 +15,10 @@ from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
 from mkc_torch.linear._problem import checked_shapes, linear_problem
 from mkc_torch.linear._rows import Rows, blocks
+from tests.draws import normal
 
 N = 24_000
 """Rows of a fit that starts with a pilot."""
-
-
-def normal(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,7 @@ from mkc_torch.linear import (
     SRegression,
 )
 from mkc_torch.linear._estimator import LinearEstimator
+from tests.draws import normal as sample
 
 N, n = 20, 3
 CPU = torch.device("cpu")
@@ -106,10 +107,6 @@ def cases(prop: str, *, robust: bool = False) -> list[object]:
 @pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
 def dtype(request) -> torch.dtype:
     return request.param
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def data(seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device = CPU) -> tuple[Tensor, Tensor]:

@@ -15,11 +15,7 @@ from torch import Tensor
 from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.linear import MKCRegression
 from mkc_torch.nonlinear import GaussianPrior, fit, minimise
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
+from tests.draws import normal as sample
 
 T = torch.linspace(0, 4, 120, dtype=torch.float64)
 TRUTH = torch.tensor([3.0, 0.7, 0.5], dtype=torch.float64)

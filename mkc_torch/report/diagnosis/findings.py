@@ -278,11 +278,9 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
     return tuple(a for a in finding.alternatives if not a.separable)
 
 
-def rivals(finding: Finding, most: int = 3) -> str:
+def rivals(finding: Finding) -> str:
     """Return the names of the inseparable alternatives; empty if there are none."""
-    each = list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding)))
-    text = ", ".join(each[:most])
-    return term("number.and_more", first=text, count=len(each) - most) if len(each) > most else text
+    return several(list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding))), 3)
 
 
 def _rival(alternative: Alternative, finding: Finding) -> str:

@@ -251,21 +251,18 @@ def _least(value: float, surrogates: int) -> bool:
     return surrogates > 0 and value <= (1.0 + 1e-9) / (1 + surrogates)
 
 
-def gain(held_out: HeldOut, *, short: bool = False) -> str:
+def gain(held_out: HeldOut) -> str:
     """Format the gain on held-out data with its interval, to the digits of the interval.
 
     Example:
-        >>> held_out = HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT")
-        >>> gain(held_out), gain(held_out, short=True)
-        ('+0.312 nats per sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
+        >>> gain(HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT"))
+        '+0.312 nats per sample (95 %: 0.281 to 0.350)'
     """
     value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
     text = number(value, places)
     signed = text if text.startswith("−") else f"+{text}"
-    if short:
-        return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
     if not known:
         return term("evidence.gain_alone", gain=signed)
     return term("evidence.gain", gain=signed, low=number(low, places), high=number(high, places))
