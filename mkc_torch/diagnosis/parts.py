@@ -31,11 +31,9 @@ __all__ = [
     "Reference",
     "Region",
     "ResidualSizes",
-    "Row",
     "Separability",
     "SmoothCorrection",
     "StateMap",
-    "Table",
     "Traces",
     "value_of",
 ]
@@ -44,29 +42,8 @@ Number = float | tuple["Number", ...]
 
 
 @dataclass(frozen=True)
-class Row:
-    """A line of facts; ``in_terminal`` shows it on the terminal. The label "driven by" adds it to the driver's line."""
-
-    label: str
-    text: str
-    in_terminal: bool = True
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report; its first column is the heading of each row, ``note`` explains how to read it."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-
-@dataclass(frozen=True)
 class EvidenceResult:
-    """The result of a test of evidence, for a finding or the whole diagnosis; report, terminal and JSON loop over it.
-
-    Texts name effects by their ids, and numbers as Python prints them.
+    """The result of a test of evidence, for a finding or the whole diagnosis.
 
     Attributes:
         test: its id.
@@ -74,18 +51,12 @@ class EvidenceResult:
         content: what ``diagnosis.json`` contains as ``evidence.<test>``: JSON, or results of this file.
         keys: the same for tests with keys of their own in the finding or the diagnosis; a mapping is merged into an
             existing object.
-        warnings: sentences.
-        rows: facts.
-        table: of the report.
     """
 
     test: str
     value: Any = None
     content: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    rows: tuple[Row, ...] = ()
-    table: Table | None = None
 
 
 def value_of(evidence: Sequence[EvidenceResult], test: str, default: Any = None) -> Any:
@@ -303,8 +274,8 @@ class Finding:
 class DensityCheck:
     """Distances of a channel's residuals from the density and from a Student-t distribution.
 
-    The distances are Kolmogorov's, between distribution functions. ``allowed`` is the distance that one in a thousand
-    sets of as many independent samples exceeds. ``closer`` is True if a Student-t is clearly closer.
+    The distances are Kolmogorov's, between distribution functions. ``allowed`` is the distance that sets of as many
+    independent samples exceed with probability ``level``. ``closer`` is True if a Student-t is clearly closer.
     """
 
     channel: str
@@ -313,6 +284,7 @@ class DensityCheck:
     degrees_of_freedom: float
     allowed: float
     closer: bool
+    level: float = 0.001
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import torch
 from mkc_torch._parallel.deadline import within
 from mkc_torch._support.note import notes_of, warnings_of
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
-from mkc_torch.diagnosis.evidence.rejected import called
 from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.evidence_warnings import called, evidence_warnings
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
 from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
@@ -251,7 +251,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
             *prepared.warnings,
             *warnings_of(whole.drivers.warnings),
             *_time_warnings(prepared),
-            *answers.warnings,
+            *evidence_warnings(answers),
             *(_no_size(finding) for finding in without_size),
             *(doubt for finding in findings for doubt in finding.doubts),
         ),

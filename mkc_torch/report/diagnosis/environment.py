@@ -8,7 +8,8 @@ from mkc_torch._support.unit_text import sized, tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
-from mkc_torch.diagnosis.result import Diagnosis, Table
+from mkc_torch.diagnosis.result import Diagnosis
+from mkc_torch.report.diagnosis.evidence import Table
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
