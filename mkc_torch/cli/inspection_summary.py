@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mkc_torch._words.terms import term
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER
 from mkc_torch.cli.recorded import read_magnetometer
 from mkc_torch.recording.formats.base import RecordingError
@@ -70,7 +69,7 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
     console.print()
     console.print(Text(str(seen.path), style="bold"), soft_wrap=True)
     for command in [*commands, *_diagnoses(seen)]:
-        console.print(Text.assemble(f"{term('label.to_do'):<8}", (command, "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{'to do':<8}", (command, "cyan")), soft_wrap=True)
     for topic in seen.topics:
         console.print(Text(_about(topic)), soft_wrap=True)
         console.print(_columns(topic))
