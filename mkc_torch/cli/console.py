@@ -347,7 +347,7 @@ class _PartColumn(ProgressColumn):
 
     steps: Steps | None = None
 
-    def render(self, task: Task) -> Text:  # noqa: ARG002
+    def render(self, task: Task) -> Text:  # noqa: ARG002 - signature of rich
         """Return the current text."""
         return Text("" if self.steps is None else self.steps.part_done)
 

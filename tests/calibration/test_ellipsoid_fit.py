@@ -527,7 +527,7 @@ def test_half_of_the_points_equal_gives_no_nan():
     try:
         fit = EllipsoidFit().fit(points)
     except NotIdentifiableError as error:
-        assert "Not identifiable" in str(error)  # noqa: PT017
+        assert "Not identifiable" in str(error)  # noqa: PT017 - the message is the point
     else:
         torch.testing.assert_close(fit.semi_axes_, AXES, rtol=0, atol=1.0)
 
@@ -872,7 +872,7 @@ def test_arrays_and_frames_are_fitted_as_tensors_of_the_same_numbers_are(library
     with pytest.raises(ValueError, match=r"`points` with the columns of the fit, `mag_x`, .* but got `mag_z`"):
         got.calibrate(frame[names[::-1]])
     with pytest.raises(AttributeError):
-        got.fit(points).feature_names_in_  # noqa: B018
+        got.fit(points).feature_names_in_
 
 
 def test_a_point_of_no_weight_can_be_anything_in_an_array_too():

@@ -15,7 +15,7 @@ POINTS = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0], dtype=torch.float64)
 
 def primal(X: np.ndarray, y: np.ndarray, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     """(35)-(38) by sequential quadratic programming over the probabilities."""
-    N, n, l, k = *X.shape, z.shape[-1], v.shape[-1]  # noqa: E741
+    N, n, l, k = *X.shape, z.shape[-1], v.shape[-1]  # noqa: E741 - the paper's name
 
     def split(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return u[: n * l].reshape(n, l), u[n * l :].reshape(N, k)

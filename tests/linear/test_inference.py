@@ -355,7 +355,7 @@ def test_arguments(estimator):
     with pytest.raises(ValueError, match="`level`"):
         estimator().fit(*line(40, 30)).confidence_interval(95.0)
     with pytest.raises(NotFittedError):
-        estimator().standard_error_  # noqa: B018
+        estimator().standard_error_
     with pytest.raises(NotFittedError):
         estimator().summary()
 

@@ -300,7 +300,7 @@ def test_a_result_that_the_estimator_lacks_is_not_blamed_on_a_missing_fit():
     X, Y = torch.randn(20, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
     fitted = LeastAbsoluteDeviations().fit(X, Y)
     with pytest.raises(AttributeError, match=r"its results are .*coef_") as error:
-        fitted.standard_error_  # noqa: B018
+        fitted.standard_error_
     assert "first" not in str(error.value)
     with pytest.raises(AttributeError, match="call fit"):
-        LeastAbsoluteDeviations().coef_  # noqa: B018
+        LeastAbsoluteDeviations().coef_

@@ -201,7 +201,7 @@ def test_result_before_fit_raises_not_fitted(estimator, name):
 
 def test_unknown_attribute_is_not_called_unfitted():
     with pytest.raises(AttributeError, match="no attribute 'slope'") as raised:
-        LeastSquares().slope  # noqa: B018
+        LeastSquares().slope
     assert not isinstance(raised.value, NotFittedError)
 
 

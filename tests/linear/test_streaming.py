@@ -223,7 +223,7 @@ def test_predictions_weights_intervals_and_summary():
     assert (mine.num_values, mine.num_light, mine.kind) == (other.num_values, other.num_light, "sandwich")
     assert (fit.history_.diff() <= 1e-12).all()
     with pytest.raises(AttributeError, match=r"weights\(X, Y\)"):
-        fit.weights_  # noqa: B018
+        fit.weights_
     with pytest.raises(ValueError, match="Expected argument `Y` of shape"):
         fit.weights(X, Y[:-1])
 
@@ -239,7 +239,7 @@ def test_parameters_are_shown_and_set():
     assert "pilot=100" in repr(fit)
     assert fit.set_params(pilot=200).get_params()["pilot"] == 200
     with pytest.raises(NotFittedError, match=r"fit\(batches\)"):
-        fit.coef_  # noqa: B018
+        fit.coef_
 
 
 # --- resuming

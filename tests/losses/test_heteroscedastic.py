@@ -182,8 +182,8 @@ def test_gradcheck_in_input_target_sigma_and_d():
     leaves = [t.requires_grad_() for t in data(3, 2)]
     weight = torch.tensor([[1.0, 0.5], [0.0, 2.0], [1.5, 0.2]], dtype=torch.float64)
     for loss in (HeteroscedasticMKCLoss(30.0), HeteroscedasticMKCLoss(torch.tensor([9.0, 40.0]), reduction="none")):
-        assert gradcheck(lambda *t: loss(*t, weight), leaves, check_forward_ad=True)  # noqa: B023
-        assert gradgradcheck(lambda *t: loss(*t, weight), leaves)  # noqa: B023
+        assert gradcheck(lambda *t: loss(*t, weight), leaves, check_forward_ad=True)  # noqa: B023 - called in this round of the loop
+        assert gradgradcheck(lambda *t: loss(*t, weight), leaves)  # noqa: B023 - called in this round of the loop
 
 
 def test_vmap_of_the_loss_and_its_gradient_equals_a_loop():

@@ -251,7 +251,7 @@ class Once(torch.autograd.Function):
         return torch.exp(x)
 
     @staticmethod
-    def setup_context(ctx, inputs, output):  # noqa: ARG004
+    def setup_context(ctx, inputs, output):
         ctx.save_for_backward(output)
         ctx.save_for_forward(output)
 

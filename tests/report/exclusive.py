@@ -281,7 +281,7 @@ class _Rows(HTMLParser):
         self.rows: list[str] = [""]
         self.inside = 0
 
-    def handle_starttag(self, tag: str, attrs: Sequence[tuple[str, str | None]]) -> None:  # noqa: ARG002
+    def handle_starttag(self, tag: str, attrs: Sequence[tuple[str, str | None]]) -> None:
         self.inside += tag in self.SKIPPED
         self.rows[-1] += " "
 

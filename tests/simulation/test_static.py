@@ -13,10 +13,10 @@ from mkc_torch.simulation import Parameter, SimulationError, Static
 class Thermistor(Static):
     inputs = ("temperature",)
     outputs = ("voltage",)
-    parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}  # noqa: RUF012
-    units = {"voltage": "V"}  # noqa: RUF012
+    parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}
+    units = {"voltage": "V"}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"voltage": p.bottom + p.slope * u.temperature}
 
 
@@ -52,10 +52,10 @@ def test_the_driver_of_an_output_is_found(simulation):
 class Joint(Static):
     inputs = ("command",)
     outputs = ("angle",)
-    parameters = {"scale": 1.0}  # noqa: RUF012
-    units = {"command": "rad", "angle": "rad"}  # noqa: RUF012
+    parameters = {"scale": 1.0}
+    units = {"command": "rad", "angle": "rad"}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"angle": p.scale * u.command}
 
 
@@ -105,9 +105,9 @@ def test_parameters_that_the_data_cannot_determine_are_named():
     class Divider(Static):
         inputs = ("current",)
         outputs = ("voltage",)
-        parameters = {"upper": 2.0, "lower": 4.0, "unused": 1.0}  # noqa: RUF012
+        parameters = {"upper": 2.0, "lower": 4.0, "unused": 1.0}
 
-        def output(self, time, u, p):  # noqa: ARG002
+        def output(self, time, u, p):
             return {"voltage": p.upper / p.lower * u.current}
 
     warnings = " ".join(Divider().prepare(recording()).warnings)
@@ -122,7 +122,7 @@ class Odd(Thermistor):
         super().__init__()
         self.value = value
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return self.value(u)
 
 

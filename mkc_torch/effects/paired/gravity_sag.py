@@ -52,10 +52,10 @@ class GravitySag(Effect):
     recurrence = "a sag changes over a wide range of angles and with the load, an offset does not"
     source = "Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), 8.1"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"phase": phase} for phase in (0.0, -0.7, 0.7))
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("sag", len(context.channels), context.signal_unit),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

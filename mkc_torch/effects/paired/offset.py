@@ -43,7 +43,7 @@ class Offset(GainEffect):
     recurrence = "an offset is also there without a signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return torch.ones_like(context.time)
 
 

@@ -159,7 +159,7 @@ def test_the_order_of_the_parts_makes_no_difference(case, answers):
 def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
     def ahead(case):
         with pytest.raises(AssertionError):
-            case.final  # noqa: B018
+            case.final
         return case.seed, case.number
 
     def test(case):

@@ -23,10 +23,10 @@ class Lag(Dynamics):
 
     states = ("level",)
     inputs = ("drive",)
-    parameters = {"rate": Parameter(2.0, lower=0.0)}  # noqa: RUF012
+    parameters = {"rate": Parameter(2.0, lower=0.0)}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": p.rate * (u.drive - x.level)}
 
 

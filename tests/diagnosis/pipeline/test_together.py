@@ -22,16 +22,16 @@ from tests.simulation.tumbling import tumbling
 class Decay(Dynamics):
     states = ("level",)
     outputs = ("level",)
-    parameters = {"rate": 0.8}  # noqa: RUF012
+    parameters = {"rate": 0.8}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 
 class Line(Static):
     inputs, outputs, parameters = ("heat",), ("voltage",), {"slope": 1.0}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"voltage": p.slope * u.heat}
 
 
@@ -83,9 +83,9 @@ def rounded_offsets(result):
 
 class Coast(Dynamics):
     states, inputs, parameters = ("speed",), ("force",), {"gain": 1.0}
-    units = {"speed": "m/s"}  # noqa: RUF012
+    units = {"speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.gain * u.force - 0.1 * x.speed}
 
 
