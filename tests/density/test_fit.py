@@ -443,11 +443,9 @@ def test_weights_that_are_negative_or_all_zero_are_refused(weight):
 
 def test_weights_of_another_shape_are_refused_with_a_remedy():
     error = normal(0, 10, 10)
-    with pytest.raises(
-        ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(10,\); .*weight\[:, None\]"
-    ):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\).*got \(10,\);.*weight\[:, None\]"):
         fit_density(error, weight=torch.ones(10))
-    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(3, 10\)\."):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\).*got \(3, 10\)\."):
         fit_density(error, weight=torch.ones(3, 10))
     with pytest.raises(ValueError, match=r"`weight` .* channels of the sums \[0\.0\]"):
         fit_density(error[:, :1], weight=torch.zeros(10, 1))
@@ -470,17 +468,17 @@ def test_residuals_of_another_type_are_refused_with_a_remedy(error, message):
 
 
 def test_a_missing_channel_dimension_is_refused_with_a_remedy():
-    with pytest.raises(ValueError, match=r"but got \(1000,\); .*error\[:, None\]"):
+    with pytest.raises(ValueError, match=r"but got \(1000,\);.*error\[:, None\]"):
         fit_density(torch.zeros(1000))
-    with pytest.raises(ValueError, match=r"at least one channel but got \(10, 0\)"):
+    with pytest.raises(ValueError, match=r"at least one channel.*got \(10, 0\)"):
         fit_density(torch.zeros(10, 0))
 
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
 def test_parameters_that_are_not_numbers_or_of_another_shape_are_refused(name):
-    with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=rf"`{name}`.*number.*got 'a'"):
         fit_density(normal(0, 10, 2), **{name: "a"})
-    with pytest.raises(ValueError, match=rf"`{name}` to be a number or of shape \(m,\) or \(2,\) but got \(3,\)"):
+    with pytest.raises(ValueError, match=rf"`{name}`.*number or of shape \(m,\) or \(2,\).*got \(3,\)"):
         fit_density(normal(0, 10, 2), **{name: torch.full((3,), 9.0)})
 
 
@@ -527,7 +525,7 @@ def test_barrons_line_has_the_published_likelihood():
 def test_residuals_whose_squares_overflow_are_refused(dtype, size):
     error = torch.linspace(-1.0, 1.0, 50, dtype=dtype).unsqueeze(-1)
     error[3] = size
-    with pytest.raises(ValueError, match=r"`error` within .*, beyond which squares overflow, but got 1e\+"):
+    with pytest.raises(ValueError, match=r"`error` within.*, beyond which squares overflow.*got 1e\+"):
         fit_density(error)
 
 

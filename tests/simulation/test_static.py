@@ -173,17 +173,17 @@ def test_modules_that_cannot_be_used():
     ],
 )
 def test_other_objects_than_modules_are_refused(module, got):
-    with pytest.raises(TypeError, match=rf"`module` to be a torch\.nn\.Module but got {got}"):
+    with pytest.raises(TypeError, match=rf"`module`.*torch\.nn\.Module.*got {got}"):
         Static(module, inputs=("temperature",), outputs=("voltage",))
 
 
 def test_text_is_refused_as_a_sequence_of_names():
     line = torch.nn.Linear(1, 1)
-    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got 'ab'; write \('ab',\)"):
+    with pytest.raises(TypeError, match=r"`inputs`.*tuple of names of columns.*got 'ab'; write \('ab',\)"):
         Static(line, inputs="ab", outputs=("voltage",))
-    with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'voltage'; write"):
+    with pytest.raises(TypeError, match=r"`outputs`.*tuple of names of columns.*got 'voltage'; write"):
         Static(line, inputs=("temperature",), outputs="voltage")
-    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got \(3,\)"):
+    with pytest.raises(TypeError, match=r"`inputs`.*tuple of names of columns.*got \(3,\)"):
         Static(line, inputs=(3,), outputs=("voltage",))
 
     class Letters(Thermistor):
@@ -191,7 +191,7 @@ def test_text_is_refused_as_a_sequence_of_names():
 
     with pytest.raises(TypeError, match=r"but got 'temperature'; write \('temperature',\)"):
         Letters()
-    with pytest.raises(TypeError, match="`name` to be text but got 3"):
+    with pytest.raises(TypeError, match=r"`name`.*text.*got 3"):
         Static(line, inputs=("temperature",), outputs=("voltage",), name=3)
 
 
@@ -205,5 +205,5 @@ def test_text_is_refused_as_a_sequence_of_names():
     ],
 )
 def test_other_objects_than_recordings_are_refused_with_the_remedy(value, remedy):
-    with pytest.raises(TypeError, match=f"`recording` to be a Recording but got .*; {remedy}"):
+    with pytest.raises(TypeError, match=rf"`recording`.*Recording.*; {remedy}"):
         Thermistor().prepare(value)

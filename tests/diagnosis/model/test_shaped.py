@@ -171,5 +171,5 @@ def test_an_empty_range_raises(wrong):
     fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
     term = fit.model.terms[-1]
     effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()
-    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation .*limit, softness.* but got `\w+`"):
+    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation.*limit, softness.*got `\w+`"):
         reach_of(replace(term, effect=effect), fit.model.prepared)
