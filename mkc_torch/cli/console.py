@@ -317,7 +317,7 @@ def _stage(steps: Steps) -> str:
 
 def _note(steps: Steps, folder: Path, elapsed: float) -> None:
     """Add a line on the current stage to ``progress.txt``."""
-    with suppress(OSError):  # the work goes on without the file
+    with suppress(OSError):  # the command continues without the file
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "progress.txt").open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {_stage(steps)}\n")

@@ -1,4 +1,4 @@
-"""Rows of warnings and notes: warnings in the order of their weight, then notes in few lines, the others counted."""
+"""Rows of warnings and notes: warnings first, by importance; then notes in few lines, with a count of the rest."""
 
 from __future__ import annotations
 

@@ -25,12 +25,12 @@ class GravitySag(Effect):
     """A joint sags under its load: most where the link is level, not at all where it hangs.
 
     A servo without integral action holds a load with a static error: the load's torque over its stiffness. Over a small
-    range of angles a sag is indistinguishable from an offset, which is preferred.
+    range of angles a sag is indistinguishable from an offset, and the offset is preferred.
 
     Simulation: adds ``γ cos(y − φ)`` to an output y that is an angle.
     Drivers: the output only.
-    Units: γ in the output's unit; the angle ``phase``, φ, at which the link is level, in rad, within 1 rad of zero:
-        farther away a sag would be equivalent to a scale error.
+    Units: γ in the output's unit; φ, the parameter ``phase``, is the angle at which the link is level, within
+        ±1 rad; beyond, a sag would be equivalent to a scale error.
     Plausible: up to 0.5 rad.
     Source: static error of a proportional joint controller under gravity; Spong, Hutchinson & Vidyasagar, "Robot
         Modeling and Control" (2006), 8.1.
@@ -64,7 +64,7 @@ class GravitySag(Effect):
 
 
 class SeveralSag(GravitySag):
-    """A sag of all joints, one for each; they are level at the same angle.
+    """A sag of each joint; all joints are level at the same angle.
 
     Simulation: adds ``γ cos(y − φ)`` to each output y.
     Drivers: the outputs only.

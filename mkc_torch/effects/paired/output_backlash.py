@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["OutputBacklash", "SeveralBacklash"]
 
 _START = 1e-9
-"""Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 there is none."""
+"""Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 it does not exist."""
 
 
 class OutputBacklash(Effect):

@@ -60,7 +60,7 @@ def _unit_of(system: Equations, name: str) -> str:
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
     """Whether the rate of a state depends on the states of its unit only by their difference to an input."""
     time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
-    # a parameter of 0 would hide what it multiplies
+    # a parameter of 0 would hide the term that it multiplies
     p = Names(**{parameter: torch.tensor(known[parameter].value or 1.0).double() for parameter in known})
 
     def rate(of_states: float, of_input: float) -> torch.Tensor:
