@@ -7,7 +7,7 @@ import torch
 
 from mkc_torch._support.side_by_side import forced
 from mkc_torch.linear import LeastSquares, MKCRegression, SRegression
-from tests.device import __main__, small_fits
+from tests.device import __main__, other_fits, small_fits
 
 CPU = torch.device("cpu")
 
@@ -51,3 +51,13 @@ def test_the_command_runs_the_section(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["tests.device", "--device", "cpu", "--only", "small_fits"])
     __main__.main()
     assert "us a fit" in capsys.readouterr().out
+
+
+def test_other_fits_agree_where_the_path_of_a_gpu_is_forced(monkeypatch, capsys):
+    with forced():
+        assert other_fits.print_other_fits(CPU)
+    assert "ellipsoids" in capsys.readouterr().out
+    # a result that differs fails the check
+    values = iter([torch.ones(2), torch.tensor([1.0, 1.1])])
+    monkeypatch.setattr(other_fits, "WORK", {"one": lambda _device: next(values)})
+    assert not other_fits.print_other_fits(CPU)

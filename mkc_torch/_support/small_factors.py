@@ -316,11 +316,19 @@ def _round_robin(half: int, device: torch.device) -> Tensor:
 def symmetric_pinv(matrix: Float[Tensor, "*batch n n"], rtol: float | None = None) -> Float[Tensor, "*batch n n"]:
     """Pseudo-inverse of symmetric matrices; eigenvalues of size up to ``rtol`` times the largest count as 0.
 
-    Off the CPU with first and second derivatives, as of an inverse.
+    Off the CPU with first and second derivatives, as of an inverse, and by Cholesky's factor where all matrices are
+    safely positive definite, for which one value is read.
     """
     eps = torch.finfo(matrix.dtype).eps
     if not _small(matrix):
         return torch.linalg.pinv(matrix, hermitian=True, rtol=rtol)
+    if (rtol or 0.0) <= 1e2 * matrix.shape[-1] * eps:
+        size = matrix.detach().diagonal(dim1=-2, dim2=-1)
+        unit = torch.where(size > 0, size, 1.0).rsqrt()
+        outer = unit.unsqueeze(-1) * unit.unsqueeze(-2)
+        inverse, strict = definite_inverse(matrix.detach() * outer)
+        if bool(strict.all()):
+            return _with_derivatives(inverse * outer, matrix)
     values, vectors = symmetric_eigen(matrix)
     size = values.abs()
     limit = max(rtol or 0.0, 4 * matrix.shape[-1] * eps) * size.amax(-1, keepdim=True)

@@ -97,7 +97,7 @@ def minimax(
             at = moving.nonzero().squeeze(-1)
             if len(at) == 0:
                 break
-        matrix = torch.cat([_take(everywhere[at], basis[at]), sign[at].unsqueeze(-1)], -1)
+        matrix = torch.cat([everywhere[at.unsqueeze(-1), basis[at]], sign[at].unsqueeze(-1)], -1)
         solution = solve(matrix, centred[at].gather(1, basis[at]).unsqueeze(-1)).squeeze(-1)
         beta[at], height[at] = solution[:, :n], solution[:, n]
         residual = centred[at] - torch.matmul(everywhere[at], beta[at].unsqueeze(-1)).squeeze(-1)
@@ -117,7 +117,7 @@ def minimax(
         patient = stalled[at] <= _STALLED
         enter = torch.where(patient, over.argmax(-1), beyond.to(torch.uint8).argmax(-1)).unsqueeze(-1)
         enter_sign = torch.where(residual.gather(1, enter) < 0, -1.0, 1.0).to(target)
-        column = torch.cat([_take(everywhere[at], enter).squeeze(1), enter_sign], -1)
+        column = torch.cat([everywhere[at, enter.squeeze(-1)], enter_sign], -1)
         both = torch.stack([column, last.expand_as(column)], -1)
         share, dual = solve(matrix.mT, both).unbind(-1)
         falls = share * enter_sign * sign[at]

@@ -14,10 +14,11 @@ from mkc_torch._support.arguments import refuse_complex, refuse_no_tensor, refus
 from mkc_torch._support.side_by_side import at_once, side_by_side
 from mkc_torch._support.small_factors import solve
 from mkc_torch._support.small_factors import solve_gram as solve_gram
-from mkc_torch._support.torch_internals import is_wrapped
+from mkc_torch._support.torch_internals import forward_mode_is_active, is_wrapped
 from mkc_torch.linear._basis import RankDeficientError as RankDeficientError
 from mkc_torch.linear._basis import orthonormalise
 from mkc_torch.linear._basis import refuse_dependent as refuse_dependent
+from mkc_torch.linear._concentration import runs_kernel, weighted_fits
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -80,8 +81,16 @@ class LinearProblem:
 
     def weighted_fit(self, weight: Float[Tensor, "B *S N m"]) -> Float[Tensor, "B *S n"]:
         """Weighted least-squares coefficients in the basis; sample weights are multiplied in."""
+        if runs_kernel(self) and not self._derived(weight):
+            fitted = weighted_fits(self, weight if weight.dim() == 4 else weight.unsqueeze(1))
+            return fitted if weight.dim() == 4 else fitted.squeeze(1)
         gram, moment = self.normal_equations(weight)
         return solve_gram(gram, moment)
+
+    def _derived(self, weight: Tensor) -> bool:
+        """Whether a derivative or a transform of a fit with these weights is wanted."""
+        recorded = torch.is_grad_enabled() and any(v.requires_grad for v in (self.basis, self.Y, weight))
+        return recorded or is_wrapped(weight) or forward_mode_is_active()
 
     def normal_equations(
         self, weight: Float[Tensor, "B *S N m"]

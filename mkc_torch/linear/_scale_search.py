@@ -19,6 +19,7 @@ from torch import Tensor
 from mkc_torch._support.elemental_sets import drawn_of_used, drawn_samples
 from mkc_torch._support.side_by_side import at_once, side_by_side, steps_between_tests
 from mkc_torch._support.small_factors import solve
+from mkc_torch.linear._concentration import ScaleOptions, concentrate, runs_kernel
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 class ScaleRule(Protocol):
     """A robust scale of residuals (B, S, N, m); ``near`` is a first guess of the scale, if known."""
+
+    def options(self, problem: LinearProblem) -> ScaleOptions:
+        """The scale as the kernel takes it."""
+        ...
 
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]: ...
 
@@ -140,11 +145,25 @@ def _of_starts(values: Float[Tensor, "B S k"], index: Float[Tensor, "B K"]) -> F
     return values.gather(1, index.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
 
 
+def scale_of(
+    problem: LinearProblem, beta: Float[Tensor, "B S n"], rule: ScaleRule, near: Tensor | None = None
+) -> Float[Tensor, "B S m"]:
+    """The scale of the residuals of each start."""
+    if runs_kernel(problem):
+        return concentrate(problem, beta, rule.options(problem), near=near).scale
+    return rule.scale(problem, problem.residual(beta), near)
+
+
 def _best(
     problem: LinearProblem, beta: Tensor, near: Tensor | None, rule: ScaleRule, count: int
 ) -> tuple[Tensor, Tensor]:
     """The coefficients with the ``count`` smallest scales, and these scales."""
-    scale = rule.scale(problem, problem.residual(beta), near)
+    return _smallest(beta, scale_of(problem, beta, rule, near), count)
+
+
+def _smallest(
+    beta: Float[Tensor, "B S n"], scale: Float[Tensor, "B S m"], count: int
+) -> tuple[Float[Tensor, "B K n"], Float[Tensor, "B K m"]]:
     order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
     return _of_starts(beta, order), _of_starts(scale, order)
 
@@ -238,22 +257,42 @@ def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search:
     near: Tensor | None = None
     if search.ranking is not None:
         beta, near = _best(problem, beta, None, search.ranking, max(search.candidates, beta.shape[1] // search.raw))
+    # without ranking a step may lower the scale so much that the last scale is not a good guess
+    keeps = near is not None
+    if runs_kernel(problem):
+        options, steps = search.screening.options(problem), search.screening_steps
+        found = concentrate(problem, beta, options, near=near, max_iter=steps, keeps=keeps)
+        return _smallest(found.beta, found.scale, search.candidates)
     for _ in range(search.screening_steps):
         beta, now = _step(problem, beta, search.screening, near)
-        # without ranking a step may lower the scale so much that the last scale is not a good guess
-        near = None if near is None else now
+        near = now if keeps else None
     return _best(problem, beta, near, search.screening, search.candidates)
 
 
 def _descended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
     """Iterate every candidate that has not converged."""
+    if runs_kernel(problem):
+        end = concentrate(
+            problem,
+            found.beta,
+            search.final.options(problem),
+            near=found.scale,
+            max_iter=search.max_iter,
+            tolerance=_tolerance(found.beta, search),
+        )
+        return _Candidates(end.beta, end.scale, end.converged, found.n_iter + end.n_iter)
     values = problem.num_samples * problem.num_channels * found.beta.shape[1]
     return _in_parts(problem, values, lambda some, part: _descend(some, found.select(part), search))
 
 
+def _tolerance(beta: Tensor, search: ScaleSearch) -> float:
+    """Decrease of the log scale that is not rounding."""
+    return max(search.tolerance, 1e2 * torch.finfo(beta.dtype).eps)
+
+
 def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
     """As :func:`_descended`, for a part; problems whose candidates have all converged leave it."""
-    tolerance = max(search.tolerance, 1e2 * torch.finfo(found.beta.dtype).eps)
+    tolerance = _tolerance(found.beta, search)
     beta, near, moving = found.beta.clone(), found.scale, ~found.converged
     objective = torch.full(beta.shape[:2], math.inf, dtype=beta.dtype, device=beta.device)
     scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near.clone()

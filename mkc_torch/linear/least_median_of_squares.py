@@ -17,11 +17,11 @@ from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import elemental_starts, values_of_sets
+from mkc_torch.linear._scale_search import elemental_starts, scale_of, values_of_sets
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, checked_h
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 EXHAUSTIVE_SETS = 30_000
 """Largest number of sets of n + 1 values that are all tried."""
@@ -179,7 +179,7 @@ def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S 
     """The candidates with the smallest objective, evaluated in parts that fit in memory."""
     values = problem.Y[0].numel() * problem.Y.shape[0]
     parts = beta.split(at_once(beta, values, _CHUNK), 1)
-    objective = torch.cat([_log_product(rule.scale(problem, problem.residual(part))) for part in parts], 1)
+    objective = torch.cat([_log_product(scale_of(problem, part, rule)) for part in parts], 1)
     order = objective.topk(min(_CANDIDATES, beta.shape[1]), dim=1, largest=False).indices
     return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
 
@@ -198,9 +198,7 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
         largest = scale.amax(-1, keepdim=True)
         eps = torch.finfo(scale.dtype).eps
         unit = torch.where(largest > 0, scale / largest, 1.0).clamp(min=eps)
-        counts = rule.weight(residual, scale) > 0
-        if problem.sample_weight is not None:
-            counts = counts & (problem.sample_weight > 0).unsqueeze(1)
+        counts = _counted(problem, rule, residual, scale)
         used, share = counts.flatten(-2), (1.0 / unit).unsqueeze(-2).expand_as(residual).flatten(-2)
         at, of = (moving & _determined(rows, used)).nonzero(as_tuple=True)
         if at.numel() == 0:
@@ -221,6 +219,24 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
     best = objective.argmin(1)
     index = torch.arange(B, device=beta.device)
     return _Refined(beta[index, best], n_iter, ~moving[index, best])
+
+
+def _counted(
+    problem: LinearProblem, rule: QuantileScale, residual: Float[Tensor, "B K N m"], scale: Float[Tensor, "B K m"]
+) -> Bool[Tensor, "B K N m"]:
+    """The values within the quantile; of those equal to it but for rounding the first, as many as it needs.
+
+    A Chebyshev fit has n + 1 residuals of this size, among which rounding would choose.
+    """
+    size = residual.abs()
+    equal = 64 * torch.finfo(size.dtype).eps * problem.Y.abs().amax(-2)[:, None, None] + 1e-12 * scale.unsqueeze(-2)
+    below, tied = size < scale.unsqueeze(-2) - equal, size <= scale.unsqueeze(-2) + equal
+    weight = torch.ones_like(problem.Y) if problem.sample_weight is None else problem.sample_weight
+    own = weight.unsqueeze(1)
+    needed = rule.fraction * problem.total_weight()[:, None, None] - (own * below).sum(-2, keepdim=True)
+    first = own * (tied & ~below)
+    before = first.cumsum(-2) - first
+    return (below | (tied & (before < needed * (1.0 - 1e-12)))) & (own > 0)
 
 
 def _determined(rows: Float[Tensor, "#B R n"], used: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.side_by_side import at_once, steps_between_tests
 from mkc_torch._support.small_factors import symmetric_pinv
+from mkc_torch.linear._concentration import QUANTILE, TRIMMED, ScaleOptions
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, coefficients_a_value
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -52,6 +53,9 @@ class TrimmedScale:
     def _count(self, problem: LinearProblem) -> int:
         return max(1, round(self.fraction * problem.num_samples))
 
+    def options(self, problem: LinearProblem) -> ScaleOptions:
+        return ScaleOptions(TRIMMED, self._count(problem))
+
     def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self.weighted(problem, residual)[0]
 
@@ -77,9 +81,14 @@ class QuantileScale:
 
     fraction: float
 
+    def _count(self, problem: LinearProblem) -> int:
+        return max(1, round(self.fraction * problem.num_samples))
+
+    def options(self, problem: LinearProblem) -> ScaleOptions:
+        return ScaleOptions(QUANTILE, self._count(problem))
+
     def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
-        h = max(1, round(self.fraction * problem.num_samples))
-        return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
+        return order_statistic(residual.abs(), stacked(problem.sample_weight), self._count(problem))
 
     def weighted(
         self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None

@@ -14,6 +14,7 @@ from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.small_factors import symmetric_pinv
+from mkc_torch.linear._concentration import M_SCALE, ScaleOptions
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import (
     ScaleInfluence,
@@ -43,6 +44,17 @@ class MScale:
     c: float = BISQUARE_50
     breakdown: float = 0.5
 
+    def options(self, problem: LinearProblem) -> ScaleOptions:
+        return ScaleOptions(
+            M_SCALE,
+            self._first_rank(problem),
+            self.c,
+            self.breakdown,
+            problem.coefficients_per_channel,
+            self.steps,
+            self.steps >= _EXACT,
+        )
+
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self._solved(problem, residual, residual.square() if self.steps else residual, near)
 
@@ -56,9 +68,11 @@ class MScale:
     def _first(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
         """First guess of the scale: a quantile that is 0 exactly where s is 0; it is not for a fit through p values."""
         w = None if problem.sample_weight is None else problem.sample_weight.unsqueeze(1)
+        return 1.4826 * order_statistic(residual.abs(), w, self._first_rank(problem))
+
+    def _first_rank(self, problem: LinearProblem) -> int:
         N, p = problem.num_samples, problem.coefficients_per_channel
-        rank = min(N, math.ceil(N - self.breakdown * max(N - p, 0) - 1e-9))
-        return 1.4826 * order_statistic(residual.abs(), w, rank)
+        return min(N, math.ceil(N - self.breakdown * max(N - p, 0) - 1e-9))
 
     def _inner(self, square: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
         """``max(1 - (r / (c s))², 0)``: its square is the weight, its cube 1 - ρ."""

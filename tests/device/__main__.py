@@ -14,12 +14,25 @@ import torch
 
 from tests.device.agreement import print_agreement
 from tests.device.fits import print_fits
+from tests.device.other_fits import print_other_fits
 from tests.device.other_losses import print_other_losses
 from tests.device.rows import print_rows
 from tests.device.small_fits import print_small_fits
 from tests.device.speed import print_capture, print_steps, print_training, print_variants
 
-SECTIONS = ("agreement", "steps", "training", "capture", "compiled", "variants", "other", "fits", "small_fits", "rows")
+SECTIONS = (
+    "agreement",
+    "steps",
+    "training",
+    "capture",
+    "compiled",
+    "variants",
+    "other",
+    "fits",
+    "small_fits",
+    "rows",
+    "other_fits",
+)
 
 
 def main() -> None:
@@ -42,12 +55,13 @@ def main() -> None:
         "variants": lambda: print_variants(device, sizes[-1]),
         "other": lambda: print_other_losses(device),
         "fits": lambda: print_fits(device, large=1_000_000 if gpu else 20_000, many=10_000 if gpu else 50),
+        "other_fits": lambda: print_other_fits(device),
         "rows": lambda: print_rows(device, (1_000_000, 10_000_000) if gpu else (20_000,)),
         "small_fits": lambda: print_small_fits(
             device,
             many=100_000 if gpu else 20,
             few=2000 if gpu else 4,
-            compared=2000,
+            compared=300,
             ellipsoids=1_000_000 if gpu else 3,
         ),
     }

@@ -20,7 +20,11 @@ from triton.compiler import ASTSource
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
 from mkc_torch.linear._blocks import Density
+from mkc_torch.linear._concentration import concentrate, weighted_fits
 from mkc_torch.linear._fused_pass import fused_pass
+from mkc_torch.linear._problem import linear_problem
+from mkc_torch.linear.least_trimmed_squares import TrimmedScale
+from mkc_torch.linear.s_regression import MScale
 from mkc_torch.losses.kernels.cached import CachedKernel
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -99,6 +103,24 @@ def training_steps() -> Iterator[str]:
         fused_pass(X, y, y, beta, density, with_curvature=curvature, weights=y[:, None].clone())
         return f"rows, {name}"
 
+    def starts(name: str, samples: int, columns: int, rule: MScale | TrimmedScale, *, weighted: bool = False) -> str:
+        X = torch.eye(samples, columns, dtype=torch.float64) + 1.0
+        y = torch.ones(samples, dtype=torch.float64)
+        problem = linear_problem(X, y, y if weighted else None)
+        beta, near = torch.ones(1, 16, columns, dtype=torch.float64), torch.ones(1, 16, 1, dtype=torch.float64)
+        options = {"near": near, "tolerance": 1e-7} if isinstance(rule, MScale) else {}
+        concentrate(problem, beta, rule.options(problem), max_iter=20, **options)
+        return f"starts, {name}"
+
+    def fits(name: str, samples: int, columns: int) -> str:
+        X, y = torch.eye(samples, columns, dtype=torch.float64) + 1.0, torch.ones(samples, dtype=torch.float64)
+        weighted_fits(linear_problem(X, y, y), torch.ones(1, 3, samples, 1, dtype=torch.float64))
+        return f"fits, {name}"
+
+    yield fits("six columns, weighted", 300, 6)
+    yield starts("two columns, M-scale", 100, 2, MScale(30))
+    yield starts("six columns, trimmed", 300, 6, TrimmedScale(0.5))
+    yield starts("twelve columns, many weighted samples", 1500, 12, MScale(2), weighted=True)
     yield rows("float32, nine columns", torch.float32, 9, curvature=False)
     yield rows("float64, nine columns, curvature", torch.float64, 9, curvature=True)
     yield rows("float32, 32 columns, curvature", torch.float32, 32, curvature=True)

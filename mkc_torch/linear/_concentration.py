@@ -1,0 +1,200 @@
+"""Concentration steps of every start of every problem in one kernel, for small problems of one channel on a GPU.
+
+A program takes one start of one problem: residual, scale, weights, normal equations and solution stay in registers, and
+the samples in the cache. In separate operations each of these would be read from and written to memory for all starts.
+Everything is float64, whatever the type of the samples.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.torch_internals import is_wrapped
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from mkc_torch.linear._problem import LinearProblem
+    from mkc_torch.losses.kernels.cached import CachedKernel
+
+_MOST_COLUMNS = 12
+"""Most columns: the normal equations are unrolled, and compile for seconds beyond."""
+
+_MOST_SAMPLES = 4096
+"""Most samples, all of which a program holds in registers."""
+
+_VALUES = 96
+"""Most values of X of a thread, which registers hold in part; a program of one warp needs no barriers."""
+
+_OWN_VALUES = 6
+"""Values that a thread holds of a sample besides those of X."""
+
+_MOST_WARPS = 16
+"""Most warps of a program."""
+
+QUANTILE, TRIMMED, M_SCALE = 0, 1, 2
+"""Numbers of the scales in the kernel."""
+
+
+class ScaleOptions(NamedTuple):
+    """A scale as the kernel takes it.
+
+    Attributes:
+        rule: :data:`QUANTILE`, :data:`TRIMMED` or :data:`M_SCALE`.
+        rank: rank of the order statistic: the quantile, the number of values kept, or the first guess of an M-scale.
+        c, breakdown, lost: constant of the bisquare, mean of ρ, and coefficients that its sum loses.
+        newton: most Newton steps for an M-scale.
+        exact: whether these solve for it to rounding.
+    """
+
+    rule: int
+    rank: float
+    c: float = 1.0
+    breakdown: float = 0.5
+    lost: float = 0.0
+    newton: int = 0
+    exact: bool = False
+
+
+class Concentrated(NamedTuple):
+    """Coefficients, the scale at them, whether the last step did not lower it, and the number of steps."""
+
+    beta: Float[Tensor, "B S n"]
+    scale: Float[Tensor, "B S 1"]
+    converged: Bool[Tensor, "B S"]
+    n_iter: int
+
+
+def runs_kernel(problem: LinearProblem) -> bool:
+    """Whether concentration steps on this problem are one kernel: one channel, few columns and samples, on a GPU."""
+    return problem.Y.is_cuda and suits_kernel(problem)
+
+
+def suits_kernel(problem: LinearProblem) -> bool:
+    """Whether the kernel takes problems of this size."""
+    return (
+        problem.num_samples > 1
+        and problem.num_channels == 1
+        and problem.num_coefficients <= _MOST_COLUMNS
+        and problem.num_samples <= _MOST_SAMPLES
+        and not is_wrapped(problem.Y)
+        and find_spec("triton") is not None
+    )
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> tuple[CachedKernel, CachedKernel]:
+    """Kernels of concentration steps and of weighted fits."""
+    # these modules need Triton
+    from mkc_torch.linear._concentration_kernel import concentration_kernel, weighted_fit_kernel
+    from mkc_torch.losses.kernels.cached import CachedKernel
+
+    return CachedKernel(concentration_kernel), CachedKernel(weighted_fit_kernel)
+
+
+@lru_cache(maxsize=64)
+def _on_device(values: tuple[float, ...], device: torch.device) -> Float[Tensor, " 6"]:
+    # the cached tensor outlives an inference mode in which it was created
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.float64, device=device)
+
+
+class _Data(NamedTuple):
+    """A problem as the kernels take it: columns, targets and sample weights with their numbers, and constants."""
+
+    tensors: tuple[Tensor, Tensor, Tensor]
+    numbers: tuple[int, int, int]
+    columns: int
+    block: int
+    warps: int
+    weighted: bool
+
+
+def _data(problem: LinearProblem) -> _Data:
+    kept: _Data | None = problem.__dict__.get("_kept_data")
+    if kept is not None:
+        return kept
+    columns = problem.basis.detach()[:, :, 0].mT.contiguous()
+    y = problem.Y.detach().contiguous()
+    weight = y if problem.sample_weight is None else problem.sample_weight.detach().contiguous()
+    block = 1 << max(problem.num_samples - 1, 31).bit_length()
+    kept = _Data(
+        (columns, y, weight),
+        (problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(), weight[0].numel()),
+        max(1 << (problem.num_coefficients - 1).bit_length(), 2),
+        block,
+        _warps(block * max(problem.num_coefficients, _OWN_VALUES)),
+        problem.sample_weight is not None,
+    )
+    problem.__dict__["_kept_data"] = kept
+    return kept
+
+
+def _warps(values: int) -> int:
+    """Warps of a program that holds so many values."""
+    threads = -(-values // _VALUES)
+    return min(1 << max(0, -(-threads // 32) - 1).bit_length(), _MOST_WARPS)
+
+
+def concentrate(
+    problem: LinearProblem,
+    beta: Float[Tensor, "B S n"],
+    options: ScaleOptions,
+    *,
+    near: Float[Tensor, "B S 1"] | None = None,
+    max_iter: int = 0,
+    tolerance: float = -torch.inf,
+    keeps: bool = True,
+) -> Concentrated:
+    """Make concentration steps from every start, each until its log scale falls by no more than ``tolerance``.
+
+    Args:
+        problem: small problems of one channel.
+        beta: starts, in the basis.
+        options: the scale.
+        near: first guess of an M-scale at the starts.
+        max_iter: most steps; 0 computes the scale at the starts.
+        tolerance: minus infinity makes ``max_iter`` steps in any case.
+        keeps: whether the scale before a step is the first guess after it.
+    """
+    count, starts, n = beta.shape
+    given = _data(problem)
+    beta, near = beta.detach().contiguous(), None if near is None else near.detach().contiguous()
+    found, scale = torch.empty_like(beta), beta.new_empty(count, starts, 1)
+    steps = torch.empty(count, starts, dtype=torch.int32, device=beta.device)
+    tiny = torch.finfo(torch.float64).tiny ** 0.5
+    values = (options.rank, options.c, options.breakdown, options.lost, tolerance, tiny)
+    _kernels()[0].launch(
+        (count * starts, 1, 1),
+        (
+            *given.tensors, beta, scale if near is None else near, _on_device(values, beta.device), found, scale, steps,
+        ),
+        (
+            starts, *given.numbers, max_iter,
+            int(near is not None), int(keeps), options.newton, int(options.exact),
+        ),
+        (n, given.columns, given.block, options.rule, given.weighted),
+        given.warps,
+    )  # fmt: skip
+    most = int(torch.where(steps < 0, -steps - 1, steps).max()) if max_iter > 0 and tolerance > -torch.inf else max_iter
+    return Concentrated(found, scale, steps >= 0, most)
+
+
+def weighted_fits(problem: LinearProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:
+    """Weighted least-squares coefficients in the basis; a direction without weight gets no part of the solution."""
+    count, sets = weight.shape[:2]
+    given, n = _data(problem), problem.num_coefficients
+    found = weight.new_empty(count, sets, n)
+    _kernels()[1].launch(
+        (count * sets, 1, 1),
+        (*given.tensors, weight.detach().contiguous(), found),
+        (sets, *given.numbers),
+        (n, given.columns, given.block, given.weighted),
+        given.warps,
+    )
+    return found
