@@ -69,7 +69,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Also write the calibration as px4, ardupilot, c-header, ros-yaml or json; repeatable.",
+            help="Also write the calibration as px4, ardupilot, c-header, ros-yaml, imu-calib or json; repeatable.",
         ),
     ] = None,
     instance: INSTANCE = None,
