@@ -69,12 +69,14 @@ class Outcome:
         failed: whether ``text`` is an error.
         note: a sentence on a choice made for the user.
         interrupted: whether the user stopped the search.
+        doubtful: whether the result must be looked at before it is used.
     """
 
     text: str
     failed: bool
     note: str = ""
     interrupted: bool = False
+    doubtful: bool = False
 
 
 def is_file_of_a_simulation(name: str) -> bool:

@@ -11,10 +11,12 @@ from typing import Literal, NamedTuple
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding, notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
-from mkc_torch.report.words.numbers import size
+from mkc_torch.report.diagnosis.unseen import residual_of_all
+from mkc_torch.report.words.numbers import share, size
 from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
@@ -51,15 +53,15 @@ class RunPaths(NamedTuple):
 
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
-structure.
+"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit, unnamed
+structure, or another doubt.
 """
 
 
 def tone(diagnosis: Diagnosis) -> Tone:
     """Return the style of the headline."""
     d = diagnosis
-    if d.verdict in ("unfit", "unexplained"):
+    if d.verdict in ("unfit", "unexplained") or {"not_better", "much_rejected"} & set(diagnosis_doubts(d)):
         return "open"
     if any(worth_correcting(f) for f in d.findings):
         return "found"
@@ -69,9 +71,21 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences, the findings by grade; a disturbed measurement comes first."""
-    disturbance = disturbed(diagnosis.rejected_intervals)
-    return f"{disturbance} {_verdict(diagnosis)}" if disturbance else _verdict(diagnosis)
+    """Return the verdict in a few sentences, the findings by grade; a doubt and a disturbed measurement come first."""
+    first = (_doubtful(diagnosis), disturbed(diagnosis.rejected_intervals))
+    return " ".join(filter(None, [*first, _verdict(diagnosis)]))
+
+
+def _doubtful(diagnosis: Diagnosis) -> str:
+    """Return the reasons for doubt that the verdict does not state; empty if there are none."""
+    found = diagnosis_doubts(diagnosis)
+    reasons = []
+    if "not_better" in found:
+        sizes = "; ".join(residual_of_all(diagnosis))
+        reasons.append("the findings do not make the residual smaller" + (f" ({sizes})" if sizes else ""))
+    if "much_rejected" in found:
+        reasons.append(f"{share(rejected_share(diagnosis))} of the samples were rejected")
+    return f"Doubtful: {' and '.join(reasons)}." if reasons else ""
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
