@@ -29,6 +29,7 @@ from mkc_torch.cli.units_option import (
     LABEL_HELP,
     SENSOR_HELP,
     parsed_units,
+    reading_options,
     split_trailing_pairs,
 )
 
@@ -115,6 +116,7 @@ def calibrate(
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
     units = parsed_units(conversions, unit_label)
     refuse_same_names(recordings)
+    read_with = reading_options(parsed_columns(columns), conversions, unit_label, sensor)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
@@ -151,7 +153,7 @@ def calibrate(
         for path in recordings:
             results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
             with step.aside():
-                counts = show_results(console, path, results)
+                counts = show_results(console, path, results, read_with)
             total += len(results)
             failed += counts.failed
             doubtful += counts.doubtful

@@ -44,6 +44,7 @@ from mkc_torch.cli.units_option import (
     LABEL_HELP,
     SENSOR_HELP,
     parsed_units,
+    reading_options,
     split_trailing_pairs,
 )
 
@@ -134,6 +135,7 @@ def diagnose(
         quick=quick,
         time_limit=_time_limit(time_limit),
         force=force,
+        read_with=reading_options(_columns(columns, run_column), conversions, unit_label, sensor),
     )
     refuse_same_names(recordings)
     with loading():

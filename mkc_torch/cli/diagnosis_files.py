@@ -235,8 +235,7 @@ def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
         options += ["--simulator-output", str(request.simulator_output)]
     elif request.simulation != MAGNETOMETER:
         options += ["--simulation", request.simulation]
-    if request.columns:
-        options += ["--columns", ",".join(f"{name}={column}" for name, column in request.columns.items())]
+    options += request.read_with
     return RunPaths(str(path), str(folder / "model.json"), tuple(options))
 
 

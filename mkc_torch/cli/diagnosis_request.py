@@ -53,6 +53,7 @@ class Request:
     time_limit: float | None = None
     force: bool = False
     report: bool = True
+    read_with: tuple[str, ...] = ()
 
     @property
     def undecided(self) -> bool:

@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
 from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding, notices
-from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
+from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all
 from mkc_torch.report.words.numbers import share, size
 from mkc_torch.report.words.verdict import disturbed
@@ -103,15 +103,19 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 def _found(findings: Sequence[Finding]) -> str:
     sentences = []
-    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH, _CANNOT_BE):
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _NOT_TESTED, _UNCONFIRMED, _BOTH, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
-            sentences.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
+            names = "; ".join(_named(f, alone=len(findings) == 1) for f in of_it)
+            sentences.append(
+                f"Found, but {NOT_TESTED}: {names}." if kind == _NOT_TESTED else term(kind, findings=names)
+            )
     return " ".join(sentences)
 
 
 _LEFT_OUT, _NEAREST = "verdict.left_out", "verdict.nearest"
 _CANNOT_BE = "verdict.cannot_be"
+_NOT_TESTED = "not tested"
 _SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.unconfirmed_and_small"
 
 
@@ -119,6 +123,8 @@ def _kind(finding: Finding) -> str:
     """Return the key of the sentence that lists a finding."""
     if finding.grade == "unconfirmed" and finding.cannot_be:
         return _CANNOT_BE
+    if finding.grade == "unconfirmed" and finding.held_out is None:
+        return _NOT_TESTED
     if finding.grade == "unconfirmed":
         return _BOTH if small(finding) else _UNCONFIRMED
     return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
@@ -157,6 +163,8 @@ def unexplained(diagnosis: Diagnosis) -> str:
         return ""
     if any(unrecorded(f) for f in d.findings):
         return term("verdict.course_alone")
+    if d.quick and d.findings:
+        return ""  # a finding may explain the structure, but a quick look does not test this
     return term("verdict.yet_structure" if found else "verdict.structure")
 
 

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.report.diagnosis.verdict import headline, tone
@@ -47,3 +48,13 @@ def test_unconfirmed_findings_alone_are_a_doubt():
     found = make_diagnosis(1)
     unconfirmed = dataclasses.replace(found, findings=(dataclasses.replace(found.findings[0], grade="unconfirmed"),))
     assert "unconfirmed" in diagnosis_doubts(unconfirmed)
+
+
+def test_a_quick_look_says_that_it_tested_no_held_out_blocks():
+    found = make_diagnosis(1)
+    untested = dataclasses.replace(found.findings[0], grade="unconfirmed", evidence=())
+    quick = dataclasses.replace(found, quick=True, verdict="unexplained", p_value=None, findings=(untested,))
+    assert headline(quick).startswith("Found, but not tested on held-out blocks:")
+    assert "no effect in the catalogue" not in headline(quick)
+    assert advice_of(quick) == ("Confirm it by a full diagnosis.",)
+    assert {"unexplained", "unconfirmed"} <= set(diagnosis_doubts(quick))
