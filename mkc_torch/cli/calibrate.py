@@ -116,7 +116,7 @@ def calibrate(
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
     units = parsed_units(conversions, unit_label)
     refuse_same_names(recordings)
-    read_with = reading_options(parsed_columns(columns), conversions, unit_label, sensor)
+    read_with = reading_options(names, conversions, unit_label)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
@@ -147,13 +147,15 @@ def calibrate(
         exports=exports,
         to=Destination(instance, device_id),
         earth=earth,
+        read_with=read_with,
     )
+    shown_with = reading_options(names, conversions, unit_label, sensor)
     console, total, failed, doubtful, left = out(), 0, 0, 0, list(recordings)
     with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
             results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
             with step.aside():
-                counts = show_results(console, path, results, read_with)
+                counts = show_results(console, path, results, shown_with)
             total += len(results)
             failed += counts.failed
             doubtful += counts.doubtful
