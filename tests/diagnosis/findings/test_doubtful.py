@@ -1,4 +1,4 @@
-"""A result that must be looked at says so in its headline, its file and its exit code."""
+"""A doubtful diagnosis is reported in the headline, in diagnosis.json and by the exit code."""
 
 import dataclasses
 import json
@@ -50,7 +50,7 @@ def test_unconfirmed_findings_alone_are_a_doubt():
     assert "unconfirmed" in diagnosis_doubts(unconfirmed)
 
 
-def test_a_quick_look_says_that_it_tested_no_held_out_blocks():
+def test_the_headline_of_a_quick_look_names_what_was_not_tested():
     found = make_diagnosis(1)
     untested = dataclasses.replace(found.findings[0], grade="unconfirmed", evidence=())
     quick = dataclasses.replace(found, quick=True, verdict="unexplained", p_value=None, findings=(untested,))
