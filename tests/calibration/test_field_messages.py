@@ -8,6 +8,7 @@ import torch
 
 from mkc_torch.calibration import Calibration, calibrate, magnetic_field_messages
 from mkc_torch.calibration.field_covariance import field_covariance, field_noise
+from mkc_torch.recording import Recording
 from mkc_torch.recording.demonstration import NOISE, simulated_recording
 
 
@@ -118,3 +119,20 @@ def test_another_unit_of_the_field(calibration):
         magnetic_field_messages(calibration, reading), magnetic_field_messages(gauss, 0.01 * reading), strict=True
     ):
         assert torch.allclose(a, b, rtol=1e-9, atol=0.0)
+
+
+def test_the_true_field_is_within_the_stated_error():
+    """The figures of docs/ros.md: random disturbances of 15 µT of two samples in five."""
+    draw = torch.Generator().manual_seed(1)
+    time = torch.arange(1500, dtype=torch.float64) / 50.0
+    about, tilt = 1.1 * time, 0.6 * (0.31 * time).sin() + 0.4 * time
+    truth = 48.0 * torch.stack([about.cos() * tilt.cos(), about.sin() * tilt.cos(), tilt.sin()], -1)
+    disturbed = torch.rand(1500, generator=draw) < 0.4
+    error = torch.where(disturbed, 15.0, 0.4)[:, None] * torch.randn(1500, 3, generator=draw, dtype=torch.float64)
+    measured = truth + torch.tensor([5.0, -3.0, 9.0]) + error
+    columns = dict(zip(("mag_x", "mag_y", "mag_z"), measured.unbind(-1), strict=True))
+    found = magnetic_field_messages(calibrate(Recording({"time": time, **columns})), measured)
+    deviation = found.magnetic_field_covariance[:, [0, 4, 8]].sqrt()
+    within = ((found.magnetic_field - 1e-6 * truth).abs() < 2.0 * deviation).double()
+    assert within[~disturbed].mean() > 0.94
+    assert 0.8 < within[disturbed].mean() < 0.95  # a disturbance across the field is not seen
