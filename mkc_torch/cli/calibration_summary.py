@@ -46,10 +46,12 @@ def show(
     compared: Differences | None = None,
     notes: Sequence[str] = (),
     source: Path | None = None,
+    read_with: Sequence[str] = (),
 ) -> None:
     """Print a summary of a calibration, its differences from an earlier one, the next command and its files.
 
-    ``notes`` are remarks on the exports, ``source`` is the recording.
+    ``notes`` are remarks on the exports, ``source`` is the recording, which was read with the options
+    ``read_with``.
     """
     console.print()
     console.print(_headline(c.name or c.recording or "recording", c))
@@ -59,7 +61,8 @@ def show(
     if compared is not None:
         _show_differences(console, compared)
     if files and source is not None:
-        command = f"mkc apply {shlex.quote(str(files[0]))} {shlex.quote(str(source))} --output corrected.csv"
+        words = ("mkc", "apply", str(files[0]), str(source), *read_with, "--output", "corrected.csv")
+        command = shlex.join(words)
         console.print(Text(f"{'to do':<{_LABEL + 3}}{command}"), soft_wrap=True)
     _print_files(console, files)
 

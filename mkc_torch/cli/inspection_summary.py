@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import asdict
 from typing import Any
@@ -16,6 +17,9 @@ from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.inspection import FileSeen, SensorSeen, TopicSeen
 
 __all__ = ["as_data", "commands_of", "show"]
+
+_MOST_PROPOSED = 3
+"""Most commands that are proposed for columns that may be a magnetometer."""
 
 
 def commands_of(seen: FileSeen) -> tuple[list[str], list[str]]:
@@ -68,7 +72,7 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
     commands, notes = found
     console.print()
     console.print(Text(str(seen.path), style="bold"), soft_wrap=True)
-    for command in [*commands, *_diagnoses(seen)]:
+    for command in [*commands, *_if_named(seen), *_diagnoses(seen)]:
         console.print(Text.assemble(f"{'to do':<8}", (command, "cyan")), soft_wrap=True)
     for topic in seen.topics:
         console.print(Text(_about(topic)), soft_wrap=True)
@@ -80,6 +84,15 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
         )
     for sentence in notes:
         console.print(Text(f"note: {sentence}"), soft_wrap=True)
+
+
+def _if_named(seen: FileSeen) -> list[str]:
+    """Return the commands that calibrate the columns that may be a magnetometer, if there are few."""
+    options = re.findall(r"`(--columns [^`]+)`", seen.question or "")
+    if not 1 <= len(options) <= _MOST_PROPOSED:
+        return []
+    path = shlex.quote(str(seen.path))
+    return [f"mkc calibrate {path} {option} --output results  (if this is a magnetometer)" for option in options]
 
 
 def _diagnoses(seen: FileSeen) -> list[str]:

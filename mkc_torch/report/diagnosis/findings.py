@@ -53,6 +53,10 @@ _BOUNDS = {
 }
 
 
+NOT_TESTED = "not tested on held-out blocks"
+"""Grade of a finding whose held-out blocks were not computed, as in a quick look."""
+
+
 def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = "") -> str:
     """Return the name of an effect with its drivers and its port; the name depends on the kind of quantity.
 
@@ -253,6 +257,8 @@ def grade(finding: Finding) -> str:
     """
     if finding.grade == "unconfirmed" and finding.cannot_be:
         return "not confirmed: impossible size"
+    if finding.grade == "unconfirmed" and finding.held_out is None:
+        return NOT_TESTED
     return _GRADES[finding.grade]
 
 

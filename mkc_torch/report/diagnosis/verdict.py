@@ -10,10 +10,12 @@ from typing import Literal, NamedTuple
 
 from mkc_torch._words.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
-from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
-from mkc_torch.report.words.numbers import size
+from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
+from mkc_torch.report.diagnosis.unseen import residual_of_all
+from mkc_torch.report.words.numbers import share, size
 from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
@@ -50,15 +52,15 @@ class RunPaths(NamedTuple):
 
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
-structure.
+"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit, unnamed
+structure, or another doubt.
 """
 
 
 def tone(diagnosis: Diagnosis) -> Tone:
     """Return the style of the headline."""
     d = diagnosis
-    if d.verdict in ("unfit", "unexplained"):
+    if d.verdict in ("unfit", "unexplained") or {"not_better", "much_rejected"} & set(diagnosis_doubts(d)):
         return "open"
     if any(worth_correcting(f) for f in d.findings):
         return "found"
@@ -68,9 +70,21 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences, the findings by grade; a disturbed measurement comes first."""
-    disturbance = disturbed(diagnosis.rejected_intervals)
-    return f"{disturbance} {_verdict(diagnosis)}" if disturbance else _verdict(diagnosis)
+    """Return the verdict in a few sentences, the findings by grade; a doubt and a disturbed measurement come first."""
+    first = (_doubtful(diagnosis), disturbed(diagnosis.rejected_intervals))
+    return " ".join(filter(None, [*first, _verdict(diagnosis)]))
+
+
+def _doubtful(diagnosis: Diagnosis) -> str:
+    """Return the reasons for doubt that the verdict does not state; empty if there are none."""
+    found = diagnosis_doubts(diagnosis)
+    reasons = []
+    if "not_better" in found:
+        sizes = "; ".join(residual_of_all(diagnosis))
+        reasons.append("the findings do not make the residual smaller" + (f" ({sizes})" if sizes else ""))
+    if "much_rejected" in found:
+        reasons.append(f"{share(rejected_share(diagnosis))} of the samples were rejected")
+    return f"Doubtful: {' and '.join(reasons)}." if reasons else ""
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
@@ -88,19 +102,21 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 def _found(findings: Sequence[Finding]) -> str:
     sentences = []
-    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH, _CANNOT_BE):
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _NOT_TESTED, _UNCONFIRMED, _BOTH, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
-            sentences.append(kind.format(findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
+            names = "; ".join(_named(f, alone=len(findings) == 1) for f in of_it)
+            sentences.append(kind.format(findings=names))
     return " ".join(sentences)
 
 
 _LEFT_OUT, _NEAREST = "Left out of the simulation: {findings}.", "Nearest in the catalogue: {findings}."
 _CANNOT_BE = "Found, but of an impossible size: {findings}."
+_NOT_TESTED = f"Found, but {NOT_TESTED}: {{findings}}."
 _SMALL, _UNCONFIRMED, _BOTH = (
     "Real, but small compared with the noise: {findings}.",
     "Found, but not confirmed on held-out blocks: {findings}.",
-    ("Found, but not confirmed on held-out blocks and too small to be worth correcting: {findings}."),
+    "Found, but not confirmed on held-out blocks and too small to be worth correcting: {findings}.",
 )
 
 
@@ -108,6 +124,8 @@ def _kind(finding: Finding) -> str:
     """Return the key of the sentence that lists a finding."""
     if finding.grade == "unconfirmed" and finding.cannot_be:
         return _CANNOT_BE
+    if finding.grade == "unconfirmed" and finding.held_out is None:
+        return _NOT_TESTED
     if finding.grade == "unconfirmed":
         return _BOTH if small(finding) else _UNCONFIRMED
     return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
@@ -162,6 +180,8 @@ def unexplained(diagnosis: Diagnosis) -> str:
         return ""
     if any(unrecorded(f) for f in d.findings):
         return "Only its course over time is known."
+    if d.quick and d.findings:
+        return ""  # a finding may explain the structure, but a quick look does not test this
     return "Structure remains that no effect in the catalogue explains." if found else VERDICT_SENTENCES["unexplained"]
 
 
