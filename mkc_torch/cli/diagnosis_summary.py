@@ -110,7 +110,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield term("label.held_out"), "\n".join(filter(None, [change, *more]))
     yield from rows(f.evidence, terminal=True)
     if sentences.inseparable(f):
-        yield _striking("label.or"), term("evidence.cannot_distinguish", rivals=sentences.rivals(f))
+        yield _striking("label.or"), term("evidence.cannot_distinguish", rivals=sentences.rivals(f, sizes=True))
     if not f.plausible:
         yield _striking("label.doubtful"), typeset(f.plausibility) or term("evidence.no_plausible_size")
 

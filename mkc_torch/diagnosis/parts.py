@@ -184,7 +184,8 @@ class Alternative:
 
     ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` states whether it recurs in
     another recording. ``distinguishing_state`` is what to record to distinguish it from the finding, if the recording
-    does not.
+    does not. ``parameters`` are its fitted parameters in place of the finding, with those of its shape; empty for an
+    alternative that was not fitted to the end, such as a separable one.
     """
 
     effect: str
@@ -194,6 +195,7 @@ class Alternative:
     port: str = ""
     recurrence: str = ""
     distinguishing_state: str = ""
+    parameters: tuple[EffectParameter, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.evidence.rejected import called
 from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.alternatives import with_parameters
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
 from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
@@ -284,13 +285,14 @@ def _finding(
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
     if whole.in_short:
         return replace(finding, grade=grade_in_short(finding))
+    others = with_parameters(finding.alternatives, found[number], final, number, whole.options.settings.noise)
     shape = None
     if whole.final.model.prepared.dynamics is not None:
         shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
     grade = grade_of(finding)
     if shape is not None and shape.curve is not None:
         grade = "nearest"
-    return replace(finding, grade=grade, shape=shape)
+    return replace(finding, grade=grade, shape=shape, alternatives=others)
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:
