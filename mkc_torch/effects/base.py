@@ -88,8 +88,8 @@ class Effect(ABC):
             and largest value, as shares where it is relative or continuous. ``change`` and ``quantities`` must accept
             it as a tensor, and ``change`` must be differentiable in it. An always positive one is fitted as its
             logarithm.
-        natural_ends: name of a fitted shape parameter or of the amplitude to the ends of its range, "least" or
-            "greatest", that are ordinary values; an estimate at any other end is doubtful. Default none.
+        natural_ends: name of a fitted shape parameter to the ends of its range, "least" or "greatest", that are
+            ordinary values; an estimate at any other end is doubtful. Default none.
         form_parameters: names of shape parameters that choose a form and are not measured; the equation states them.
         shape_units: name of a shape parameter to its unit, for those whose unit does not depend on the recording;
             default s for onset, lag, delay and time_constant.

@@ -74,17 +74,12 @@ def far_from_plausible(term: Term, gamma: Tensor, context: Context) -> str:
     largest, most = float(gamma[: first.size].abs().max()), term.effect.upper
     name = first.name.replace("_", " ")
     # an upper bound of 1 is a share, which may be 1
-    if 1.0 < most < math.inf and _near(largest, most) and not _natural_end(term, first.name):
+    if 1.0 < most < math.inf and _near(largest, most):
         return f"Its {name} ended at {sized(most, tidy(first.unit))}, the upper bound: the recording does not limit it."
     times = times_plausible(term, gamma, context)
     if times is not None and times > FAR:
         return f"Its {name} is {times:.2g} times the largest plausible size ({term.effect.source})."
     return ""
-
-
-def _natural_end(term: Term, name: str) -> bool:
-    """Whether the upper bound of an effect's amplitude is a limiting case, such as a first store without capacity."""
-    return "greatest" in term.effect.natural_ends.get(name, ())
 
 
 def times_plausible(term: Term, gamma: Tensor, context: Context) -> float | None:
@@ -232,10 +227,9 @@ def parameters_of(
         value, spread = gamma[mine], error[mine]
         start += quantity.size
         components = _components(term, quantity.name, quantity.size, context)
-        # in a limiting case the likelihood is flat, and a symmetric error would include 0
-        at_end = _natural_end(term, quantity.name) and _near(float(value.abs().max()), term.effect.upper)
-        known = None if at_end else _numbers(spread)
-        parameters.append(EffectParameter(quantity.name, _numbers(value), known, tidy(quantity.unit), components))
+        parameters.append(
+            EffectParameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components)
+        )
     return tuple(parameters)
 
 

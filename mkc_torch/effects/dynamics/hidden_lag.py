@@ -21,9 +21,6 @@ SHARES = (0.005, 0.015, 0.05, 0.15)
 """Time constants to search, as shares of the longest run."""
 
 
-_AT_END = 0.99
-"""Share of its upper bound from which the store's capacity is a lower limit."""
-
 _EXAMPLES = {
     "temperature": ": a wall, furniture, a housing, the vessel itself",
     "speed": ": a load on a slipping coupling, a liquid carried along",
@@ -50,7 +47,6 @@ class HiddenLag(RateEffect):
     continuous: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
     upper = 30.0
-    natural_ends: Mapping[str, tuple[str, ...]] = {"share": ("greatest",)}  # a state with nearly no store of its own
     gain = "share"
     plot_axis = ""
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
@@ -79,8 +75,7 @@ class HiddenLag(RateEffect):
         known = self.stores.get(kind_at(context), "a second store")
         evens_out = "catching up" if kind_at(context) in MOTION else "exchanging"
         time = duration(float(shape["time_constant"]))
-        least = "at least " if float(gamma[0]) > _AT_END * self.upper else ""
-        return f"{known}, {least}{share_of(float(gamma[0]))} of the first, {evens_out} in {time}"
+        return f"{known}, {share_of(float(gamma[0]))} of the first, {evens_out} in {time}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return f"There is {self.store(gamma, shape, context)}, that is not in the equations."
