@@ -305,7 +305,6 @@ TERMS: dict[str, str] = {
     "table.without": "log-likelihood gain, [unit.nats]",
     "table.candidate": "candidate",
     "table.less_likely": "log-likelihood gap, [unit.nats]",
-    "table.parameters": "fitted parameters in place of the finding",
     "table.distinguished": "does this recording distinguish them?",
     "table.held_out_blocks": "[unit.unseen_blocks]",
     "table.residual": "residual, [unit.rms]",

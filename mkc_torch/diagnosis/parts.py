@@ -237,7 +237,7 @@ class Finding:
     ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
     ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its
     shape at the ends of their ranges.
-    ``likelier`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
+    ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
     ``evidence`` has the results of the tests of evidence.
@@ -267,7 +267,7 @@ class Finding:
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
-    likelier: bool = False
+    clearly_better: bool = False
     grade: Grade = "left_out"
     shape: ShapeCheck | None = None
     evidence: tuple[EvidenceResult, ...] = ()

@@ -95,7 +95,7 @@ def is_zero_within_error(finding: Finding) -> bool:
     flat, as for the capacity of a large second store, and the standard error larger than the size (Hauck & Donner,
     Journal of the American Statistical Association 72 (1977), 851).
     """
-    if finding.likelier:
+    if finding.clearly_better:
         return False
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))

@@ -284,7 +284,7 @@ def _finding(
     """Return a finding with its evidence, shape check and grade."""
     quick = whole.options.quick
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
-    finding = replace(finding, likelier=_likelier(answers.case.fits, number, whole.options.settings.naming))
+    finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, whole.options.settings.naming))
     if whole.in_short:
         return replace(finding, grade=grade_in_short(finding))
     others = with_parameters(finding.alternatives, found[number], final, number, whole.options.settings.noise)
@@ -297,7 +297,7 @@ def _finding(
     return replace(finding, grade=grade, shape=shape, alternatives=others)
 
 
-def _likelier(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
+def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
     """Whether the fit without the last finding is clearly less likely, with the residual's correlation."""
     if number < len(fits) - 2:
         return False

@@ -29,7 +29,7 @@ Scores = Callable[[FittedModel], Evidence]
 def with_special_case(
     located: SearchResult, scores: Scores, blocks: HeldOutBlocks, seed: int, settings: NamingSettings
 ) -> SearchResult:
-    """Return the search result with the likeliest special case first, unless held-out blocks prefer the general form.
+    """Return the search result with the most likely special case first, unless held-out blocks prefer the general form.
 
     A general form, such as a power of the speed with any exponent, follows the errors of a nearly right special case,
     such as drag in air whose density falls. Both remain candidates that the recording does not distinguish.

@@ -30,15 +30,15 @@ def with_open_loop_gain(
     runs: Mapping[int, FittedModel],
     terms: tuple[Term, ...],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """Return the likeliest rival that clearly improves the open loop, if the likeliest candidate does not; and ranking.
+    """Return the most likely rival that clearly improves the open loop, if the most likely candidate does not; and ranking.
 
     Process noise together with a resonance or a lag can follow any residual one step ahead. What physics explains, it
-    also explains in an open-loop simulation. Where no rival does that clearly, the likeliest candidate stays.
+    also explains in an open-loop simulation. Where no rival does that clearly, the most likely candidate stays.
 
     Args:
-        best: the likeliest candidate, under its own noise.
+        best: the most likely candidate, under its own noise.
         ranking: of the candidates, best first.
-        rivals: candidates that are likelier than the simulation alone by more than their penalties.
+        rivals: candidates that are more likely than the simulation alone by more than their penalties.
         free: the open-loop fit of the simulation alone.
         runs: open-loop fits of candidates by their number, as far as they are known.
         terms: all candidates.

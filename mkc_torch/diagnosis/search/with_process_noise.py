@@ -332,7 +332,7 @@ def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn
 
 
 def _pays(base: FittedModel, fit: FittedModel, prefer: ModelPrior, settings: Settings) -> bool:
-    """Whether a candidate under its own noise is likelier than the simulation alone by more than its penalties."""
+    """Whether a candidate under its own noise is more likely than the simulation alone by more than its penalties."""
     noise = priced(fit, settings) - fit.log_likelihood - (priced(base, settings) - base.log_likelihood)
     return prefer.score_with_shape(fit, base) + noise > 0.0
 

@@ -306,7 +306,7 @@ def fitted_sizes(alternative: Alternative) -> str:
         >>> from mkc_torch.diagnosis.result import EffectParameter
         >>> drag = EffectParameter("drag", 0.00047, 0.0001, "1/m")
         >>> fitted_sizes(Alternative("quadratic_drag", (), 0.4, False, parameters=(drag,)))
-        'drag 0.00047 ± 0.00010 1/m'
+        'drag (4.7 ± 1.0) × 10⁻⁴ 1/m'
     """
     return "" if is_curve(alternative.effect) else "; ".join(largest(p) for p in alternative.parameters)
 

@@ -23,7 +23,7 @@ def term(name, *, general=False, curve=False, port="rate of speed"):
 
 
 def fit(of, better):
-    """A fit whose held-out samples are likelier by that many nats each, with noise."""
+    """A fit whose held-out samples are more likely by that many nats each, with noise."""
     return types.SimpleNamespace(model=types.SimpleNamespace(terms=[of]), better=better)
 
 

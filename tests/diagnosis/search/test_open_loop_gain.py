@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.search.ranking import Ranked
 from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
 
 AHEAD = 20.0
-"""Nats by which the likeliest candidate is ahead of its rival."""
+"""Nats by which the most likely candidate is ahead of its rival."""
 
 
 @functools.cache
@@ -51,7 +51,7 @@ def test_a_candidate_that_improves_the_open_loop_stays_first():
     assert ranking == [("quadratic_drag", 0.0), ("input_saturation", AHEAD)]
 
 
-def test_without_a_better_rival_the_likeliest_candidate_stays():
+def test_without_a_better_rival_the_most_likely_candidate_stays():
     name, ranking = leading("input_saturation", "dead_zone")
     assert name == "input_saturation"
     assert [gap for _, gap in ranking] == [0.0, AHEAD]
