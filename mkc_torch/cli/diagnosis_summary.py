@@ -109,7 +109,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield "held out", "\n".join(filter(None, [change, *more]))
     yield from rows(f.evidence, terminal=True)
     if sentences.inseparable(f):
-        yield _striking("or"), f"{sentences.rivals(f)}: this recording cannot distinguish"
+        yield _striking("or"), f"{sentences.rivals(f, sizes=True)}: this recording cannot distinguish"
     if not f.plausible:
         yield _striking("doubtful"), typeset(f.plausibility) or "no plausible size"
 

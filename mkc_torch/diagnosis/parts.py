@@ -155,7 +155,8 @@ class Alternative:
 
     ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` states whether it recurs in
     another recording. ``distinguishing_state`` is what to record to distinguish it from the finding, if the recording
-    does not.
+    does not. ``parameters`` are its fitted parameters in place of the finding, with those of its shape; empty for an
+    alternative that was not fitted to the end, such as a separable one.
     """
 
     effect: str
@@ -165,6 +166,7 @@ class Alternative:
     port: str = ""
     recurrence: str = ""
     distinguishing_state: str = ""
+    parameters: tuple[EffectParameter, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -206,6 +208,7 @@ class Finding:
     ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
     ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its
     shape at the ends of their ranges.
+    ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
     ``evidence`` has the results of the tests of evidence.
@@ -235,6 +238,7 @@ class Finding:
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
+    clearly_better: bool = False
     grade: Grade = "left_out"
     shape: ShapeCheck | None = None
     evidence: tuple[EvidenceResult, ...] = ()

@@ -308,6 +308,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "separable": a.separable,
                 **({"port": a.port} if a.port else {}),
                 **({"distinguishing_state": a.distinguishing_state} if a.distinguishing_state else {}),
+                **({"parameters": [_parameter(p) for p in a.parameters]} if a.parameters else {}),
             }
             for a in f.alternatives
         ],

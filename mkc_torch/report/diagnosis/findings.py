@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.environment import Grade, Run
 from mkc_torch.diagnosis.result import Alternative, CandidateScore, Finding, Region
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
-from mkc_torch.report.diagnosis.numbers import TimeFormat, probability
+from mkc_torch.report.diagnosis.numbers import TimeFormat, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
@@ -19,6 +19,7 @@ __all__ = [
     "acts_on",
     "driven_by",
     "finding_name",
+    "fitted_sizes",
     "grade",
     "inseparable",
     "label_name",
@@ -288,9 +289,30 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
     return tuple(a for a in finding.alternatives if not a.separable)
 
 
-def rivals(finding: Finding) -> str:
-    """Return the names of the inseparable alternatives; empty if there are none."""
-    return several(list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding))), 3)
+def rivals(finding: Finding, *, sizes: bool = False) -> str:
+    """Return the names of the inseparable alternatives; empty if there are none.
+
+    Args:
+        finding: with its alternatives.
+        sizes: also return the fitted parameters of each alternative, as far as they are known.
+    """
+    each = [
+        f"{_rival(a, finding)} with {fitted_sizes(a)}" if sizes and fitted_sizes(a) else _rival(a, finding)
+        for a in inseparable(finding)
+    ]
+    return several(list(dict.fromkeys(each)), 3)
+
+
+def fitted_sizes(alternative: Alternative) -> str:
+    """Return the fitted parameters of an alternative; empty for a free curve, and if they are not known.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import EffectParameter
+        >>> drag = EffectParameter("drag", 0.00047, 0.0001, "1/m")
+        >>> fitted_sizes(Alternative("quadratic_drag", (), 0.4, False, parameters=(drag,)))
+        'drag (4.7 ± 1.0) × 10⁻⁴ 1/m'
+    """
+    return "" if is_curve(alternative.effect) else "; ".join(largest(p) for p in alternative.parameters)
 
 
 def _rival(alternative: Alternative, finding: Finding) -> str:
