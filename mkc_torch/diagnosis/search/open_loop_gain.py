@@ -30,7 +30,7 @@ def with_open_loop_gain(
     runs: Mapping[int, FittedModel],
     terms: tuple[Term, ...],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """Return the most likely rival that clearly improves the open loop, if the most likely candidate does not; and ranking.
+    """Return the most likely rival that clearly improves the open loop if the first candidate does not; and ranking.
 
     Process noise together with a resonance or a lag can follow any residual one step ahead. What physics explains, it
     also explains in an open-loop simulation. Where no rival does that clearly, the most likely candidate stays.
