@@ -29,8 +29,12 @@ PLAIN_KAPPA = 1e-2
 """κ from which differences of sums over κ and κ² lose at most four digits, so that three sums give all derivatives."""
 
 
+_LARGEST = 1e15
+"""Limit of q in float32, whose square is finite."""
+
+
 class Memory:
-    """Float64 tensors by name that keep their memory from block to block and from batch to batch.
+    """Tensors by name that keep their memory from block to block and from batch to batch.
 
     Example:
         >>> memory = Memory()
@@ -39,14 +43,20 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self._held: dict[tuple[str, torch.device], Tensor] = {}
+        self._held: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
 
-    def of(self, name: str, shape: tuple[int, ...], device: torch.device | str = "cpu") -> Float64[Tensor, ...]:
+    def of(
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float64,
+    ) -> Tensor:
         """A tensor of this shape; its values are arbitrary, and lost at the next call with the same name."""
-        key, size = (name, torch.device(device)), math.prod(shape)
+        key, size = (name, torch.device(device), dtype), math.prod(shape)
         held = self._held.get(key)
         if held is None or held.numel() < size:
-            held = self._held[key] = torch.empty(size, dtype=torch.float64, device=device)
+            held = self._held[key] = torch.empty(size, dtype=dtype, device=device)
         return held[:size].view(shape)
 
 
@@ -71,6 +81,10 @@ def products(
     return torch.from_numpy(total)
 
 
+def _same(value: Tensor) -> Tensor:
+    return value
+
+
 class BlockSums:
     """Accumulates the sums of a pass at a point.
 
@@ -78,6 +92,7 @@ class BlockSums:
         beta, density: the point, on the CPU.
         memory: memory for intermediate results.
         device: device of the blocks.
+        dtype: float32 for blocks of float32 arrays without curvature, whose products are formed in float32.
         with_curvature: whether to form the curvature sums too.
         with_range: whether to find the range of the residuals.
     """
@@ -88,6 +103,7 @@ class BlockSums:
         density: Density,
         memory: Memory,
         device: torch.device,
+        dtype: torch.dtype = torch.float64,
         *,
         with_curvature: bool,
         with_range: bool,
@@ -95,8 +111,10 @@ class BlockSums:
         m, n = len(density.kappa), len(beta)
         self._on_cpu = device.type == "cpu"
         self._operations: Any = np if self._on_cpu else torch
-        self._device, self._memory = device, memory
-        self._beta = self._native(beta.to(device))
+        # a number on a GPU stays there
+        self._number: Any = float if self._on_cpu else _same
+        self._device, self._dtype, self._memory = device, dtype, memory
+        self._beta = self._native(beta.to(device, dtype))
         self._kappa, self._precision = density.kappa.tolist(), density.d.pow(-2).tolist()
         self._with_curvature, self._with_range = with_curvature, with_range
         # weight, residual and terms
@@ -132,40 +150,51 @@ class BlockSums:
     ) -> None:
         do, kappa, precision = self._operations, self._kappa[c], self._precision[c]
         count, x = len(y), self._native(rows)
-        vectors = self._memory.of("vectors", (5, count), self._device)
+        vectors = self._memory.of("vectors", (5, count), self._device, self._dtype)
         e, q, w, s, t = map(self._native, vectors)
         do.matmul(x, self._beta, out=e)
         do.subtract(y, e, out=e)
         do.multiply(e, e, out=q)
         q *= 0.5 * precision
+        if self._dtype == torch.float32:
+            # an infinite square times the weight 0 would be NaN
+            do.minimum(q, np.float32(_LARGEST), out=q)
         do.multiply(q, -kappa, out=w)
         do.exp(w, out=w)
         if weights is not None:
             weights[:, c] = vectors[2]
         if self._with_range:
             low, high = (e, e) if own is None else (do.where(own > 0, e, math.inf), do.where(own > 0, e, -math.inf))
-            self._low[c] = do.minimum(self._low[c], low.min())
-            self._high[c] = do.maximum(self._high[c], high.max())
+            self._low[c] = do.minimum(self._low[c], self._exact(e, x, y, low.argmin()))
+            self._high[c] = do.maximum(self._high[c], self._exact(e, x, y, high.argmax()))
         if self._with_curvature:
             self._light += do.count_nonzero(w < LIGHT)
         if own is not None:
             w *= own
         do.multiply(w, e, out=s)
         do.multiply(s, q, out=t)
-        qw, q2w = (0.5 * precision * do.dot(v, e) for v in (s, t))
+        qw, q2w = (0.5 * precision * self._number(do.dot(v, e)) for v in (s, t))
+        residual = self._number(e.sum() if own is None else do.dot(own, e))
         energy = self._energy(c, vectors[1], w, own, qw, q2w)
-        for row, value in enumerate((e.sum() if own is None else do.dot(own, e), *energy, qw, q2w), 1):
+        for row, value in enumerate((residual, *energy, qw, q2w), 1):
             self._channels[row, c] += value
         self._score[c] += do.matmul(s, x)
         if self._with_curvature:
             self._tilt[c] += do.matmul(t, x)
             self._add_curvature(c, rows, vectors, own)
 
+    def _exact(self, e: Any, x: Any, y: Any, row: Any) -> Any:
+        """The residual of a row in float64, so that the domain does not depend on how rows are cut into blocks."""
+        if self._dtype == torch.float64:
+            return e[row]
+        return float(y[row]) - float(np.dot(x[row].astype(np.float64), self._beta.astype(np.float64)))
+
     def _energy(self, c: int, q: Tensor, w: Any, own: Any, qw: Any, q2w: Any) -> Any:
         """Sums of the energy and of the terms of its first and second derivative by κ."""
         kappa = self._kappa[c]
         if kappa >= PLAIN_KAPPA:
-            value = ((len(w) if own is None else own.sum()) - w.sum()) / kappa
+            total = len(w) if own is None else self._number(own.sum())
+            value = (total - self._number(w.sum())) / kappa
             first = (value - qw) / kappa
             return value, first, (2.0 * first - q2w) / kappa
         # limited, since the cube of q would overflow
@@ -192,8 +221,8 @@ class BlockSums:
         self._moment[c] += do.matmul(plain, self._native(rows))
         self._square[c] += do.dot(plain, e)
 
-    def _native(self, values: Tensor) -> Any:
-        return values.numpy() if self._on_cpu else values
+    def _native(self, values: Any) -> Any:
+        return values.numpy() if self._on_cpu and isinstance(values, Tensor) else values
 
     def _zeros(self, *shape: int) -> Any:
         return self._native(torch.zeros(shape, dtype=torch.float64, device=self._device))

@@ -42,6 +42,13 @@ class Rows:
     weight: Shaped[Any, "N m"] | None
     frame: Float64[Tensor, "n n"] | None = None
 
+    @property
+    def is_single(self) -> bool:
+        """Whether a rough pass over these rows is in float32."""
+        on_cpu = not isinstance(self.Y, Tensor) or self.Y.device.type == "cpu"
+        given = (self.X, self.Y) if self.weight is None else (self.X, self.Y, self.weight)
+        return on_cpu and self.frame is None and all(part.dtype in (np.float32, torch.float32) for part in given)
+
     def range_at(self, coef: Float64[Tensor, " n"]) -> ResidualRange:
         """Range of the residuals."""
         extent = self.evaluate(coef, Density(*torch.ones(2, self.Y.shape[1]).double()), with_range=True).extent
@@ -57,10 +64,12 @@ class Rows:
         with_range: bool = False,
         weights: Float[Tensor, "N m"] | None = None,
         memory: Memory | None = None,
+        rough: bool = False,
     ) -> PassResult:
         """Make one pass: return the sums and what else is wanted; write the weights to ``weights``.
 
-        Coefficients, density and results are on the CPU; ``memory`` is used again by the next batch.
+        Coefficients, density and results are on the CPU; ``memory`` is used again by the next batch. A ``rough`` pass
+        over float32 rows forms products in float32, in half the time; the sums of blocks are added in float64.
         """
         if runs_kernel(self):
             # the module needs Triton
@@ -72,9 +81,11 @@ class Rows:
             )
         memory = Memory() if memory is None else memory
         device = self.Y.device if isinstance(self.Y, Tensor) else torch.device("cpu")
-        total = BlockSums(beta, density, memory, device, with_curvature=with_curvature, with_range=with_range)
+        dtype = torch.float32 if rough and not with_curvature and self.is_single else torch.float64
+        total = BlockSums(beta, density, memory, device, dtype, with_curvature=with_curvature, with_range=with_range)
         first = 0
-        for block in blocks(self.X, self.Y, self.weight, self.frame, memory=memory):
+        given = (self.X, self.Y, self.weight)
+        for block in single_blocks(*given) if dtype == torch.float32 else blocks(*given, self.frame, memory=memory):
             part = slice(first, first + len(block.y))
             total.add(block, None if weights is None else weights[part])
             first = part.stop
@@ -105,6 +116,16 @@ def blocks(
         if frame is not None:
             rows = torch.matmul(rows, frame.to(rows.device), out=memory.of("framed", rows.shape, rows.device))
         yield Block(rows, y, own, joined)
+
+
+def single_blocks(
+    X: Shaped[Any, "N m n"], Y: Shaped[Any, "N m"], weight: Shaped[Any, "N m"] | None
+) -> Iterator[Block]:
+    """Yield float32 rows on a CPU as blocks of arrays, twice as long and without a copy."""
+    arrays = [None if part is None else np.asarray(part) for part in (X, Y, weight)]
+    step = max(1, 2 * VALUES // Y.shape[-1])
+    for first in range(0, Y.shape[0], step):
+        yield Block(*(None if part is None else part[first : first + step] for part in arrays))  # type: ignore[arg-type]
 
 
 def _is_ready(values: Shaped[Any, ...]) -> bool:

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mkc_torch.density.likelihood import energy_derivatives
-from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _rows, em
-from mkc_torch.linear._blocks import Density, energy_of, kernel, residual, sums
+from mkc_torch.linear import MKCRegression, RankDeficientError, _block_sums, _large, _rows, em
+from mkc_torch.linear._blocks import Density, energy_of
 from mkc_torch.linear._descent import sandwich_of
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
@@ -315,9 +315,9 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
     X, y = sample(rows=rows)
     read = 0
 
-    def counted(*args):
+    def counted(*args, **kwargs):
         nonlocal read
-        for block in blocks(*args):
+        for block in blocks(*args, **kwargs):
             read += block.y.shape[0]
             yield block
 
@@ -348,8 +348,8 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     covariance = coefficient_covariance(problem, in_basis, density.kappa[None], density.d[None], "sandwich", None)
     used = 2 * N if weight is None else int((weight > 0).sum())
     torch.testing.assert_close(sandwich_of(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
-    monkeypatch.setattr(_blocks, "_STRIP", 100)
-    monkeypatch.setattr(_rows, "blocks", lambda *args: blocks(*args, 1234))
+    monkeypatch.setattr(_block_sums, "_STRIP", 100)
+    monkeypatch.setattr(_rows, "blocks", lambda *args, **kwargs: blocks(*args, values=1234, **kwargs))
     again, transformed, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     for reference, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
         torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
@@ -375,9 +375,7 @@ def test_score_is_the_slope_of_the_energy():
     density = Density(torch.tensor([0.3]).double(), torch.tensor([1.2]).double())
 
     def energy_at(beta: Tensor) -> Tensor:
-        block = next(iter(blocks(X[:, None], y[:, None], None)))
-        error = residual(block, beta)
-        found = sums(block, error, *kernel(error, density), density, plain=True)
+        found = Rows(X[:, None], y[:, None], None).evaluate(beta, density).total
         return torch.cat([energy_of(found, density.kappa).value, found.score.flatten()])
 
     beta, step = torch.full((5,), 0.9).double(), 1e-5

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,6 +56,7 @@ class Survey:
         total: weighted sums of [x y], which identify the rows, (m, n + 1).
         weight: sum of the weights, (m,).
         largest: largest absolute value of Y, (m,).
+        single: whether all rows are float32 on a CPU.
     """
 
     shape: Shape
@@ -64,6 +66,7 @@ class Survey:
     total: Float64[Tensor, "m k"]
     weight: Float64[Tensor, " m"]
     largest: Float64[Tensor, " m"]
+    single: bool
 
     @staticmethod
     def of_all(parts: list[Survey]) -> Survey:
@@ -92,6 +95,7 @@ class Survey:
             total=_summed([part.total for part in parts]),
             weight=_summed([part.weight for part in parts]),
             largest=torch.stack([part.largest for part in parts]).amax(0),
+            single=all(part.single for part in parts),
         )
         whole._check()
         return whole
@@ -127,6 +131,11 @@ class Survey:
         singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
         return self.to_coef() if bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1]) else None
 
+    def sizes(self, coef: Float64[Tensor, " n"]) -> Float64[Tensor, " m"]:
+        """Upper bound of the weighted sum of ``|y| + |x| |coef|`` of each channel, by Cauchy-Schwarz."""
+        size = (self.weight.unsqueeze(-1) * self.triangle.square().sum(-2)).sqrt()
+        return size[:, -1] + size[:, :-1] @ coef.abs()
+
     def grams(self) -> Float64[Tensor, "m n n"]:
         """Products of the columns of each channel in the basis of the passes, per unit of weight."""
         n, frame = self.shape.n, self.frame()
@@ -144,6 +153,7 @@ def survey_rows(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
     memory = Memory()
     for number, (shape, rows) in enumerate(rows_of(batches)):
         adding = _GrowingSurvey(shape, memory) if adding is None else adding
+        adding.single = adding.single and rows.is_single
         first = 0
         for block in blocks(rows.X, rows.Y, rows.weight, memory=memory):
             adding.add(block, number, first)
@@ -159,6 +169,7 @@ class _GrowingSurvey:
         m, k = shape.m, shape.n + 1
         self._shape, self._memory = shape, memory
         self.rows = self._used = 0
+        self.single = True
         self._ones: Tensor | None = None
         self._total, self._weight, self._largest = (torch.zeros(size, dtype=torch.float64) for size in ((m, k), m, m))
         self._triangle, self._gram = (torch.zeros(m, k, k, dtype=torch.float64) for _ in range(2))
@@ -200,7 +211,8 @@ class _GrowingSurvey:
     def survey(self) -> Survey:
         if self._gram.any():
             self._join(torch.linalg.cholesky(self._gram, upper=True))
-        return Survey(self._shape, self.rows, self._used, self._triangle, self._total, self._weight, self._largest)
+        sums = self._triangle, self._total, self._weight, self._largest
+        return Survey(self._shape, self.rows, self._used, *sums, self.single)
 
 
 def _products(joined: Tensor, weighted: Tensor, y: Tensor) -> Float64[Tensor, "k k"]:
@@ -217,11 +229,15 @@ def _products(joined: Tensor, weighted: Tensor, y: Tensor) -> Float64[Tensor, "k
 
 def _is_good(gram: Float64[Tensor, "m k k"]) -> bool:
     """Whether the Cholesky factor of products of columns has ten digits; sums of such products then have them too."""
-    size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
-    if not bool((size > 0).all()):
+    found = gram.numpy()
+    size = np.sqrt(np.diagonal(found, axis1=-2, axis2=-1))
+    if not (size > 0).all():
         return False
-    factor, info = torch.linalg.cholesky_ex(gram / (size.unsqueeze(-1) * size.unsqueeze(-2)))
-    return not bool(info.any()) and float(factor.diagonal(dim1=-2, dim2=-1).min()) > LEAST_PIVOT
+    try:
+        factor = np.linalg.cholesky(found / (size[:, :, None] * size[:, None]))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.diagonal(factor, axis1=-2, axis2=-1).min() > LEAST_PIVOT)
 
 
 def refuse_bad_values(block: Block, batch: int, first: int) -> None:

@@ -155,9 +155,9 @@ class StreamedMKCRegression(Inference):
             progress = self._after_range_pass(ranks, source, progress, checkpoint)
         while progress.phase != "done":
             before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
-            beta, density, curvature = progress.next_pass()
+            (beta, density, curvature), rough = progress.next_pass(), progress.rough
             flat = ranks.sum_of(
-                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
+                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature, rough=rough)[0],  # noqa: B023
                 flat_length(shape, with_curvature=curvature),
             )
             progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
@@ -256,8 +256,10 @@ class StreamedMKCRegression(Inference):
         self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
     ) -> StreamProgress:
         """Progress after the pass for the domain."""
-        survey, (beta, density, _) = progress.survey, progress.next_pass()
-        parts = ranks.gathered(lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True))
+        survey, (beta, density, _), rough = progress.survey, progress.next_pass(), progress.rough
+        parts = ranks.gathered(
+            lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True, rough=rough)
+        )
         return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
 
     def _saved(
