@@ -129,8 +129,10 @@ class BlockSums:
         count, m, _ = block.rows.shape
         for c in range(m):
             own = None if block.weight is None else self._native(block.weight[:, c])
-            self._channels[0, c] += count if own is None else own.sum()
-            self._add_channel(c, block.rows[:, c], self._native(block.y[:, c]), own, weights)
+            self._channels[0, c] += count if own is None else self._number(own.sum())
+            # the weight of a residual whose square overflows is 0
+            with np.errstate(over="ignore"):
+                self._add_channel(c, block.rows[:, c], self._native(block.y[:, c]), own, weights)
         if self._with_curvature and m > 1:
             scored = self._memory.of("scored", (count, block.rows.shape[2]), self._device)
             self._spread += products(scored, scored)

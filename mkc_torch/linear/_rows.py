@@ -118,9 +118,7 @@ def blocks(
         yield Block(rows, y, own, joined)
 
 
-def single_blocks(
-    X: Shaped[Any, "N m n"], Y: Shaped[Any, "N m"], weight: Shaped[Any, "N m"] | None
-) -> Iterator[Block]:
+def single_blocks(X: Shaped[Any, "N m n"], Y: Shaped[Any, "N m"], weight: Shaped[Any, "N m"] | None) -> Iterator[Block]:
     """Yield float32 rows on a CPU as blocks of arrays, twice as long and without a copy."""
     arrays = [None if part is None else np.asarray(part) for part in (X, Y, weight)]
     step = max(1, 2 * VALUES // Y.shape[-1])
