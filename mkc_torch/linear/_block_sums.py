@@ -180,7 +180,10 @@ class BlockSums:
         energy = self._energy(c, vectors[1], w, own, qw, q2w)
         for row, value in enumerate((residual, *energy, qw, q2w), 1):
             self._channels[row, c] += value
-        self._score[c] += do.matmul(s, x)
+        # the error of a sum in float32 grows with its rows
+        step = count if self._dtype == torch.float64 else _STRIP
+        for first in range(0, count, step):
+            self._score[c] += do.matmul(s[first : first + step], x[first : first + step])
         if self._with_curvature:
             self._tilt[c] += do.matmul(t, x)
             self._add_curvature(c, rows, vectors, own)
