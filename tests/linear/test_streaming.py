@@ -56,6 +56,7 @@ def in_memory(X: Tensor, Y: Tensor, weight: Tensor | None = None, **arguments) -
 
 
 def assert_same(fit: StreamedMKCRegression, memory: MKCRegression, tol: float = 1e-8) -> None:
+    """A partial sample leaves the last pass, which sums the covariance, farther from the maximum than the result."""
     assert fit.converged_
     assert fit.coef_.dtype == torch.float64
     # standard error of one row: d, apart from what the columns have in common
@@ -65,8 +66,8 @@ def assert_same(fit: StreamedMKCRegression, memory: MKCRegression, tol: float = 
     torch.testing.assert_close(fit.sigma_.pow(-2), memory.sigma_.pow(-2), rtol=0, atol=tol)
     torch.testing.assert_close(fit.bound_, memory.bound_, rtol=tol, atol=0)
     torch.testing.assert_close(fit.log_likelihood_, memory.log_likelihood_, rtol=tol, atol=0)
-    size = memory.covariance_.abs().max()
-    torch.testing.assert_close(fit.covariance_ / size, memory.covariance_ / size, rtol=0, atol=1e-4)
+    size, near = memory.covariance_.abs().max(), tol if fit.n_pilot_ == fit.n_rows_ else 1e-5
+    torch.testing.assert_close(fit.covariance_ / size, memory.covariance_ / size, rtol=0, atol=near)
     assert fit.dof_ == memory.dof_
 
 
