@@ -225,7 +225,8 @@ def _on_final_domain(
     extent = rows.range_at(rough.beta[0]) if extent is None else extent
     bound = torch.maximum(extent.half(), WIDE * d)
     beta = pilot.in_basis(rough.beta)
-    state = known.initial_state(pilot.problem, beta, d, bound, least_d(pilot.begin), tails=(rough.kappa,))
+    least = least_d(pilot.problem, pilot.begin)
+    state = known.initial_state(pilot.problem, beta, d, bound, least, tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
         return replace(rough, log_bound=state.log_bound), first
     return _at(rough.beta, state), None
