@@ -1,8 +1,8 @@
-"""MKC-EM on many rows: a pilot fit to few rows, Newton steps on more rows, and at last on all.
+"""MKC-EM on many rows: a pilot fit to few rows, and Newton steps on all.
 
-Each fit starts at the result and with the curvature of the fit before, so that few passes over all rows are needed;
-four or five are usual. The last fit ends where a Newton step with the curvature of all rows would be shorter than a
-millionth of a standard error.
+The steps start at the result of the pilot, with the curvature of a few more rows, so that few passes over all rows are
+needed; four or five are usual. They end where a step with the curvature of all rows would be shorter than a millionth
+of a standard error.
 """
 
 from __future__ import annotations
@@ -27,30 +27,16 @@ from mkc_torch.linear._robust_start import RobustStart, robust_start
 from mkc_torch.linear._rows import Rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from jaxtyping import Float, Float64
 
 LARGE = 20_000
 """Number of values from which a fit starts with a pilot; with nine columns it is four times as fast there."""
-
-_GROWTH = 16
-"""Growth factor of the rows between fits: each fit starts some ten of its standard errors from its maximum."""
-
-_LEAST_FACTOR_TO_ALL = 8
-"""An intermediate fit is made if all rows are at least this many times its rows; else passes over all cost less."""
 
 _NEAR = 0.03
 """Distance from the maximum, in standard errors, below which the curvature of all rows is computed."""
 
 _STOP = 1e-6
 """Length of the next step, in standard errors, below which the fit has converged."""
-
-_NEAR_INTERMEDIATE = 0.5
-"""As :data:`_NEAR`, for an intermediate fit, whose standard errors are four times those of the next."""
-
-_STOP_INTERMEDIATE = 0.5
-"""As :data:`_STOP`, for an intermediate fit."""
 
 _PASSES = 15
 """Largest number of passes; a fit that has not converged then is left to the alternation over all rows."""
@@ -125,18 +111,10 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     # rows drawn by leverage do not represent the curvature of all rows, and another draw may lack rare rows
     count = pilot.problem.num_samples
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
+    first: PassResult | None = None
     if known.bound is None:
         half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
         fit_state = replace(fit_state, log_bound=torch.log(half))
-    # on a GPU a pass over all rows takes less time than drawing some of them
-    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike and not rows.Y.is_cuda else ():
-        descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
-        end = _descended(some, descent, passes)
-        if end is None:
-            return None
-        fit_state, slopes = _moved(fit_state, end), end.slopes
-    first: PassResult | None = None
-    if known.bound is None:
         descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
         end = _descended(rows, descent, passes, with_range=True) if pilot.alike else None
         if end is not None:
@@ -230,16 +208,6 @@ def _on_final_domain(
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
         return replace(rough, log_bound=state.log_bound), first
     return _at(rough.beta, state), None
-
-
-def _intermediate_subsets(
-    values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int
-) -> Iterator[Rows]:
-    """Yield random subsets of growing size, smaller than all rows."""
-    count *= _GROWTH
-    while _LEAST_FACTOR_TO_ALL * count < values.Y.shape[-2]:
-        yield _drawn(values, count, frame, seed)
-        count *= _GROWTH
 
 
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:

@@ -226,16 +226,6 @@ def test_results_are_continuous_where_fits_become_large(monkeypatch, piloted):
     assert large.n_iter_ < small.n_iter_
 
 
-def test_more_levels_end_at_the_same_maximum(monkeypatch, piloted):
-    X, y = sample()
-    fit = MKCRegression().fit(X, y)
-    monkeypatch.setattr(_large, "_GROWTH", 2)
-    monkeypatch.setattr(_large, "_LEAST_FACTOR_TO_ALL", 2)
-    again = MKCRegression(bound=fit.bound_).fit(X, y)
-    assert piloted == [True, True]
-    assert apart(fit, again) < 1e-6
-
-
 def test_float32_data_have_float64_sums(monkeypatch):
     X, y = (v.float() for v in changed(move_x=100.0))
     fit = MKCRegression(bound=20.0).fit(X, y)
