@@ -113,13 +113,16 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
     first: PassResult | None = None
     if known.bound is None:
-        half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
+        # the sums do not depend on the domain, so this is also the first pass of the descent
+        begin = rows.evaluate(fit_state.beta[0], _density(fit_state), with_range=True)
+        half = torch.maximum(_half_range(begin), TIGHT * pilot.begin.scale)
         fit_state = replace(fit_state, log_bound=torch.log(half))
         descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
-        end = _descended(rows, descent, passes, with_range=True) if pilot.alike else None
-        if end is not None:
+        end = _descended(rows, descent, passes, first=begin, with_range=True) if pilot.alike else None
+        if end is not None and end.result is not None:
             fit_state, first = _moved(fit_state, end), end.result
-        fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
+        fit_state, same = _on_final_domain(pilot, known, fit_state, begin if first is None else first)
+        first = first if same else None
     weights = torch.empty_like(rows.Y)
     descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
     end = _descended(rows, descent, passes, weights, first)
@@ -195,19 +198,26 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
 
 
 def _on_final_domain(
-    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: PassResult | None
-) -> tuple[FitState, PassResult | None]:
-    """Starting point on the domain of the rule; with the sums at it if it equals the rough fit."""
+    pilot: _Pilot, known: FixedParameters, rough: FitState, found: PassResult
+) -> tuple[FitState, bool]:
+    """Starting point on the domain of the rule, from the pass at the rough fit; whether it equals the rough fit."""
     d = torch.exp(rough.log_d)
-    extent = None if first is None else first.extent
-    extent = rows.range_at(rough.beta[0]) if extent is None else extent
-    bound = torch.maximum(extent.half(), WIDE * d)
+    bound = torch.maximum(_half_range(found), WIDE * d)
     beta = pilot.in_basis(rough.beta)
     least = least_d(pilot.problem, pilot.begin)
     state = known.initial_state(pilot.problem, beta, d, bound, least, tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
-        return replace(rough, log_bound=state.log_bound), first
-    return _at(rough.beta, state), None
+        return replace(rough, log_bound=state.log_bound), True
+    return _at(rough.beta, state), False
+
+
+def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
+    assert found.extent is not None
+    return found.extent.half()
+
+
+def _density(fit_state: FitState) -> Density:
+    return Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
 
 
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
@@ -268,8 +278,7 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
-    total, found, _ = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
+    total, found, _ = rows.evaluate(fit_state.beta[0], _density(fit_state), with_curvature=True)
     assert found is not None
     total_weight = total.weight.sum()
     grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])

@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import as_strided
 from torch import Tensor
 
 from mkc_torch.linear._block_sums import BlockSums, Memory
-from mkc_torch.linear._blocks import Block, Density, PassResult, ResidualRange
+from mkc_torch.linear._blocks import Block, Density, PassResult
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -48,12 +48,6 @@ class Rows:
         on_cpu = not isinstance(self.Y, Tensor) or self.Y.device.type == "cpu"
         given = (self.X, self.Y) if self.weight is None else (self.X, self.Y, self.weight)
         return on_cpu and self.frame is None and all(part.dtype in (np.float32, torch.float32) for part in given)
-
-    def range_at(self, coef: Float64[Tensor, " n"]) -> ResidualRange:
-        """Range of the residuals."""
-        extent = self.evaluate(coef, Density(*torch.ones(2, self.Y.shape[1]).double()), with_range=True).extent
-        assert extent is not None
-        return extent
 
     def evaluate(
         self,
