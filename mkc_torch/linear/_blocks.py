@@ -5,7 +5,7 @@ The sums of blocks add up to those of all rows.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,14 +82,6 @@ class PassResult(NamedTuple):
     total: Sums
     curvature: CurvatureSums | None
     extent: ResidualRange | None
-
-
-Added = TypeVar("Added", Sums, CurvatureSums)
-
-
-def added(total: Added | None, part: Added) -> Added:
-    """The sums of two sets of rows; None is no rows."""
-    return part if total is None else type(part)(*(a + b for a, b in zip(total, part, strict=True)))
 
 
 def energy_of(total: Sums, kappa: Float64[Tensor, " m"]) -> Derivatives:

@@ -187,7 +187,7 @@ def least_d(problem: LinearProblem, begin: RobustStart) -> Tensor:
     weight, N, p = problem.sample_weight, problem.num_samples, problem.coefficients_per_channel
     if weight is None:
         return _FLOOR * begin.scale
-    # d often ends at this bound, which would otherwise tell a weight of 2 from two samples
+    # d often ends at this bound, so that a weight of 2 and two samples need the same
     count = torch.where((weight == weight.round()).all(-2), weight.sum(-2), float(N))
     return _FLOOR * begin.scale * small_sample_factor(count, p) / small_sample_factor(weight.new_tensor(float(N)), p)
 

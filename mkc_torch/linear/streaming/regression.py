@@ -38,8 +38,8 @@ class StreamedMKCRegression(Inference):
     maximises the likelihood of all rows, from the sample's maximum, by the passes of :class:`MKCRegression` over many
     rows: one to three for the gradient, and a last for the covariance. Sums are float64, also for float32 data; if all
     rows are float32 on a CPU and residuals are not small compared to Y, passes far from the maximum multiply in
-    float32. Memory does not grow with the rows: one batch, a block of 33 000 values of Y, and during the first pass
-    twice the sample.
+    float32. Memory does not grow with the rows: one batch, a block of 33 000 values of Y or 8 000 rows, and during the
+    first pass twice the sample.
 
     If the sample has all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8 or to
     the accuracy of its maximum. With more rows the domain depends on the sample: ``MKCRegression(bound=fit.bound_)``
