@@ -167,8 +167,12 @@ class BlockSums:
             weights[:, c] = vectors[2]
         if self._with_range:
             low, high = (e, e) if own is None else (do.where(own > 0, e, math.inf), do.where(own > 0, e, -math.inf))
-            self._low[c] = do.minimum(self._low[c], self._exact(e, x, y, low.argmin()))
-            self._high[c] = do.maximum(self._high[c], self._exact(e, x, y, high.argmax()))
+            if self._dtype == torch.float64:
+                least, largest = low.min(), high.max()
+            else:
+                least, largest = (self._exact(x, y, row) for row in (low.argmin(), high.argmax()))
+            self._low[c] = do.minimum(self._low[c], least)
+            self._high[c] = do.maximum(self._high[c], largest)
         if self._with_curvature:
             self._light += do.count_nonzero(w < LIGHT)
         if own is not None:
@@ -188,10 +192,8 @@ class BlockSums:
             self._tilt[c] += do.matmul(t, x)
             self._add_curvature(c, rows, vectors, own)
 
-    def _exact(self, e: Any, x: Any, y: Any, row: Any) -> Any:
+    def _exact(self, x: Any, y: Any, row: Any) -> float:
         """The residual of a row in float64, so that the domain does not depend on how rows are cut into blocks."""
-        if self._dtype == torch.float64:
-            return e[row]
         return float(y[row]) - float(np.dot(x[row].astype(np.float64), self._beta.astype(np.float64)))
 
     def _energy(self, c: int, q: Tensor, w: Any, own: Any, qw: Any, q2w: Any) -> Any:

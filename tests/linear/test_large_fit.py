@@ -345,6 +345,33 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
         torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
 
 
+class SumsByTorch(_block_sums.BlockSums):
+    """The operations of a GPU, on the CPU."""
+
+    def __init__(self, *args, **options) -> None:
+        super().__init__(*args, **options)
+        self._on_cpu, self._operations, self._number = False, torch, _block_sums._same
+        for name, value in vars(self).items():
+            if hasattr(value, "__array__") and not isinstance(value, Tensor):
+                setattr(self, name, torch.from_numpy(value))
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_sums_by_the_operations_of_a_gpu(kappa, weighted, monkeypatch):
+    X, Y = channels()
+    rows = Rows(X, Y, (torch.arange(2 * N) % 3).double().reshape(N, 2) if weighted else None)
+    density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
+    by_numpy, by_torch = torch.empty_like(Y), torch.empty_like(Y)
+    options = {"with_curvature": True, "with_range": True}
+    expected = rows.evaluate(torch.ones(3).double(), density, weights=by_numpy, **options)
+    monkeypatch.setattr(_rows, "BlockSums", SumsByTorch)
+    found = rows.evaluate(torch.ones(3).double(), density, weights=by_torch, **options)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(by_torch, by_numpy)
+
+
 def test_a_frame_is_a_change_of_columns():
     X, y = sample()
     frame = torch.linalg.inv(normal(9, 5, 5))
