@@ -157,7 +157,7 @@ def test_affine_equivariance(case, dtype, device):
 
 @pytest.mark.parametrize("case", cases("repetition"))
 def test_weight_is_repetition(case, dtype, device):
-    X, y = data(30, dtype, device)  # one maximum of the likelihood within reach, so that the starts do not decide
+    X, y = data(30, dtype, device)  # d above its least, which depends on the coverage of the start
     count = 1 + torch.arange(N, device=device) % 2
     weighted = fitted(case, X, y, count.to(device, dtype))
     repeated = fitted(case, X.repeat_interleave(count, 0), y.repeat_interleave(count))
