@@ -127,7 +127,7 @@ class MachineCollocation:
     Args:
         system: the system.
         parameters: the parameters.
-        equations, jump: as in :mod:`mkc_torch.simulation.dynamics.loops.collocation`.
+        equations, jump: as in :mod:`mkc_torch.simulation.dynamics.loops.equations`.
     """
 
     def __init__(
@@ -188,8 +188,9 @@ class _Loops(NamedTuple):
 
 @cache
 def _compiled() -> _Loops:
-    from mkc_torch.simulation.dynamics.loops import collocation as loops
+    from mkc_torch.simulation.dynamics.loops.collocation import solve_equations, solve_roughly
+    from mkc_torch.simulation.dynamics.loops.equations import linearise_equations, parameter_sources
 
-    plain = loops.solve_equations, loops.solve_roughly, loops.linearise_equations, loops.parameter_sources
+    plain = solve_equations, solve_roughly, linearise_equations, parameter_sources
     found = [machine_code(loop) for loop in plain]
     return _Loops(*(loop for loop in found if loop is not None))

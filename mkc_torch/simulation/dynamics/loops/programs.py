@@ -13,12 +13,18 @@ The rows of the states come first. Comparisons give 1 and 0.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["BLOCK", "CODES", "loaded", "registers", "run"]
+__all__ = ["BLOCK", "CODES", "jitable", "loaded", "registers", "run"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+jitable = cast(Callable[[F], F], register_jitable)
+"""Marks a function that loops in machine code may call; it remains a function of Python."""
 
 BLOCK = 128
 """Places in a block: the rows of a program fit into the processor's cache."""
@@ -40,7 +46,7 @@ CODES = {
 """The code of each operation of :data:`mkc_torch.simulation.dynamics.compiled.expressions.FUNCTIONS`."""
 
 
-@register_jitable
+@jitable
 def registers(program: Any, states: int) -> Any:
     """Allocate the rows of a program, with its numbers."""
     _, numbers, columns, _, size = program
@@ -52,7 +58,7 @@ def registers(program: Any, states: int) -> Any:
     return rows
 
 
-@register_jitable
+@jitable
 def loaded(program: Any, rows: Any, states: Any, place: int, arrangement: int, first: int, count: int) -> None:
     """Fill the rows of the states, from ``place`` on, and of the columns, from ``first`` on."""
     columns = program[2]
@@ -65,7 +71,7 @@ def loaded(program: Any, rows: Any, states: Any, place: int, arrangement: int, f
             rows[w + j, k] = columns[j, arrangement, first + k]
 
 
-@register_jitable
+@jitable
 def run(program: Any, rows: Any, count: int) -> None:
     """Run a program on the first ``count`` places of its rows."""
     code = program[0]
@@ -92,7 +98,7 @@ def run(program: Any, rows: Any, count: int) -> None:
                 rows[t, k] = _of_one(op, rows[a, k])
 
 
-@register_jitable
+@jitable
 def _of_one(op: int, x: float) -> float:
     """The result of an operation on a number."""
     if op == _NEG:
@@ -146,7 +152,7 @@ def _of_one(op: int, x: float) -> float:
     return x
 
 
-@register_jitable
+@jitable
 def _of_two(op: int, x: float, y: float, z: float) -> float:
     """The result of an operation on two numbers or three."""
     if op == _WHERE:
