@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from mkc_torch import fit_density
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density import likelihood
 from mkc_torch.density.domain import domain_rule
 from mkc_torch.density.likelihood import (
     DensityState,
@@ -137,6 +139,28 @@ def test_a_newton_step_never_increases_the_value():
         assert bool((after.value <= state.value + 1e-14).all())
         torch.testing.assert_close(after.value, negative_log_likelihood(error, None, after), rtol=0, atol=1e-12)
         state = after
+
+
+@pytest.mark.parametrize("free", [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize("weighted", [True, False])
+def test_a_newton_step_of_one_problem_is_that_of_a_batch(free, weighted, monkeypatch):
+    error = torch.stack([contaminated(s, 80, share) for s, share in ((0, 0.0), (2, 0.3), (4, 0.45))], -1).unsqueeze(0)
+    weight = uniform(5, *error.shape) if weighted else None
+    weight = None if weight is None else weight / weight.sum(-2, keepdim=True)
+    scale = robust_scale(error[0]).unsqueeze(0)
+    state = initial_state(error, weight, 3.0 * scale, domain_rule(error, scale), 1e-3 * scale)
+    state = replace(state, free_kappa=free[0], free_d=free[1])
+    moved = False
+    for _ in range(6):
+        with monkeypatch.context() as patch:
+            patch.setattr(likelihood, "is_short", lambda _: False)
+            expected = newton_step(error, weight, state)
+        found = newton_step(error, weight, state)
+        for field in ("kappa", "log_d", "value"):
+            torch.testing.assert_close(getattr(found, field), getattr(expected, field), rtol=1e-9, atol=1e-7)
+        moved = moved or bool((found.value < state.value).any())
+        state = expected
+    assert moved
 
 
 # the optimum

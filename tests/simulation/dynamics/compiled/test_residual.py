@@ -280,7 +280,7 @@ def test_growing_horizons_of_numpy_and_torch_end_near_the_trajectory():
     compiled = prepared.compiled(lambda p: (p, {}), len(theta))
     far = torch.where(prepared.grid.begins.unsqueeze(-1), prepared.guess, -2.0 * prepared.guess + 1.0)
     theirs = torch_marched(prepared.rate(theta, {}), prepared.grid, prepared.first_states(theta, {})[0], far)
-    ours = marched(compiled._functions(theta.tolist()), compiled._grid, far.numpy().T)
+    ours = marched(compiled._collocation(theta.tolist()), compiled._grid, far.numpy().T)
     solved = compiled.answer(theta).nearby.states
     assert_close(torch.from_numpy(ours.T.copy()), solved, 1e-3)
     assert_close(theirs, solved, 1e-3)
