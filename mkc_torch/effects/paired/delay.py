@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
-from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 from mkc_torch.effects.paired.between import shifted
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
-from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

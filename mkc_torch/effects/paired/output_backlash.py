@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
-from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 from mkc_torch.effects.runs import first_of_runs
 from mkc_torch.effects.waveforms import in_contact
 
