@@ -39,7 +39,7 @@ def test_a_wrong_device_result_is_reported():
 
 def test_errors_of_an_estimator_are_printed_and_fail(monkeypatch, capsys):
     class Failing(LeastSquares):
-        def fit(self, *data):  # noqa: ARG002
+        def fit(self, *data):
             raise RuntimeError("CUSOLVER_STATUS_INTERNAL_ERROR")
 
     monkeypatch.setattr(small_fits, "ESTIMATORS", {"Failing": (Failing, 1.0)})

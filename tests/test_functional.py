@@ -542,7 +542,7 @@ def called(function, **changed):
 def test_parameters_out_of_range_are_refused_by_name(function, name, bad, kind):
     if name == "bound" and function in POINTWISE:
         return
-    with pytest.raises(ValueError, match=rf"`{name}` to be (positive and finite|in \[.*inf\]) but got"):
+    with pytest.raises(ValueError, match=rf"`{name}`.*(positive and finite|in \[.*inf\])"):
         called(function, **{name: kind(bad)})
 
 
@@ -551,14 +551,14 @@ def test_an_infinite_scale_or_domain_is_refused_and_an_infinite_bandwidth_is_the
     assert bool(called(function, sigma=INF).isfinite().all())
     for name in ("d", "bound"):
         if name == "d" or function not in POINTWISE:
-            with pytest.raises(ValueError, match=f"`{name}` to be positive and finite but got inf"):
+            with pytest.raises(ValueError, match=rf"`{name}`.*positive and finite.*got inf"):
                 called(function, **{name: INF})
 
 
 def test_the_normaliser_accepts_the_rounded_smallest_sigma():
     for function in LIKELIHOOD:
         called(function, sigma=torch.tensor(KAPPA_MAX).rsqrt() * (1 - 1e-6))
-        with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
+        with pytest.raises(ValueError, match=r"`sigma`.*\[0\.05, inf\].*got 0\.04"):
             called(function, sigma=0.04)
     assert called(mkc_energy, sigma=0.001).tolist() == pytest.approx([1e-6, 1e-6])
 
@@ -576,7 +576,7 @@ def test_compiled_code_checks_parameters_that_are_numbers():
     compiled = torch.compile(mkc_nll, fullgraph=True)
     error = torch.linspace(-3.0, 3.0, 7)
     torch.testing.assert_close(compiled(error, 2.0, 1.0, 5.0), mkc_nll(error, 2.0, 1.0, 5.0))
-    with pytest.raises(ValueError, match="`sigma` to be in"):
+    with pytest.raises(ValueError, match=r"`sigma`.*in"):
         torch.compile(mkc_nll)(error, -2.0, 1.0, 5.0)
     tensors = torch.tensor([2.0]), torch.tensor([1.0]), torch.tensor([5.0])
     torch.testing.assert_close(compiled(error, *tensors), mkc_nll(error, *tensors))
@@ -585,16 +585,16 @@ def test_compiled_code_checks_parameters_that_are_numbers():
 @pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
 def test_parameters_that_are_not_numbers_are_refused_by_name(function):
     for value in ("2", None, 2j):
-        with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got"):
+        with pytest.raises(TypeError, match=r"`sigma`.*number"):
             called(function, sigma=value)
 
 
 def test_errors_and_arguments_of_the_primitives_must_be_tensors():
     for error in (np.ones(2), [1.0, 2.0]):
-        with pytest.raises(TypeError, match=r"`error` to be a real tensor but got .*torch\.as_tensor\(error\)"):
+        with pytest.raises(TypeError, match=r"`error`.*real tensor.*torch\.as_tensor\(error\)"):
             mkc_energy(error, 1.0, 1.0)
-    with pytest.raises(TypeError, match="`kappa` to be a tensor but got float"):
+    with pytest.raises(TypeError, match=r"`kappa`.*tensor.*got float"):
         energy(torch.ones(2), 1.0)
-    with pytest.raises(TypeError, match="`length` to be a tensor but got float"):
+    with pytest.raises(TypeError, match=r"`length`.*tensor.*got float"):
         log_partition(torch.ones(2), 1.0)
     assert mkc_energy(torch.tensor([math.nan, 1.0]), 2.0, 1.0).isnan().tolist() == [True, False]

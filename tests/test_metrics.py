@@ -109,7 +109,7 @@ def test_masked_elements_are_ignored_even_if_nan():
     y[2, :, 3], x[5, :, 0] = NAN, NAN
     metric.update(x, y, mask)
     torch.testing.assert_close(metric.compute(), expected, rtol=1e-13, atol=0)
-    with pytest.raises(ValueError, match="`target` to be finite but got 2 values"):
+    with pytest.raises(ValueError, match=r"`target`.*finite.*got 2"):
         metric.update(x, y)
 
 
@@ -162,17 +162,17 @@ def test_a_metric_copied_with_its_loss_refers_to_the_copy():
 
 
 def test_another_loss_and_bad_batches_are_refused():
-    with pytest.raises(TypeError, match="`loss` to be an MKCLoss but got MSELoss"):
+    with pytest.raises(TypeError, match=r"`loss`.*MKCLoss.*got MSELoss"):
         MKCNegativeLogLikelihood(nn.MSELoss())
     metric = MKCNegativeLogLikelihood(made())
     with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 1))
-    with pytest.raises(TypeError, match="`target` to be a real floating-point tensor"):
+    with pytest.raises(TypeError, match=r"`target`.*floating-point"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 2, dtype=torch.int64))
     x = torch.zeros(4, 2)
-    with pytest.raises(ValueError, match="`input` to be finite but got 8 values"):
+    with pytest.raises(ValueError, match=r"`input`.*finite.*got 8"):
         metric.update(x * NAN, x)
-    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite"):
+    with pytest.raises(ValueError, match=r"`weight`.*>= 0 and finite"):
         metric.update(x, x, -torch.ones(4))
     assert float(metric.weight.sum()) == 0.0
 

@@ -85,9 +85,12 @@ def _wrong_sizes(row: Mapping[str, Any], sizes: Sequence[Size]) -> list[str]:
 
 
 def _parameter(row: Mapping[str, Any], size: Size) -> tuple[float | None, float]:
-    for finding in row["findings"]:
-        for parameter in finding["parameters"]:
-            if finding["effect"] == size.effect and parameter["name"] == size.parameter:
+    """Return a size and its error: of a finding, else of an alternative that the recording cannot rule out."""
+    findings = row["findings"]
+    others = [other for finding in findings for other in finding["alternatives"] if not other["separable"]]
+    for candidate in (*findings, *others):
+        for parameter in candidate["parameters"]:
+            if candidate["effect"] == size.effect and parameter["name"] == size.parameter:
                 error = parameter["standard_error"]
                 return float(parameter["value"]), 0.0 if error is None else float(error)
     return None, math.nan

@@ -49,11 +49,19 @@ def finding(entry: Mapping[str, Any]) -> dict[str, Any]:
         >>> finding({"effect": "backlash"})["parameters"]
         []
     """
-    numbers = ("name", "value", "standard_error", "unit")
+    others = entry.get("alternatives") or ()
     return {key: entry.get(key) for key in _FINDING} | {
-        "alternatives": [{key: other.get(key) for key in _ALTERNATIVE} for other in entry.get("alternatives") or ()],
-        "parameters": [{key: p.get(key) for key in numbers} for p in entry.get("parameters") or ()],
+        "alternatives": [
+            {key: other.get(key) for key in _ALTERNATIVE} | {"parameters": _sizes(other)} for other in others
+        ],
+        "parameters": _sizes(entry),
     }
+
+
+def _sizes(entry: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the parameters of a finding or of an alternative."""
+    numbers = ("name", "value", "standard_error", "unit")
+    return [{key: p.get(key) for key in numbers} for p in entry.get("parameters") or ()]
 
 
 def _parameters(model: Path, request: Request) -> dict[str, float]:

@@ -95,7 +95,7 @@ class Classifier(LightningModule):
             assert self.trainer.max_epochs is not None
             self.criterion.sigma = graduated_sigma(self.current_epoch / self.trainer.max_epochs)
 
-    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:  # noqa: ARG002
+    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:  # noqa: ARG002 - signature of Lightning
         x, y = batch
         loss: Tensor = self.criterion(self.net(x), y)
         return loss

@@ -115,7 +115,7 @@ class Regression(LightningModule):
         self.weight_decay = weight_decay
         self.annealed = annealed
 
-    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:  # noqa: ARG002
+    def training_step(self, batch: tuple[Tensor, Tensor], batch_idx: int) -> Tensor:  # noqa: ARG002 - signature of Lightning
         x, y = batch
         loss: Tensor = self.criterion(self.net(x), y)
         return loss

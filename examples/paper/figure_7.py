@@ -19,11 +19,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
-from sklearn.linear_model import Lasso as SklearnLasso
+from table_2 import Lasso
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, Recording
-from mkc_torch._support.arrays import Data
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, Ridge
 from mkc_torch.linear._estimator import LinearEstimator
 
@@ -38,22 +37,6 @@ COLOURS = {
 CLEAN, DISTURBED = "#8fb8d8", "#b5651d"
 LIMIT = 5.0
 """A sample counts as disturbed where the norm calibrated by the truth is off by more, in µT."""
-
-
-class Lasso(LinearEstimator):
-    """scikit-learn's Lasso under the vocabulary of the ellipsoid fit."""
-
-    def __init__(self, alpha: float) -> None:
-        super().__init__()
-        self.alpha = alpha
-
-    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> Lasso:
-        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
-        model = SklearnLasso(alpha=self.alpha, fit_intercept=False, max_iter=100_000)
-        model.fit(X.squeeze(-2).numpy(), Y.squeeze(-1).numpy(), sample_weight=sample_weight)
-        self.coef_ = torch.from_numpy(model.coef_)
-        self.weights_ = torch.ones_like(Y)
-        return self
 
 
 def fits(points: Tensor) -> dict[str, EllipsoidFit]:

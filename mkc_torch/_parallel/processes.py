@@ -8,6 +8,7 @@ import gc
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -37,7 +38,7 @@ def cores() -> int:
 def one_thread() -> None:
     """Limit torch and the linear algebra of NumPy to one thread in this process.
 
-    The problems of a recording are too small to share: with a second thread a diagnosis takes a sixth longer.
+    The problems of a recording are too small for several threads: a second thread makes a diagnosis a sixth slower.
     """
     from threadpoolctl import threadpool_limits
 
@@ -48,8 +49,8 @@ def one_thread() -> None:
 def keep_memory() -> None:
     """Let glibc keep freed memory instead of returning it to the system.
 
-    By default it returns the memory of each large tensor at once, and the system clears the pages for the next tensor:
-    1 to 7 % of the CPU time of a diagnosis. It has no effect with other C libraries.
+    By default glibc returns the memory of each large tensor at once, and the system clears its pages before the next
+    use, which takes 1 to 7 % of the CPU time of a diagnosis. With other C libraries this does nothing.
     """
     with suppress(OSError, AttributeError, TypeError):
         library = ctypes.CDLL(None)
@@ -68,22 +69,30 @@ def keep_modules() -> None:
     """
     gc.freeze()
     gc.set_threshold(50_000)
-    atexit.register(gc.freeze)
+    atexit.register(_at_exit)
+
+
+def _at_exit() -> None:
+    """Skip the last collection, unless triton is loaded: it reports every object that is kept as a leak."""
+    if "triton" in sys.modules:
+        gc.unfreeze()
+    else:
+        gc.freeze()
 
 
 @contextmanager
 def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterator[Callable[[], R]]]:
-    """For each item, in order, a function that waits for its result.
+    """Start ``work`` on all items; yield for each item, in order, a function that waits for its result.
 
-    A single item is worked on in this process. A function raises what ``work`` raised, and :class:`BrokenProcessPool`
-    for an item whose process died.
+    A single item is processed in this process. The function raises the error of ``work``, or
+    :class:`BrokenProcessPool` if the process of the item died.
     """
     workers = min(len(items), cores())
     if workers < 2:
         yield (lambda item=item: work(item) for item in items)  # type: ignore[misc]
         return
     before = set(multiprocessing.active_children())
-    # spawned, for torch's threads do not survive a fork
+    # torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
     # without a lock: an interrupt between its acquisition and its release would block all processes
     stop = context.RawValue(ctypes.c_bool, False)
@@ -124,7 +133,7 @@ def _stopped() -> bool:
 
 
 def _interruptible(work: Callable[[T], R], item: T) -> R:
-    """Do the work with the default handler of interrupts, so that half-written files are removed."""
+    """Run ``work`` with the default handler of interrupts, so that it removes its half-written files."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if _stopped():

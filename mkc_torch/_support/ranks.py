@@ -26,8 +26,8 @@ class Ranks:
     """The processes of a ``torch.distributed`` group, or this one alone.
 
     Every method returns on all ranks or raises on all ranks: before a result is used, the ranks exchange whether they
-    have a result. With gloo, the others notice at once that a process has ended, because its connections close; a
-    process that hangs, and any failure with nccl, is noticed after the timeout of the group.
+    have a result. With gloo, a process that ends closes its connections, so the others raise at once. A process that
+    hangs, and any failure with nccl, is detected after the timeout of the group.
 
     Args:
         group: a ``torch.distributed`` group; None is the default group if it is initialised, else this process alone.

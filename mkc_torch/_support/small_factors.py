@@ -62,17 +62,14 @@ def _with_identity(gram: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch 2
     return torch.cat([gram, eye.expand_as(gram)], -2)
 
 
-def inverse_factor(
-    gram: Float[Tensor, "*batch n n"], least: float = 0.0
-) -> tuple[Float[Tensor, "*batch n n"], Float[Tensor, "*batch n"]]:
+def inverse_factor(gram: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Float[Tensor, "*batch n"]]:
     """Upper triangular T with ``T Tᵀ = gram⁻¹``, and the pivots; columns of pivots that are not positive are 0.
 
     Args:
         gram: symmetric positive definite matrices.
-        least: share of a diagonal element at or below which a pivot counts as 0.
     """
     n = gram.shape[-1]
-    columns = _columns(_with_identity(gram), least)
+    columns = _columns(_with_identity(gram), 0.0)
     factor = torch.stack([column[..., n - j :] for j, column in enumerate(columns)], -1)
     return factor, torch.stack([column[..., 0] for column in columns], -1).square()
 

@@ -1,1 +1,1 @@
-"""The words that a reader sees, in reports, in pictures and on the terminal, and how they are set."""
+"""How text from files is set in reports, in pictures and on the terminal."""

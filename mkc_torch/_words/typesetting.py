@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from mkc_torch._words.terms import term
-
 __all__ = ["capital", "plain", "several", "superscript", "typeset"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -32,7 +30,7 @@ def several(names: Sequence[str], most: int = 6) -> str:
         ('x, y', 'a, b, c and 5 more')
     """
     text = ", ".join(plain(name) for name in names[:most])
-    return term("number.and_more", first=text, count=len(names) - most) if len(names) > most else text
+    return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
 def superscript(power: int) -> str:

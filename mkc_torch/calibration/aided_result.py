@@ -1,4 +1,4 @@
-"""The result of an aided calibration: the aid, and what it did and did not determine."""
+"""The result of an aided calibration: the aid, and which quantities it determined."""
 
 from __future__ import annotations
 

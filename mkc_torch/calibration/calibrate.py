@@ -17,7 +17,7 @@ from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
 from mkc_torch.calibration.ellipsoid_fit import MIN_POINTS, EllipsoidFit
 from mkc_torch.calibration.file import Matrix, Vector
-from mkc_torch.calibration.frozen_samples import FROZEN, without_frozen
+from mkc_torch.calibration.frozen_samples import without_frozen
 from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
@@ -27,6 +27,7 @@ from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
 from mkc_torch.calibration.turning import thin_at_rest
+from mkc_torch.calibration.warning_order import NOT_COVERED, by_weight, is_fault
 from mkc_torch.density.tails import ChannelTails, time_series_tails
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
@@ -160,7 +161,12 @@ def calibrate(
         strength = GRAVITY if field_strength is None else field_strength
         return accelerometer(recording, lambda table: calibrate(table, field_strength=strength, name=name, seed=seed))
     found = _of_magnetometer(recording, field_strength, seed, earth)
-    return dataclasses.replace(found, name=recording.name if name is None else name, rest_bias=rest_bias(recording))
+    return dataclasses.replace(
+        found,
+        name=recording.name if name is None else name,
+        rest_bias=rest_bias(recording),
+        warnings=by_weight(found.warnings),
+    )
 
 
 def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
@@ -247,11 +253,16 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
 
 
 def _with_faults(error: NotIdentifiableError, usable: Recording) -> NotIdentifiableError:
-    """Add the warnings about frozen and clipped samples, which may have removed the needed samples, to an error."""
-    faults = [sentence for sentence in usable.warnings if FROZEN in sentence or CLIPPED in sentence]
+    """Put the warnings about frozen and clipped samples, which may have removed the needed samples, first."""
+    faults = [sentence for sentence in by_weight(usable.warnings) if is_fault(sentence)]
+    if not faults:
+        return error
     if any(CLIPPED in sentence for sentence in faults):
         faults.append("Set the sensor to a wider range, or remove what magnetises it, and record again.")
-    return NotIdentifiableError(" ".join([str(error), *faults]), error.coverage, error.directions)
+    prefix, reason = "Not identifiable: ", str(error)
+    consequence = reason.removeprefix(prefix)
+    sentences = [*faults, consequence[:1].upper() + consequence[1:]]
+    return NotIdentifiableError(prefix + " ".join(sentences), error.coverage, error.directions)
 
 
 def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_share: float) -> list[str]:
@@ -301,6 +312,4 @@ def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
             f"combination is {found.information**-0.5:.1g} times less accurate than from all directions, and "
             "disturbances have that much more influence"
         )
-    return (
-        f"Directions not covered: {missing}. {means}. To be sure, turn the sensor so that the field points there too."
-    )
+    return f"{NOT_COVERED}: {missing}. {means}. To be sure, turn the sensor so that the field points there too."

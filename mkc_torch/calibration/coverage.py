@@ -66,9 +66,9 @@ def nearest_axis(direction: tuple[float, float, float]) -> str:
     return "".join(f"{'+' if v > 0 else '-'}{name}" for v, name in parts if abs(v) > 0.6 * largest)
 
 
-def fibonacci_sphere(count: int, *, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 3"]:
+def fibonacci_sphere(count: int) -> Float[Tensor, "count 3"]:
     """Evenly spread unit vectors on a spiral."""
-    i = torch.arange(count, dtype=dtype) + 0.5
+    i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1.0 - 2.0 * i / count
     angle = math.pi * (1.0 + math.sqrt(5.0)) * i
     radius = torch.sqrt(1.0 - z * z)

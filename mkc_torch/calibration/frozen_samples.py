@@ -111,7 +111,7 @@ def _frozen(
     found = [repeat for repeat in found if not bool(known[repeat.start : repeat.end].any())]
     if not found or not bool(free.any()):
         return []
-    # a single axis is constant while the sensor turns about it; without motion of the others, nothing turned
+    # one axis is constant while the sensor turns about it; if the other axes are constant too, nothing turned
     alone = turned.shape[-1] != values.shape[-1]
     usual = max((repeat.end - repeat.start for repeat in repeats(values[free], [], 1)), default=1)
     move, least = usual_move(values, free), _STEPS * max(step_of_digits(v) for v in values.unbind(-1))

@@ -23,7 +23,7 @@ ROWS_A_SECOND = 50.0
 
 
 def numbered(recording: Recording) -> Recording:
-    """Add a column of row numbers, from 1, if the recording has no time; dropped rows keep the others' numbers.
+    """Add a column of row numbers, from 1, if the recording has no time; they stay the same when rows are dropped.
 
     Example:
         >>> kept = numbered(Recording({"a": torch.zeros(3)})).rows(torch.tensor([0, 2]))
@@ -53,7 +53,7 @@ def places(recording: Recording) -> Float[Tensor, " N"]:
 
 
 def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tuple[RejectedInterval, ...]:
-    """:func:`mkc_torch.recording.disturbance.disturbed_intervals`, in rows if there is no time.
+    """Return :func:`mkc_torch.recording.disturbance.disturbed_intervals`, in rows if there is no time.
 
     Example:
         >>> row = torch.arange(1, 1001)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.drawing import BLUE, DARK_ORANGE, GREY, INK, ORANGE, PALE, SHADE, array, axes_or_new
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.places import numbered, places
@@ -135,8 +134,8 @@ class CalibrationPlot:
             scatter = 1.4826 * float(self._calibration.norm_residual(points).abs().median())
             if scatter > 0.0:
                 ax.set_ylim(-_CLOSE * scatter, _CLOSE * scatter)
-        ax.set_title(term("picture.length"))
-        ax.set_xlabel(term("picture.row" if samples.time is None else "picture.time"))
+        ax.set_title("Measured minus nominal length of the field")
+        ax.set_xlabel("row of the recording" if samples.time is None else "time (s)")
         ax.legend(markerscale=4, frameon=False)
         return ax
 
@@ -155,8 +154,8 @@ class CalibrationPlot:
             ax.plot(x[mask], weight[mask], ".", ms=2.2, color=color, label=label, rasterized=True)
         ax.set_ylim(-0.03, 1.03)
         ax.margins(x=0.01)
-        ax.set_xlabel(term("picture.row" if samples.time is None else "picture.time"))
-        ax.set_ylabel(term("picture.weight"))
+        ax.set_xlabel("row of the recording" if samples.time is None else "time (s)")
+        ax.set_ylabel("weight")
         ax.legend(markerscale=4, frameon=False)
         return ax
 
@@ -174,9 +173,9 @@ class CalibrationPlot:
         points = self._drawn(recording).magnetometer()
         ax = axes_or_new(ax)
         draw_density(ax, self._calibration, points, tail=tail)
-        ax.set_title(term("picture.tail" if tail else "picture.head"))
+        ax.set_title("Head and tail, logarithmic scale" if tail else "Head, linear scale")
         unit = self._calibration.unit
-        ax.set_ylabel(term("picture.density", unit=unit) if unit else term("noise.density"))
+        ax.set_ylabel(f"density (1/{unit})" if unit else "density")
         ax.legend(frameon=False)
         return ax
 
@@ -193,7 +192,7 @@ class CalibrationPlot:
         c, points = self._calibration, self._drawn(recording).magnetometer()
         ax = axes_or_new(ax, projection="mollweide", size=(7.2, 3.6))
         draw_coverage(ax, c.coverage, c.corrected(points)[c.weight(points) >= 0.5])
-        ax.set_title(term("section.directions"))
+        ax.set_title("Directions covered")
         return ax
 
     def _drawn(self, recording: Recording | None) -> Recording:
@@ -226,7 +225,7 @@ def draw_sphere(ax: Any, c: Calibrated, points: Tensor, plane: str, *, corrected
     _square(ax, outline[:, i], outline[:, j], include_origin=not corrected)
     ax.set_xlabel(f"{plane[0]} ({unit})" if unit else plane[0])
     ax.set_ylabel(f"{plane[1]} ({unit})" if unit else plane[1])
-    ax.set_title(term("picture.corrected" if corrected else "picture.measured", plane=plane))
+    ax.set_title(("Corrected, {plane} plane" if corrected else "Measured, {plane} plane").format(plane=plane))
 
 
 def draw_residual(ax: Any, c: Calibrated, points: Tensor, place: Tensor) -> None:
@@ -239,7 +238,7 @@ def draw_residual(ax: Any, c: Calibrated, points: Tensor, place: Tensor) -> None
         if mask.any():
             ax.plot(x[mask], r[mask], ".", ms=2.2, color=color, label=label, rasterized=True)
     ax.margins(x=0.01)
-    ax.set_ylabel(f"{term('label.residual')} ({c.unit})" if c.unit else term("label.residual"))
+    ax.set_ylabel(f"residual ({c.unit})" if c.unit else "residual")
 
 
 def draw_density(ax: Any, c: Calibrated, points: Tensor, *, tail: bool) -> None:
@@ -253,13 +252,13 @@ def draw_density(ax: Any, c: Calibrated, points: Tensor, *, tail: bool) -> None:
     edges = np.linspace(start, end, 81 if tail else 61)
     count, _ = np.histogram(array(e), edges)
     value = count / (len(e) * np.diff(edges))
-    ax.stairs(value, edges, fill=True, color=PALE, label=term("picture.samples"))
+    ax.stairs(value, edges, fill=True, color=PALE, label="samples")
     grid = torch.linspace(start, end, 1201, dtype=torch.float64)
     fitted = torch.exp(-mkc_nll(grid, c.sigma, d, bound))
     normal = torch.exp(-0.5 * (grid / gauss).square()) / (gauss * (2 * np.pi) ** 0.5) if gauss > 0 else 0 * grid
-    ax.plot(array(grid), array(fitted), color=BLUE, lw=1.6, label=term("picture.fitted"))
-    ax.plot(array(grid), array(normal), color=ORANGE, lw=1.4, ls=(0, (5, 2)), label=term("picture.normal"))
-    ax.set_xlabel(term("picture.algebraic", unit=c.unit))
+    ax.plot(array(grid), array(fitted), color=BLUE, lw=1.6, label="MKC, fitted")
+    ax.plot(array(grid), array(normal), color=ORANGE, lw=1.4, ls=(0, (5, 2)), label="Gaussian of the same samples")
+    ax.set_xlabel(f"residual, algebraic × radius/2 ({c.unit})")
     ax.margins(x=0)
     if tail:
         least = 1.0 / (len(e) * (edges[1] - edges[0]))
@@ -306,7 +305,7 @@ def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
         lon_gap, lat_gap = _lon_lat(np.array([gap.direction]))
         ax.plot(lon_gap, lat_gap, "x", color=ORANGE, ms=9, mew=2)
         ax.annotate(
-            term("picture.gap", axis=nearest_axis(gap.direction).replace("-", "−"), degrees=f"{gap.degrees:.0f}"),
+            f"gap {nearest_axis(gap.direction).replace('-', '−')}, {gap.degrees:.0f}°",
             (float(lon_gap[0]), float(lat_gap[0])),
             xytext=(0, -9), textcoords="offset points", ha="center", va="top",
             color=DARK_ORANGE, weight="bold", bbox=_BOX,
@@ -322,7 +321,7 @@ def _shade(ax: Any, c: Calibrated) -> None:
 
 def _kinds(rejected: np.ndarray) -> tuple[tuple[np.ndarray, str, str], ...]:
     """Masks of used and rejected samples, with their colours and labels."""
-    return (~rejected, BLUE, term("picture.in_use")), (rejected, ORANGE, term("label.rejected"))
+    return (~rejected, BLUE, "in use"), (rejected, ORANGE, "rejected")
 
 
 def _ring(i: int, j: int) -> np.ndarray:

@@ -38,6 +38,10 @@ def apply(
     convert: Annotated[list[str] | None, typer.Option(metavar=CONVERT_METAVAR, help=CONVERT_HELP)] = None,
     unit_label: Annotated[str | None, typer.Option(metavar="UNIT", help=LABEL_HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
+    ros: Annotated[
+        bool,
+        typer.Option("--ros", help="Write the fields of ROS's sensor_msgs/MagneticField: tesla, and a covariance."),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Correct a recording with a calibration or a model, and keep the recording's other columns.
@@ -50,7 +54,14 @@ def apply(
     if simulation is not None and simulator_output is not None:
         raise typer.BadParameter("--simulation and --simulator-output exclude each other; give the diagnosed one.")
     with loading():
-        from mkc_torch.cli.correction import correct, read_correction, show_correction, unit_of, write_correction
+        from mkc_torch.cli.correction import (
+            correct,
+            correct_as_messages,
+            read_correction,
+            show_correction,
+            unit_of,
+            write_correction,
+        )
         from mkc_torch.cli.diagnosis_files import named_simulation, paired_simulation
         from mkc_torch.cli.recorded import read_again
         from mkc_torch.simulation.load import raised_in
@@ -68,7 +79,7 @@ def apply(
             _refuse_input(output, recording, model, simulator_output)
             subject = recording
             table, topic = read_again(recording, names, units, sensor, made_in=unit_of(known), of_field=own is None)
-            corrected = correct(known, table)
+            corrected = correct_as_messages(known, table) if ros else correct(known, table)
             subject = output
             corrected = write_correction(recording, output, table, corrected, topic=topic, force=force)
     except Exception as error:

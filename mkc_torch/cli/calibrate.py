@@ -29,6 +29,7 @@ from mkc_torch.cli.units_option import (
     LABEL_HELP,
     SENSOR_HELP,
     parsed_units,
+    reading_options,
     split_trailing_pairs,
 )
 
@@ -69,7 +70,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Also write the calibration as px4, ardupilot, c-header, ros-yaml or json; repeatable.",
+            help="Also write the calibration as px4, ardupilot, c-header, ros-yaml, imu-calib or json; repeatable.",
         ),
     ] = None,
     instance: INSTANCE = None,
@@ -115,6 +116,7 @@ def calibrate(
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
     units = parsed_units(conversions, unit_label)
     refuse_same_names(recordings)
+    read_with = reading_options(names, conversions, unit_label)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
@@ -145,13 +147,15 @@ def calibrate(
         exports=exports,
         to=Destination(instance, device_id),
         earth=earth,
+        read_with=read_with,
     )
+    shown_with = reading_options(names, conversions, unit_label, sensor)
     console, total, failed, doubtful, left = out(), 0, 0, 0, list(recordings)
     with progress(len(recordings), output, lines=True) as step, interrupts_reported(lambda: not_written(left, output)):
         for path in recordings:
             results = list(calibrations_of(path, output / path.stem, request, force=force, step=step))
             with step.aside():
-                counts = show_results(console, path, results)
+                counts = show_results(console, path, results, shown_with)
             total += len(results)
             failed += counts.failed
             doubtful += counts.doubtful

@@ -44,6 +44,7 @@ class CalibrationRequest(NamedTuple):
         exports: formats of additional files.
         to: the vehicle's sensor that the exports are for.
         earth: the Earth's field at the place of the recordings, if known.
+        read_with: options with which the recordings are read, without ``--sensor``.
     """
 
     columns: Mapping[str, str]
@@ -57,6 +58,7 @@ class CalibrationRequest(NamedTuple):
     exports: tuple[str, ...] = ()
     to: Destination = Destination()
     earth: Field | None = None
+    read_with: tuple[str, ...] = ()
 
 
 class CalibrationOutcome(NamedTuple):
@@ -187,7 +189,10 @@ def _calibrate(
         compared, refused = _compared(calibration, request.old)
         texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), request.exports, request.to)
         drawing()
-        page = calibration_report(calibration, recording, against=compared, source=str(path), result=str(result))
+        read_with = (*request.read_with, *(("--sensor", request.sensor) if request.sensor else ()))
+        page = calibration_report(
+            calibration, recording, against=compared, source=str(path), result=str(result), read_with=read_with
+        )
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)
         for name, text in texts.items():

@@ -23,20 +23,26 @@ class Counts(NamedTuple):
     doubtful: int
 
 
-def show_results(console: Console, path: Path, results: Sequence[tuple[str, CalibrationOutcome | Exception]]) -> Counts:
+def show_results(
+    console: Console,
+    path: Path,
+    results: Sequence[tuple[str, CalibrationOutcome | Exception]],
+    read_with: Sequence[str] = (),
+) -> Counts:
     """Print the results of a file: in full for a single sensor, on one page for several; errors on standard error.
 
     Args:
         console: standard output.
         path: the file.
         results: the subject for messages of each sensor, and its calibration or the error.
+        read_with: options with which the file was read, for the proposed command.
     """
     done = [outcome for _, outcome in results if isinstance(outcome, CalibrationOutcome)]
     if len(results) > 1 and done:
         show_sensors(console, path.stem, [_result(subject, outcome) for subject, outcome in results])
     else:
         for found in done:
-            show(console, found.calibration, found.files, found.differences, found.notes, path)
+            show(console, found.calibration, found.files, found.differences, found.notes, path, read_with)
     for subject, outcome in results:
         for error in [outcome] if isinstance(outcome, Exception) else outcome.refused:
             complain(subject, error)

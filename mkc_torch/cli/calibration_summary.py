@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.differences import Differences
 from mkc_torch.cli.remarks import NOTE, note_rows, warning_rows
@@ -47,21 +46,24 @@ def show(
     compared: Differences | None = None,
     notes: Sequence[str] = (),
     source: Path | None = None,
+    read_with: Sequence[str] = (),
 ) -> None:
     """Print a summary of a calibration, its differences from an earlier one, the next command and its files.
 
-    ``notes`` are remarks on the exports, ``source`` is the recording.
+    ``notes`` are remarks on the exports, ``source`` is the recording, which was read with the options
+    ``read_with``.
     """
     console.print()
-    console.print(_headline(c.name or c.recording or term("label.recording"), c))
+    console.print(_headline(c.name or c.recording or "recording", c))
     _print_rows(console, [*warning_rows(c.warnings, _REPORT), *_exports(notes)])
     console.print(_numbers(c))
     _print_rows(console, [*_facts(c), *note_rows(c.notes, _REPORT, console.width - _LABEL - 3)])
     if compared is not None:
         _show_differences(console, compared)
     if files and source is not None:
-        command = f"mkc apply {shlex.quote(str(files[0]))} {shlex.quote(str(source))} --output corrected.csv"
-        console.print(Text(f"{term('label.to_do'):<{_LABEL + 3}}{command}"), soft_wrap=True)
+        words = ("mkc", "apply", str(files[0]), str(source), *read_with, "--output", "corrected.csv")
+        command = shlex.join(words)
+        console.print(Text(f"{'to do':<{_LABEL + 3}}{command}"), soft_wrap=True)
     _print_files(console, files)
 
 
@@ -72,8 +74,8 @@ def show_sensors(console: Console, recording: str, results: Sequence[SensorResul
     table = Table.grid(padding=(0, 3, 0, 0))
     units = {r.calibration.unit for r in results if r.calibration is not None}
     unit = next(iter(units)) if len(units) == 1 else ""
-    offset = term("table.offset_line", unit=unit)
-    heads = ("sensor", "result", offset, term("label.residual"), term("label.rejected"))
+    offset = f"offset x, y, z ± SE, {unit}"
+    heads = ("sensor", "result", offset, "residual", "rejected")
     for _ in heads:
         table.add_column(no_wrap=True)
     table.add_row(*(Text(head, style="dim") for head in heads))
@@ -110,7 +112,7 @@ def _headline(name: str, c: Calibration) -> Text:
 
 def _exports(notes: Sequence[str]) -> Iterator[tuple[str, str]]:
     for note in notes:
-        yield term("label.warning"), note
+        yield "warning", note
 
 
 def _numbers(c: Calibration) -> Table:
@@ -121,29 +123,24 @@ def _numbers(c: Calibration) -> Table:
         table.add_column(justify="right", no_wrap=True)
     power = w.power(c.radius)
     unit = w.in_power(power, c.unit)
-    table.add_row(Text(term("table.offset_line", unit=unit)), *w.with_errors(c.center, c.center_se, power))
-    table.add_row(Text(term("table.semi_axes_line", unit=unit)), *w.with_errors(c.semi_axes, c.semi_axes_se, power))
+    table.add_row(Text(f"offset x, y, z ± SE, {unit}"), *w.with_errors(c.center, c.center_se, power))
+    table.add_row(Text(f"semi-axes ± SE, {unit}"), *w.with_errors(c.semi_axes, c.semi_axes_se, power))
     return table
 
 
 def _facts(c: Calibration) -> Iterator[tuple[str, str]]:
     """Yield the residual, the noise, the rejected samples, the coverage, and what aided the fit."""
     yield (
-        term("label.residual"),
-        term(
-            "calibration.change",
-            robust=w.change(c.before, c.after, c.unit),
-            before=w.size(c.before.rms),
-            after=w.size(c.after.rms),
-        ),
+        "residual",
+        (f"{w.change(c.before, c.after, c.unit)} robust, {w.size(c.before.rms)} → {w.size(c.after.rms)} rms"),
     )
-    yield term("label.noise"), w.noise(c)
-    yield term("label.rejected"), w.rejection(c)
-    yield term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))
+    yield "noise", w.noise(c)
+    yield "rejected", w.rejection(c)
+    yield "coverage", f"{w.share(c.coverage.fraction)} of all directions have a sample within 15°"
     if c.rest_bias is not None:
-        yield term("label.gyroscope"), w.rest_bias(c.rest_bias)
+        yield "gyroscope", w.rest_bias(c.rest_bias)
     if c.aid is not None:
-        yield term("label.aided"), " ".join(w.aided(c))
+        yield "aided", " ".join(w.aided(c))
 
 
 def _print_rows(console: Console, rows: Iterator[tuple[str, str]] | Sequence[tuple[str, str]]) -> None:
@@ -152,7 +149,7 @@ def _print_rows(console: Console, rows: Iterator[tuple[str, str]] | Sequence[tup
     facts.add_column(overflow="fold")
     rows, last = list(rows), ""
     for label, text in rows:
-        style = "bold yellow" if label == term("label.warning") else ""
+        style = "bold yellow" if label == "warning" else ""
         facts.add_row(Text("" if label == last == NOTE else label, style=style), Text(text))
         last = label
     if rows:
@@ -162,15 +159,15 @@ def _print_rows(console: Console, rows: Iterator[tuple[str, str]] | Sequence[tup
 def _print_files(console: Console, files: Sequence[Path]) -> None:
     for file in files:
         # outside the table, so that a long path is not broken and can be copied
-        console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{'written':<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
 
 
 def _show_differences(console: Console, found: Differences) -> None:
     """Print the differences from an earlier calibration."""
-    console.print(Text(term("section.against", name=found.name), style="bold"))
+    console.print(Text(f"Comparison with the calibration {found.name}", style="bold"))
     table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
     table.add_column("", no_wrap=True)
-    heads = (term("table.this_one"), found.name, term("table.difference"), term("table.in_errors"))
+    heads = ("this calibration", found.name, "difference ± SE", "in standard errors")
     for head in heads:
         table.add_column(Text(head), justify="right")
     for row in difference_rows(found):

@@ -31,7 +31,6 @@ from rich.progress import (
 from rich.text import Text
 
 from mkc_torch._support.files import folder_held
-from mkc_torch._words.terms import term
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """Errors of bad input, a full disk or a numerical breakdown."""
@@ -88,7 +87,7 @@ def complain(subject: str | Path, error: BaseException) -> None:
     sentence = sentence.removeprefix(f"{Path(subject).stem}: ")  # the name of a recording in Python
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
-    err().print(term("command.failed", sentence=sentence), soft_wrap=True)
+    err().print(f"mkc: {sentence}", soft_wrap=True)
 
 
 def sentence_of(error: BaseException) -> str:
@@ -102,7 +101,7 @@ def sentence_of(error: BaseException) -> str:
     """
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename} " if error.filename else ""
-        return term("command.no_file", file=where, reason=error.strerror.lower())
+        return f"{where}cannot be written or read: {error.strerror.lower()}; choose another place."
     from mkc_torch.simulation.load import SimulationFileError
 
     if isinstance(error, SimulationFileError):
@@ -126,9 +125,9 @@ def parsed_columns(text: str | None) -> dict[str, str]:
         if not part.strip() and not text:
             continue
         if not (name and equals and source):
-            raise typer.BadParameter(term("command.no_pair", part=part))
+            raise typer.BadParameter(f'"{part}" is not a pair; write name=column, such as mag_x=mx,mag_y=my,mag_z=mz.')
         if name in pairs:
-            raise typer.BadParameter(term("command.twice", name=name))
+            raise typer.BadParameter(f'"{name}" is given twice.')
         pairs[name] = source
     return pairs
 
@@ -147,9 +146,9 @@ def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, s
     for part in (part for text in texts for part in text.split(",")):
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not (name and equals and value):
-            raise typer.BadParameter(term("command.no_option_pair", option=option, part=part, example=example))
+            raise typer.BadParameter(f'{option} "{part}" is not a pair; write name=value, such as {example}.')
         if name in pairs:
-            raise typer.BadParameter(term("command.twice", name=name))
+            raise typer.BadParameter(f'"{name}" is given twice.')
         pairs[name] = value
     return pairs
 
@@ -163,10 +162,12 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
     taken: dict[str, Path] = {}
     for path in recordings:
         if not path.stem.strip("."):
-            raise typer.BadParameter(term("command.no_folder", path=path))
+            raise typer.BadParameter(f"{path} is not a valid name for a results folder; rename it.")
         other = taken.setdefault(path.stem.casefold(), path)
         if other is not path:
-            raise typer.BadParameter(term("command.same_folder", path=other, other=path, folder=path.stem))
+            raise typer.BadParameter(
+                f"{other} and {path} would both write into {path.stem}; rename one, or use two --output."
+            )
 
 
 def folder_names(labels: list[str]) -> list[str]:
@@ -242,10 +243,8 @@ class Steps:
         thing, done, total = self._part
         task = None if self._bar is None else next(task for task in self._bar.tasks if task.id == self._timed)
         if task is None or task.time_remaining is None:
-            return term("command.part", thing=thing, number=done + 1, total=total)
-        return term(
-            "command.part_and_time", thing=thing, number=done + 1, total=total, seconds=math.ceil(task.time_remaining)
-        )
+            return f"{thing} {done + 1} of {total}"
+        return f"{thing} {done + 1} of {total}, about {math.ceil(task.time_remaining)} s"
 
     def count(self, name: str, done: int, total: int) -> None:
         """Report the current item and the number of finished items."""
@@ -306,7 +305,7 @@ def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> 
 
 def _write_line(steps: Steps, elapsed: float) -> None:
     """Write the stage and the elapsed seconds to standard error."""
-    text = term("command.progress", seconds=f"{elapsed:.0f}", stage=_stage(steps))
+    text = f"mkc: after {elapsed:.0f} s: {_stage(steps)}"
     err().print(text, soft_wrap=True)
 
 
@@ -318,7 +317,7 @@ def _stage(steps: Steps) -> str:
 
 def _note(steps: Steps, folder: Path, elapsed: float) -> None:
     """Add a line on the current stage to ``progress.txt``."""
-    with suppress(OSError):  # the work goes on without the file
+    with suppress(OSError):  # the command continues without the file
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "progress.txt").open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {_stage(steps)}\n")
@@ -348,7 +347,7 @@ class _PartColumn(ProgressColumn):
 
     steps: Steps | None = None
 
-    def render(self, task: Task) -> Text:  # noqa: ARG002
+    def render(self, task: Task) -> Text:  # noqa: ARG002 - signature of rich
         """Return the current text."""
         return Text("" if self.steps is None else self.steps.part_done)
 
@@ -380,7 +379,7 @@ def interrupts_reported(left: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        err().print(term("command.interrupted", left=left()), soft_wrap=True)
+        err().print(f"mkc: interrupted; {left()}", soft_wrap=True)
         raise
 
 
@@ -396,11 +395,11 @@ def not_written(recordings: Iterable[Path], output: Path) -> str:
     there = [path for path in paths if path not in stopped and (output / path.stem).is_dir()]
     absent = ", ".join(str(path) for path in paths if path not in there and path not in stopped)
     known = ", ".join(str(path) for path in stopped)
-    sentences = [term("command.stopped", recordings=known)] if known else []
-    sentences += [term("command.nothing_written", recordings=absent)] if absent else []
+    sentences = [f"results so far were written for {known}"] if known else []
+    sentences += [f"nothing was written for {absent}"] if absent else []
     folders = ", ".join(str(output / path.stem) for path in there)
-    sentences += [term("command.incomplete", folders=folders)] if there else []
-    return f"{'; '.join(sentences)}." if sentences else term("command.all_written")
+    sentences += [f"{folders} may be incomplete"] if there else []
+    return f"{'; '.join(sentences)}." if sentences else "all results were written."
 
 
 def _holds_stopped_diagnosis(folder: Path) -> bool:

@@ -12,6 +12,8 @@ import torch
 
 from mkc_torch.calibration import result as calibration_file
 from mkc_torch.calibration.calibrate import Calibration
+from mkc_torch.calibration.exports.units import unit_ratio
+from mkc_torch.calibration.field_messages import magnetic_field_messages
 from mkc_torch.cli.console import out
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
@@ -26,7 +28,15 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation import Simulation
 
-__all__ = ["Corrected", "correct", "read_correction", "show_correction", "unit_of", "write_correction"]
+__all__ = [
+    "Corrected",
+    "correct",
+    "correct_as_messages",
+    "read_correction",
+    "show_correction",
+    "unit_of",
+    "write_correction",
+]
 
 _NOT_MEASURED = ("time", "experiment")
 
@@ -60,9 +70,10 @@ def show_correction(table: Recording, corrected: Corrected, output: Path) -> Non
     """Print warnings, notes and a summary of the written file."""
     console = out()
     columns = {name: values for name, values in corrected.columns.items() if name not in _NOT_MEASURED}
-    values = torch.stack(list(columns.values()), -1)
+    field = [name for name in columns if name.startswith(("field_", "magnetic_field."))] or list(columns)
+    values = torch.stack([columns[name] for name in field], -1)
     missing = int((~values.isfinite().all(-1)).sum())
-    is_field = set(columns) == {f"field_{axis}" for axis in "xyz"}
+    is_field = field in [[f"{name}{axis}" for axis in "xyz"] for name in ("field_", "magnetic_field.")]
     for warning in table.warnings:
         console.print(f"warning: {warning}", soft_wrap=True)
     for note in (*table.notes, *corrected.notes):
@@ -149,6 +160,23 @@ def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Correc
     columns, notes = known.correct(recording)
     length = known.state.get("strength")
     return Corrected(columns, str(known.state.get("unit", "")), length if isinstance(length, float) else None, notes)
+
+
+def correct_as_messages(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:
+    """Correct a recording to the fields of ``sensor_msgs/MagneticField``.
+
+    Raises:
+        ValueError: a model, an accelerometer, or a field in an unknown unit.
+    """
+    if not isinstance(known, Calibration):
+        raise ValueError(
+            "--ros needs the noise of a calibration, which a model of `mkc diagnose` does not hold; give the "
+            "calibration.json of `mkc calibrate`."
+        )
+    messages = magnetic_field_messages(known, recording.magnetometer())
+    time = {} if recording.time is None else {"time": recording.time}
+    strength = known.field_strength * (unit_ratio(known.field_unit, "T") or 1.0)
+    return Corrected(time | messages.columns(), "T", strength, ())
 
 
 def unit_of(known: Calibration | DiagnosedModel) -> str:

@@ -13,7 +13,6 @@ from rich.text import Text
 
 from mkc_torch._support.files import write_atomically
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration, Vector, calibrate
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.cli import diagnosis_summary
@@ -139,8 +138,8 @@ def show_calibration(console: Console, calibration: Calibration, rows: list[Comp
 def _table(rows: list[Comparison]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
     table.add_column("µT, SIMULATED")
-    offsets = [term("table.offset_of", axis=axis) for axis in "xyz"]
-    for name in (*offsets, *(term("table.semi_axis", number=i) for i in (1, 2, 3))):
+    offsets = [f"offset {axis}" for axis in "xyz"]
+    for name in (*offsets, *(f"semi-axis {i}" for i in (1, 2, 3))):
         table.add_column(name, justify="right")
     table.add_column("largest error", justify="right")
     truth = (*rows[0].center, *rows[0].semi_axes)
@@ -166,4 +165,4 @@ def show_diagnosis(console: Console, diagnosis: Diagnosis, files: list[Path], se
     console.print(f"by a calibration alone             {second.calibrated:.2f} µT")
     console.print(f"by the model with the findings     {second.corrected:.2f} µT")
     for file in second.files:
-        console.print(Text.assemble(f"{term('label.written'):<12}", (str(file), "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{'written':<12}", (str(file), "cyan")), soft_wrap=True)

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from mkc_torch.cli.console import (
+    DOUBTFUL,
     FAILURES,
     ConsoleStyle,
     Steps,
@@ -43,6 +44,7 @@ from mkc_torch.cli.units_option import (
     LABEL_HELP,
     SENSOR_HELP,
     parsed_units,
+    reading_options,
     split_trailing_pairs,
 )
 
@@ -113,7 +115,9 @@ def diagnose(
     """Find the physics that a simulation lacks: its place, size and form, the evidence, and the improvement.
 
     For each REC, diagnosis.json, model.json (for `mkc apply`) and report.html are written; with --together, one set
-    for all of them. The exit code is 0 if every recording was diagnosed, with or without findings, and 1 otherwise.
+    for all of them. The exit code is 0 if every recording was diagnosed, with or without findings, 1 if one was not,
+    and 3 if all were but a result is doubtful: the simulation does not fit, structure remains unexplained, no finding
+    is confirmed, the findings do not make the residual smaller, or a third of the samples was rejected.
     Ctrl-C stops the search, writes the results so far and exits with 130; a second Ctrl-C exits at once.
     """
     recordings, conversions = split_trailing_pairs(recordings, convert or [])
@@ -131,12 +135,13 @@ def diagnose(
         quick=quick,
         time_limit=_time_limit(time_limit),
         force=force,
+        read_with=reading_options(_columns(columns, run_column), conversions, unit_label, sensor),
     )
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
         from mkc_torch.cli.diagnosis_files import simulation_of
-    total, failed, left = 0, 0, list(recordings)
+    total, failed, doubtful, left = 0, 0, False, list(recordings)
     with interrupts_reported(lambda: not_written(left, output)):
         _refuse_unusable(request, simulation_of)
     one_thread()
@@ -158,13 +163,14 @@ def diagnose(
             _print_outcomes(outcomes, step)
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
+            doubtful = doubtful or any(outcome.doubtful for outcome in outcomes)
             if any(outcome.interrupted for outcome in outcomes):
                 raise KeyboardInterrupt
             left.remove(path)
             step(None)
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if failed else DOUBTFUL if doubtful else 0)
 
 
 def _diagnosed(output: Path, request: Request, look: ConsoleStyle, step: Steps | None, path: Path) -> list[Outcome]:
@@ -184,7 +190,9 @@ def _all_together(output: Path, request: Request, look: ConsoleStyle, paths: lis
         if any(outcome.interrupted for outcome in outcomes):
             raise KeyboardInterrupt
         step(None)
-    return int(any(outcome.failed for outcome in outcomes))
+    if any(outcome.failed for outcome in outcomes):
+        return 1
+    return DOUBTFUL if any(outcome.doubtful for outcome in outcomes) else 0
 
 
 def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:

@@ -24,6 +24,7 @@ from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_f
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts
 from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -221,7 +222,8 @@ def _outcome(
         own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
     stopped = diagnosis.stop is not None and diagnosis.stop.reason == "interrupt"
-    return Outcome(look.set(lambda console: show(console, diagnosis, files, paths)), failed=False, interrupted=stopped)
+    text = look.set(lambda console: show(console, diagnosis, files, paths))
+    return Outcome(text, failed=False, interrupted=stopped, doubtful=bool(diagnosis_doubts(diagnosis)))
 
 
 def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
@@ -233,8 +235,7 @@ def _paths(path: Path, folder: Path, request: Request) -> RunPaths | None:
         options += ["--simulator-output", str(request.simulator_output)]
     elif request.simulation != MAGNETOMETER:
         options += ["--simulation", request.simulation]
-    if request.columns:
-        options += ["--columns", ",".join(f"{name}={column}" for name, column in request.columns.items())]
+    options += request.read_with
     return RunPaths(str(path), str(folder / "model.json"), tuple(options))
 
 

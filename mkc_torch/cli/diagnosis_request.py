@@ -53,6 +53,7 @@ class Request:
     time_limit: float | None = None
     force: bool = False
     report: bool = True
+    read_with: tuple[str, ...] = ()
 
     @property
     def undecided(self) -> bool:
@@ -69,12 +70,14 @@ class Outcome:
         failed: whether ``text`` is an error.
         note: a sentence on a choice made for the user.
         interrupted: whether the user stopped the search.
+        doubtful: whether the result must be looked at before it is used.
     """
 
     text: str
     failed: bool
     note: str = ""
     interrupted: bool = False
+    doubtful: bool = False
 
 
 def is_file_of_a_simulation(name: str) -> bool:

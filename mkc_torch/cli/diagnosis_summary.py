@@ -9,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
@@ -33,9 +32,9 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     """Print the summary of a diagnosis and the files that hold it."""
     d = diagnosis
     console.print()
-    heading = plain(d.recording) or term("label.recording")
+    heading = plain(d.recording) or "recording"
     if d.simulation:
-        heading = term("label.against", recording=heading, simulation=plain(d.simulation))
+        heading = f"{heading} against {plain(d.simulation)}"
     console.print(Text(heading, style="bold"))
     for notice in top.notices_first(d):
         console.print(Text(notice, style="bold yellow"))
@@ -48,23 +47,23 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
     console.print(_facts(_of_all(d, paths, console.width - _LABEL - 3)))
     for file in files:
         # outside the table, so that a long path is not broken and can be copied
-        console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{'written':<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
 
 
 def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     """Yield the goodness of fit, the noise, the findings, and the unexplained rest."""
     d = diagnosis
     for line in environment.output_lines(d):
-        yield term("label.follows"), line
+        yield "fit", line
     if d.verdict == "unfit":
         for reason in top.reasons(d):
-            yield _striking("label.why"), reason
-        yield term("label.named"), term("environment.nothing_named")
+            yield _striking("why"), reason
+        yield "named", "nothing: a simulation must fit before physics is named"
         return
     for line in environment.noise_lines(d) or [noise.noise_model(d.noise)]:
-        yield term("label.noise"), line
-    yield term("label.named"), _named(d.findings)
-    yield term("label.unexplained"), top.unexplained_place(d) or term("environment.nothing")
+        yield "noise", line
+    yield "named", _named(d.findings)
+    yield "unexplained", top.unexplained_place(d) or "nothing"
 
 
 def _named(findings: Sequence[Finding]) -> str:
@@ -72,12 +71,12 @@ def _named(findings: Sequence[Finding]) -> str:
     sure = [f for f in findings if f.grade in ("left_out", "small")]
     names = "; ".join(_graded(f) for f in sure or findings)
     if sure or not findings:
-        return names or term("environment.nothing")
-    return term("environment.nothing_sure", findings=names)
+        return names or "nothing"
+    return f"nothing confirmed; {names}"
 
 
 def _graded(finding: Finding) -> str:
-    return term("environment.graded", finding=sentences.finding_name(finding), grade=sentences.grade(finding))
+    return f"{sentences.finding_name(finding)}: {sentences.grade(finding)}"
 
 
 def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
@@ -85,68 +84,68 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
     lines = [line for p in f.parameters for line in numbers.named_lines(p, f.channels)]
     if len(lines) > _MOST_LINES:
         lines = [numbers.largest(p) for p in f.parameters[:_MOST_LINES]]
-        lines.append(term("number.more_parameters"))
+        lines.append("and more, see the report")
     if lines:
-        yield term("label.size"), "\n".join(lines)
+        yield "size", "\n".join(lines)
     acts = f"; {sentences.acts_on(f)}" if f.channels else ""
-    yield term("label.where"), sentences.where(f, numbers.clock_of(diagnosis.traces)) + acts
+    yield "where", sentences.where(f, numbers.clock_of(diagnosis.traces)) + acts
     if f.region is not None:
-        yield term("label.mostly"), sentences.region(f.region)
+        yield "mostly", sentences.region(f.region)
     if f.experiments:
-        yield term("label.in"), sentences.shares_of_runs(f.experiments, diagnosis.environment.runs)
-    yield term("label.driven_by"), sentences.driven_by(f)
+        yield "in", sentences.shares_of_runs(f.experiments, diagnosis.environment.runs)
+    yield "driven by", sentences.driven_by(f)
     evidence = numbers.evidence(f.p_value, diagnosis.surrogates)
-    sure = evidence if f.p_value is None else term("evidence.after_the_search", evidence=evidence)
-    yield term("label.how_sure"), sure
+    sure = evidence if f.p_value is None else f"{evidence}, corrected for the search"
+    yield "how sure", sure
     if f.shape is not None:
-        yield term("label.shape"), "; ".join(filter(None, [sentences.shape(f), plain(f.shape.formula)]))
+        yield "shape", "; ".join(filter(None, [sentences.shape(f), plain(f.shape.formula)]))
     if f.held_out is None:
-        yield term("label.held_out"), f"{term('evidence.not_measured')}: {plain(f.held_out_note)}"
+        yield "held out", f"not measured: {plain(f.held_out_note)}"
     else:
-        zero = f"; {term('evidence.zero')}" if first else ""
+        zero = "; 0 is no improvement" if first else ""
         residual = "; ".join(unseen.residuals(f.held_out, diagnosis.environment))
         more = [unseen.diverged(f.held_out), plain(f.held_out_note)]
         change = f"{residual}; {unseen.better(f.held_out)}; {numbers.gain(f.held_out)}{zero}"
-        yield term("label.held_out"), "\n".join(filter(None, [change, *more]))
+        yield "held out", "\n".join(filter(None, [change, *more]))
     yield from rows(f.evidence, terminal=True)
     if sentences.inseparable(f):
-        yield _striking("label.or"), term("evidence.cannot_distinguish", rivals=sentences.rivals(f))
+        yield _striking("or"), f"{sentences.rivals(f, sizes=True)}: this recording cannot distinguish"
     if not f.plausible:
-        yield _striking("label.doubtful"), typeset(f.plausibility) or term("evidence.no_plausible_size")
+        yield _striking("doubtful"), typeset(f.plausibility) or "no plausible size"
 
 
 def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
         for change in unseen.residual_of_all(d):
-            yield term("label.together"), term("evidence.together", change=change)
+            yield "together", f"{change} on held-out data"
     if not d.findings and d.verdict != "unfit":
         evidence = numbers.evidence(d.p_value, d.surrogates)
         tried = f"{d.candidates_tried:,}"
         yield (
-            term("label.how_sure"),
-            term("evidence.searched", evidence=evidence, candidates=tried, level=f"{d.level:g}"),
+            "how sure",
+            f"{evidence}, corrected for {tried} candidates, level {d.level:g}",
         )
     smooth = noise.smooth_fit(d)
     if smooth and d.verdict != "unfit":
-        yield term("label.compare"), smooth
+        yield "compare", smooth
     if d.verdict != "unfit":
         if environment.noise_lines(d):
-            yield term("label.sensor"), noise.noise_model(d.noise)
+            yield "sensor", noise.noise_model(d.noise)
         yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
-        yield term("label.to_do"), sentence
+        yield "to do", sentence
     command = top.apply_command(d, paths)
     if command:
-        yield term("label.to_do"), command
+        yield "to do", command
     for _, warning in warning_rows(top.warned(d), _REPORT):
-        yield _striking("label.warning"), warning
+        yield _striking("warning"), warning
     yield from note_rows([plain(note) for note in d.notes], _REPORT, width)
 
 
 def _striking(key: str) -> str:
     """Return a label that is highlighted."""
-    return f"!{term(key)}"
+    return f"!{key}"
 
 
 def _facts(lines: Iterator[tuple[str, str]]) -> Table:

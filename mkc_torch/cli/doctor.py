@@ -1,4 +1,4 @@
-"""``mkc doctor``: what is installed, and what each missing extra would bring."""
+"""``mkc doctor``: the installed packages, and the features of each missing extra."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["EXTRAS", "Extra", "doctor"]
 
 
 class Extra(NamedTuple):
-    """An extra of the installation: what it brings, and the packages that it installs."""
+    """An extra of the installation: its features, and the packages that it installs."""
 
     name: str
     brings: str

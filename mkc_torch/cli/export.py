@@ -17,7 +17,7 @@ def export(
         Path,
         typer.Argument(metavar="MODEL.json", help="calibration.json of `mkc calibrate`, model.json of `mkc diagnose`."),
     ],
-    to: Annotated[str, typer.Option(metavar="KIND", help="px4, ardupilot, c-header, ros-yaml or json.")],
+    to: Annotated[str, typer.Option(metavar="KIND", help="px4, ardupilot, c-header, ros-yaml, imu-calib or json.")],
     output: Annotated[Path, typer.Option(help="File to write.")],
     name: Annotated[
         str | None,
@@ -28,6 +28,8 @@ def export(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Export a calibration as PX4 or ArduPilot parameters, C header, ROS parameter file, or JSON.
+
+    imu-calib is for accelerometers, the others are for magnetometers.
 
     From a model, the offset, the matrix and the field of a current are exported; a warning names other findings.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import asdict
 from typing import Any
@@ -10,13 +11,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mkc_torch._words.terms import term
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER
 from mkc_torch.cli.recorded import read_magnetometer
 from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.inspection import FileSeen, SensorSeen, TopicSeen
 
 __all__ = ["as_data", "commands_of", "show"]
+
+_MOST_PROPOSED = 3
+"""Most commands that are proposed for columns that may be a magnetometer."""
 
 
 def commands_of(seen: FileSeen) -> tuple[list[str], list[str]]:
@@ -69,8 +72,8 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
     commands, notes = found
     console.print()
     console.print(Text(str(seen.path), style="bold"), soft_wrap=True)
-    for command in [*commands, *_diagnoses(seen)]:
-        console.print(Text.assemble(f"{term('label.to_do'):<8}", (command, "cyan")), soft_wrap=True)
+    for command in [*commands, *_if_named(seen), *_diagnoses(seen)]:
+        console.print(Text.assemble(f"{'to do':<8}", (command, "cyan")), soft_wrap=True)
     for topic in seen.topics:
         console.print(Text(_about(topic)), soft_wrap=True)
         console.print(_columns(topic))
@@ -81,6 +84,15 @@ def show(console: Console, seen: FileSeen, found: tuple[list[str], list[str]]) -
         )
     for sentence in notes:
         console.print(Text(f"note: {sentence}"), soft_wrap=True)
+
+
+def _if_named(seen: FileSeen) -> list[str]:
+    """Return the commands that calibrate the columns that may be a magnetometer, if there are few."""
+    options = re.findall(r"`(--columns [^`]+)`", seen.question or "")
+    if not 1 <= len(options) <= _MOST_PROPOSED:
+        return []
+    path = shlex.quote(str(seen.path))
+    return [f"mkc calibrate {path} {option} --output results  (if this is a magnetometer)" for option in options]
 
 
 def _diagnoses(seen: FileSeen) -> list[str]:

@@ -1,11 +1,10 @@
-"""Rows of warnings and notes: warnings in the order of their weight, then notes in few lines, the others counted."""
+"""Rows of warnings and notes: warnings first, by importance; then notes in few lines, with a count of the rest."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 
 __all__ = ["NOTE", "note_rows", "warning_rows"]
@@ -31,9 +30,9 @@ def warning_rows(warnings: Sequence[str], file: str, most: int = MOST_LINES) -> 
     """
     shown = warnings if len(warnings) <= most else warnings[: max(most - 1, 1)]
     for warning in shown:
-        yield term("label.warning"), warning
+        yield "warning", warning
     if len(shown) < len(warnings):
-        yield term("label.warning"), f"{len(warnings) - len(shown)} more; see {file}"
+        yield "warning", f"{len(warnings) - len(shown)} more; see {file}"
 
 
 def note_rows(notes: Sequence[str], file: str, width: int) -> Iterator[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import typer
@@ -15,6 +15,7 @@ __all__ = [
     "QUANTITIES",
     "SENSOR_HELP",
     "parsed_units",
+    "reading_options",
     "split_trailing_pairs",
 ]
 
@@ -55,6 +56,25 @@ def parsed_units(conversions: Sequence[str], label: str | None = None) -> dict[s
         units[name] = unit.rstrip(",")
     _refuse_unknown(units)
     return units if label is None else _with_label(units, label.strip())
+
+
+def reading_options(
+    columns: Mapping[str, str], conversions: Sequence[str], label: str | None = None, sensor: str | None = None
+) -> tuple[str, ...]:
+    """Return the options with which a recording was read, for a proposed command that reads it again.
+
+    Args:
+        columns: new name to column, of ``--columns``.
+        conversions, label, sensor: values of ``--convert``, ``--unit-label`` and ``--sensor``.
+
+    Example:
+        >>> reading_options({"mag_x": "mx"}, ["time=ms"], None, "mag0")
+        ('--columns', 'mag_x=mx', '--convert', 'time=ms', '--sensor', 'mag0')
+    """
+    named = ",".join(f"{name}={column}" for name, column in columns.items())
+    pairs = [("--columns", named), *(("--convert", part) for part in conversions)]
+    pairs += [("--unit-label", label or ""), ("--sensor", sensor or "")]
+    return tuple(word for option, value in pairs if value for word in (option, value))
 
 
 def _refuse_unknown(units: dict[str, str]) -> None:

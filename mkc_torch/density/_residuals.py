@@ -72,7 +72,7 @@ def checked_residuals(error: Float[Tensor, "*batch N m"] | Data) -> Float[Tensor
     if not bool((error.abs() <= most).all()):
         raise ValueError(
             f"Expected argument `error` within {most:.1g}, beyond which squares overflow, but got "
-            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out what cannot be right."
+            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out impossible values."
         )
     return error
 

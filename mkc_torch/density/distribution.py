@@ -71,7 +71,7 @@ class MKCDistribution(Distribution):
         tensor(0.5000)
     """
 
-    arg_constraints = {  # noqa: RUF012
+    arg_constraints = {  # noqa: RUF012 - a class attribute of torch.distributions
         "sigma": constraints.greater_than_eq(SIGMA_MIN),
         "d": _Finite(),
         "bound": _Finite(),
@@ -171,7 +171,7 @@ class MKCDistribution(Distribution):
         quantile = self.loc + self.d * u
         return torch.minimum(torch.maximum(quantile, self.loc - self.bound), self.loc + self.bound)
 
-    def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008
+    def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008 - the default of torch.distributions
         """Samples, differentiable in sigma, d, bound and loc; drawn from torch's global generator."""
         _refuse_no_shape("sample_shape", sample_shape)
         shape = self._extended_shape(torch.Size(sample_shape))

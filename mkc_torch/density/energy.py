@@ -71,7 +71,7 @@ class _Energy(torch.autograd.Function):
         return energy_value(z, kappa)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: ARG004
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
         ctx.save_for_backward(*inputs)
         ctx.save_for_forward(*inputs)
 

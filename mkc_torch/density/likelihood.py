@@ -6,29 +6,28 @@ the likelihood falls exponentially.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch.density._numpy_newton import (
+    KAPPA_OFFSET,
+    LEAST_KAPPA_SHARE,
+    LONGEST_STEP,
+    Channel,
+    channel_step,
+    is_short,
+)
 from mkc_torch.density.energy import KAPPA_MAX, energy_terms, energy_value
 from mkc_torch.density.head import head_rule, integrate, tail_density
 from mkc_torch.density.normalizer import log_partition_value
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-_KAPPA_OFFSET = 0.02
-"""Offset of κ in relative steps, Δκ / (κ + offset): near a Gaussian small absolute changes matter."""
-
-_LONGEST_STEP = 2.0
-"""Longest step, in log d and in relative κ."""
-
-_LEAST_KAPPA_SHARE = math.exp(-2.0)
-"""Smallest factor on κ (plus its offset) in a step."""
 
 
 class Derivatives(NamedTuple):
@@ -172,6 +171,8 @@ def initial_state(
 
 def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
     """One damped Newton step in (κ, log d) with κ in [0, 400] and d in [d_min, bound]; the value never increases."""
+    if is_short(error):
+        return _newton_step_of_one(error, weight, state)
     total = likelihood_derivatives(energy_derivatives(error, weight, state.kappa, state.log_d), state)
     proposal = newton_proposal(total, state)
     value = negative_log_likelihood(error, weight, proposal)
@@ -185,6 +186,21 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     )
 
 
+def _newton_step_of_one(
+    error: Float[Tensor, "1 N m"], weight: Float[Tensor, "1 N m"] | None, state: DensityState
+) -> DensityState:
+    """:func:`newton_step` of a single problem, channel by channel in NumPy."""
+    fields = (state.kappa, state.log_d, state.log_bound, state.log_d_min, state.damping, state.value)
+    channels = [Channel(*numbers) for numbers in zip(*(field[0].tolist() for field in fields), strict=True)]
+    errors = error[0].numpy().T
+    weights = [None] * len(errors) if weight is None else weight[0].numpy().T
+    free = state.free_kappa, state.free_d
+    with np.errstate(all="ignore"):
+        found = [channel_step(e, w, at, *free) for e, w, at in zip(errors, weights, channels, strict=True)]
+    kappa, log_d, damping, value = torch.from_numpy(np.array(found, dtype=float).T.copy()).unsqueeze(1)
+    return replace(state, kappa=kappa, log_d=log_d, damping=damping, value=value)
+
+
 def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivatives:
     """Derivatives of the mean negative log-likelihood, from those of the mean energy."""
     norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
@@ -193,7 +209,7 @@ def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivati
 
 def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
     """Iterate after a damped Newton step from ``state``; its value is not updated."""
-    chain = state.kappa + _KAPPA_OFFSET
+    chain = state.kappa + KAPPA_OFFSET
     g_s, g_l = total.kappa * chain, total.log_d
     h_ss = total.kappa_kappa * chain.square()
     h_sl, h_ll = total.kappa_log_d * chain, total.log_d_log_d
@@ -217,9 +233,9 @@ def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
     g_s, g_l = g_s * r_s, g_l * r_l
     step_s, step_l = r_s * (b * g_l - c * g_s) / determinant, r_l * (b * g_s - a * g_l) / determinant
     longest = torch.maximum(step_s.abs(), step_l.abs())
-    shorten = (_LONGEST_STEP / longest.clamp(min=_LONGEST_STEP)).nan_to_num(0.0)
-    grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=_LEAST_KAPPA_SHARE)
-    kappa = (chain * grown - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
+    shorten = (LONGEST_STEP / longest.clamp(min=LONGEST_STEP)).nan_to_num(0.0)
+    grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=LEAST_KAPPA_SHARE)
+    kappa = (chain * grown - KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
     log_d = torch.minimum(
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )

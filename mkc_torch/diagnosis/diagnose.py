@@ -40,7 +40,7 @@ def diagnose(
     surrogates: int = SURROGATES,
     max_findings: int = MAX_FINDINGS,
     seed: int = 0,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),  # noqa: B008 - frozen
     noise: Mapping[str, float] | None = None,
     input_hold: Mapping[str, str] | None = None,
     quick: bool = False,

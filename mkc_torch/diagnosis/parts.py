@@ -31,11 +31,9 @@ __all__ = [
     "Reference",
     "Region",
     "ResidualSizes",
-    "Row",
     "Separability",
     "SmoothCorrection",
     "StateMap",
-    "Table",
     "Traces",
     "value_of",
 ]
@@ -44,29 +42,8 @@ Number = float | tuple["Number", ...]
 
 
 @dataclass(frozen=True)
-class Row:
-    """A line of facts; ``in_terminal`` shows it on the terminal. The label "driven by" adds it to the driver's line."""
-
-    label: str
-    text: str
-    in_terminal: bool = True
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report; its first column is the heading of each row, ``note`` explains how to read it."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-
-@dataclass(frozen=True)
 class EvidenceResult:
-    """The result of a test of evidence, for a finding or the whole diagnosis; report, terminal and JSON loop over it.
-
-    Texts name effects by their ids, and numbers as Python prints them.
+    """The result of a test of evidence, for a finding or the whole diagnosis.
 
     Attributes:
         test: its id.
@@ -74,18 +51,12 @@ class EvidenceResult:
         content: what ``diagnosis.json`` contains as ``evidence.<test>``: JSON, or results of this file.
         keys: the same for tests with keys of their own in the finding or the diagnosis; a mapping is merged into an
             existing object.
-        warnings: sentences.
-        rows: facts.
-        table: of the report.
     """
 
     test: str
     value: Any = None
     content: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    rows: tuple[Row, ...] = ()
-    table: Table | None = None
 
 
 def value_of(evidence: Sequence[EvidenceResult], test: str, default: Any = None) -> Any:
@@ -184,7 +155,8 @@ class Alternative:
 
     ``port`` is where it acts, if the simulation has several places for it. ``recurrence`` states whether it recurs in
     another recording. ``distinguishing_state`` is what to record to distinguish it from the finding, if the recording
-    does not.
+    does not. ``parameters`` are its fitted parameters in place of the finding, with those of its shape; empty for an
+    alternative that was not fitted to the end, such as a separable one.
     """
 
     effect: str
@@ -194,6 +166,7 @@ class Alternative:
     port: str = ""
     recurrence: str = ""
     distinguishing_state: str = ""
+    parameters: tuple[EffectParameter, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -235,6 +208,7 @@ class Finding:
     ``kind`` is the quantity it acts on, such as "temperature"; empty if unknown.
     ``cannot_be`` is True if its size is impossible, see ``plausibility``; ``doubts`` are sentences about numbers of its
     shape at the ends of their ranges.
+    ``clearly_better`` is True if the open-loop fit without it is clearly less likely, whatever the error of its size.
     ``p_value`` is that after the whole search; None in a quick look, which draws no surrogates.
     ``grade`` rates the finding; ``shape`` checks its named shape, None if not checked.
     ``evidence`` has the results of the tests of evidence.
@@ -264,6 +238,7 @@ class Finding:
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
+    clearly_better: bool = False
     grade: Grade = "left_out"
     shape: ShapeCheck | None = None
     evidence: tuple[EvidenceResult, ...] = ()
@@ -303,8 +278,8 @@ class Finding:
 class DensityCheck:
     """Distances of a channel's residuals from the density and from a Student-t distribution.
 
-    The distances are Kolmogorov's, between distribution functions. ``allowed`` is the distance that one in a thousand
-    sets of as many independent samples exceeds. ``closer`` is True if a Student-t is clearly closer.
+    The distances are Kolmogorov's, between distribution functions. ``allowed`` is the distance that sets of as many
+    independent samples exceed with probability ``level``. ``closer`` is True if a Student-t is clearly closer.
     """
 
     channel: str
@@ -313,6 +288,7 @@ class DensityCheck:
     degrees_of_freedom: float
     allowed: float
     closer: bool
+    level: float = 0.001
 
 
 @dataclass(frozen=True)

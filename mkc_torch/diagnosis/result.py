@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from mkc_torch._parallel.deadline import Reason
 from mkc_torch._support.html_table import html_table
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
 from mkc_torch.diagnosis.parts import (
@@ -32,11 +31,9 @@ from mkc_torch.diagnosis.parts import (
     Reference,
     Region,
     ResidualSizes,
-    Row,
     Separability,
     SmoothCorrection,
     StateMap,
-    Table,
     Traces,
     value_of,
 )
@@ -49,6 +46,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = [
+    "UNFINISHED",
+    "VERDICT_SENTENCES",
     "Alternative",
     "CandidateScore",
     "CorrectingModel",
@@ -67,12 +66,10 @@ __all__ = [
     "Reference",
     "Region",
     "ResidualSizes",
-    "Row",
     "Separability",
     "SmoothCorrection",
     "StateMap",
     "Stop",
-    "Table",
     "Traces",
     "as_html",
     "notices",
@@ -129,12 +126,15 @@ class CorrectingModel(nn.Module):
         """Return the simulation with the findings as Python source."""
 
 
-_VERDICTS: dict[Verdict, str] = {
-    "unfit": "verdict.unfit",
-    "adequate": "verdict.nothing",
-    "explained": "verdict.explained",
-    "unexplained": "verdict.structure",
+VERDICT_SENTENCES: dict[Verdict, str] = {
+    "unfit": "The simulation does not fit the recording.",
+    "adequate": "The recording shows no missing physics.",
+    "explained": "The findings explain the residual of the simulation.",
+    "unexplained": "The residual has structure that no effect in the catalogue explains.",
 }
+
+UNFINISHED = "The search was stopped; more physics may be missing."
+"""Headline of a search that was stopped."""
 
 
 def as_html(
@@ -147,10 +147,10 @@ def as_html(
     stop: Stop | None = None,
 ) -> str:
     """Return the table with sentences below it: why the search was stopped, if it was; then advice and warnings."""
-    names = term("label.against", recording=plain(recording) or term("label.recording"), simulation=plain(simulation))
+    names = f"{plain(recording) or 'recording'} against {plain(simulation)}"
     heads = ("", "grade", "p", "on unseen data")
     rows = [_row(finding) for finding in findings]
-    first = term(_VERDICTS[verdict]) if stop is None else term("verdict.unfinished")
+    first = VERDICT_SENTENCES[verdict] if stop is None else UNFINISHED
     below = [first, *(typeset(sentence) for sentence in sentences)]
     for finding in findings:
         below = [text.replace(finding.effect, words_of(finding.effect, finding.kind)) for text in below]

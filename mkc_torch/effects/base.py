@@ -158,7 +158,7 @@ class Effect(ABC):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         """The change, (N, c), that the effect adds to the c channels of its port."""
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         """The grid of shapes to search, for a recording at these times in s; default one empty shape."""
         return ({},)
 
@@ -175,7 +175,7 @@ class Effect(ABC):
         """Whether no number of γ can be negative."""
         return self.lower >= 0.0
 
-    def within_a_sample(self, shape: Shape, step: float) -> bool:  # noqa: ARG002
+    def within_a_sample(self, shape: Shape, step: float) -> bool:
         """Whether this shape only changes an input between two samples, ``step`` s apart."""
         return False
 
@@ -193,43 +193,43 @@ class Effect(ABC):
             return context.units[0] if part == "driver" else context.unit_of(part)
         return self.shape_units.get(name, "")
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         """The equation in the form that the shape chooses; default ``equation``."""
         return self.equation
 
-    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         """The explanation for the kind of quantity it acts on, with sizes where the effect states them."""
         return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[0]
 
-    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         """The advice for the kind of quantity it acts on, with sizes where the effect states them."""
         return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[1]
 
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         """Labels of the numbers of a quantity, in order; default empty: one number for each channel."""
         return ()
 
-    def moments(self, context: Context) -> tuple[float, ...]:  # noqa: ARG002
+    def moments(self, context: Context) -> tuple[float, ...]:
         """Its onsets in s, ascending, where they are known before the fit; default none."""
         return ()
 
-    def bind(self, shape: Shape, context: Context) -> Shape:  # noqa: ARG002
+    def bind(self, shape: Shape, context: Context) -> Shape:
         """The shape with all that the effect needs from this recording to act on another; default unchanged."""
         return shape
 
-    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:  # noqa: ARG002
+    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         """The basis of an effect that is ``basis @ γ``, whose shapes are fast to search. Check ``has_basis`` first."""
         self._refuse("basis")
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         """The waveform at a gain of 1 of an effect ``gain ⊗ waveform``. Check ``has_waveform`` first."""
         self._refuse("waveform")
 
-    def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+    def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
         """What an effect bound to a time adds to a later recording. Check ``persistent_change`` first."""
         self._refuse("lasting")
 
-    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
         """For each channel a Python expression with torch of the change. Check ``has_code`` first.
 
         Args:
@@ -293,7 +293,7 @@ class GainEffect(Effect):
         """The unit of the gain: the signal's unit per unit of the driver."""
         return per(context.signal_unit, context.units[0]) if context.units else context.signal_unit
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, len(context.channels), self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

@@ -13,7 +13,10 @@ from mkc_torch.effects.runs import run_numbers
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Context", "Quantity", "Shape"]
+__all__ = ["SEVERAL", "Context", "Quantity", "Shape"]
+
+SEVERAL = "several"
+"""The part of the port of all outputs, where there are several outputs with the same unit."""
 
 Shape = Mapping[str, float]
 """Parameters that an effect is not linear in, such as its onset or a time constant in s; found by a search."""

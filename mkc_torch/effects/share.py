@@ -35,7 +35,7 @@ class ShareEffect(GainEffect):
     plausible = 1.5
     gain = "share"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, len(context.channels), ""),)
 
 
@@ -48,7 +48,7 @@ class Saturation(ShareEffect):
     limits: tuple[float, ...]
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"limit": limit} for limit in self.limits)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["MIN_RESIDUALS"]
 
 MIN_RESIDUALS = 30
-"""Residuals of a channel, at least, for an E-step; with fewer it keeps its σ and d."""
+"""Minimum number of residuals of a channel for an E-step; with fewer, the channel keeps its σ and d."""
 
 _WARNINGS = {
     "silent": (
@@ -97,7 +97,7 @@ class Progress:
         self.warn_once("collapsed", owned.name, usable & collapsed)
 
     def warn_once(self, kind: str, name: str, channels: Bool[Tensor, " m"]) -> None:
-        """Issue a warning, for the channels that have not had it yet."""
+        """Issue a warning for the channels without an earlier warning of this kind."""
         new = [i for i in channels.nonzero().flatten().tolist() if (kind, i) not in self.warned]
         if new:
             self.warned.update((kind, i) for i in new)

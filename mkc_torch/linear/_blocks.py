@@ -5,32 +5,24 @@ The sums of blocks add up to those of all rows.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.density.energy import energy_terms
 from mkc_torch.density.likelihood import Derivatives
-from mkc_torch.linear.summary import LIGHT
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-_STRIP = 1 << 12
-"""Rows whose products are formed at once; 16384 rows take twice as long."""
-
-PLAIN_KAPPA = 1e-2
-"""κ from which differences of sums over κ and κ² lose at most four digits, so that three sums give all derivatives."""
-
 
 class Block(NamedTuple):
-    """Some rows of a problem, in float64."""
+    """Some rows of a problem, in float64; ``joined`` is [rows y] where they lie together in memory."""
 
     rows: Float64[Tensor, "b m n"]
     y: Float64[Tensor, "b m"]
     weight: Float64[Tensor, "b m"] | None
+    joined: Float64[Tensor, "b m k"] | None = None
 
 
 class Density(NamedTuple):
@@ -92,118 +84,10 @@ class PassResult(NamedTuple):
     extent: ResidualRange | None
 
 
-Added = TypeVar("Added", Sums, CurvatureSums)
-
-
-def added(total: Added | None, part: Added) -> Added:
-    """The sums of two sets of rows; None is no rows."""
-    return part if total is None else type(part)(*(a + b for a, b in zip(total, part, strict=True)))
-
-
-def residual(block: Block, coef: Float64[Tensor, " n"]) -> Float64[Tensor, "b m"]:
-    if block.rows.shape[1] == 1:
-        return torch.addmv(block.y[:, 0], block.rows[:, 0], coef, alpha=-1.0).unsqueeze(-1)
-    return block.y - torch.matmul(block.rows, coef)
-
-
-def residual_range(block: Block, error: Float64[Tensor, "b m"]) -> ResidualRange:
-    if block.weight is None:
-        return ResidualRange(*torch.aminmax(error, dim=0))
-    used = block.weight > 0
-    return ResidualRange(
-        torch.where(used, error, torch.inf).amin(0),
-        torch.where(used, error, -torch.inf).amax(0),
-    )
-
-
-def kernel(error: Float64[Tensor, "b m"], density: Density) -> tuple[Float64[Tensor, "b m"], Float64[Tensor, "b m"]]:
-    """Return ``q = e² / (2 d²)`` and the weight ``exp(-κ q)``."""
-    q = error.square() * (0.5 / density.d.square())
-    return q, torch.exp(q * -density.kappa)
-
-
-def _moments(values: Float64[Tensor, "b m"], block: Block) -> Float64[Tensor, "m n"]:
-    """Sum over the rows of each channel's values times x."""
-    if block.rows.shape[1] == 1:
-        return torch.mv(block.rows[:, 0].mT, values[:, 0]).unsqueeze(0)
-    return torch.matmul(values.mT.unsqueeze(1), block.rows.transpose(0, 1)).squeeze(1)
-
-
-def sums(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density, *, plain: bool) -> Sums:
-    """The sums of a block, from its residual and the results of :func:`kernel`.
-
-    Args:
-        block, error, q, w: the block, its residuals, and the results of :func:`kernel`.
-        density: κ and d.
-        plain: whether κ is at least :data:`PLAIN_KAPPA` in every channel.
-    """
-    weighted = w if block.weight is None else w * block.weight
-    weight = error.new_full((error.shape[1],), float(error.shape[0])) if block.weight is None else block.weight.sum(0)
-    score = weighted * error
-    if plain:
-        qw = q * weighted
-        terms = energy_sums(weight, weighted.sum(0), qw.sum(0), qw.mul_(q).sum(0), density.kappa)
-    else:
-        # limited, since the cube of q would overflow
-        q = q.clamp(max=1e100)
-        w, value, first, second = energy_terms(q, density.kappa)
-        every = torch.stack([value, first, second, q * w, q * q * w])
-        terms = every.sum(1) if block.weight is None else (every * block.weight).sum(1)
-    total = error.sum(0) if block.weight is None else (error * block.weight).sum(0)
-    return Sums(weight, total, terms, _moments(score, block))
-
-
-def energy_sums(weight: Tensor, w: Tensor, qw: Tensor, q2w: Tensor, kappa: Tensor) -> Float64[Tensor, "5 m"]:
-    """The terms of :class:`Sums` from the sums of the weights, of w, q w and q² w, for a κ that is not small."""
-    value = (weight - w) / kappa
-    first = (value - qw) / kappa
-    return torch.stack([value, first, (2.0 * first - q2w) / kappa, qw, q2w])
-
-
-def is_plain(kappa: Float64[Tensor, " m"]) -> bool:
-    return bool((kappa >= PLAIN_KAPPA).all())
-
-
 def energy_of(total: Sums, kappa: Float64[Tensor, " m"]) -> Derivatives:
     """The summed energy and its derivatives by κ and log d."""
     value, first, second, qw, q2w = total.terms
     return Derivatives(value, -first, -2.0 * qw, second, 2.0 * q2w, 4.0 * (qw - kappa * q2w))
-
-
-def products(
-    rows: Float64[Tensor, "k n"], others: Float64[Tensor, "k j"], weight: Float64[Tensor, " k"] | None = None
-) -> Float64[Tensor, "n j"]:
-    """Sum of weight · rowᵀ · other row; on a CPU by NumPy, which takes half as long as torch where MKL is slow."""
-    if rows.device.type != "cpu":
-        return torch.matmul((rows if weight is None else rows * weight.unsqueeze(-1)).mT, others)
-    total = np.zeros((rows.shape[1], others.shape[1]))
-    for first in range(0, rows.shape[0], _STRIP):
-        part = slice(first, first + _STRIP)
-        strip = rows[part] if weight is None else rows[part] * weight[part].unsqueeze(-1)
-        total += strip.numpy().T @ others[part].numpy()
-    return torch.from_numpy(total)
-
-
-def curvature_sums(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> CurvatureSums:
-    """The curvature sums of a block, from its residual and the results of :func:`kernel`."""
-    weighted, plain = (w, error) if block.weight is None else (w * block.weight, error * block.weight)
-    precision = density.d.pow(-2)
-    curvature_weight = weighted * (1.0 - 2.0 * density.kappa * q) * precision
-    score = weighted * error * precision
-    flat = block.rows.flatten(0, 1)
-    if block.rows.shape[1] == 1:
-        spread = products(flat, flat, score.square().flatten())
-    else:
-        scored = torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
-        spread = torch.matmul(scored.mT, scored)
-    return CurvatureSums(
-        curvature=products(flat, flat, curvature_weight.flatten()),
-        spread=spread,
-        tilt=_moments(q * weighted * error, block),
-        moment=_moments(plain, block),
-        square=(plain * error).sum(0),
-        light=(w < LIGHT).sum().double().reshape(1),
-    )
 
 
 def triangle(block: Block, above: Float64[Tensor, "k n"] | None) -> Float64[Tensor, "k n"]:

@@ -199,8 +199,8 @@ class Descent:
         """κ and d of the next pass."""
         return Density(self.point.kappa[0], torch.exp(self.point.log_d[0]))
 
-    def after(self, result: PassResult) -> Descent:
-        """State after the pass at ``point``, from its sums."""
+    def after(self, result: PassResult, slack: float = 0.0) -> Descent:
+        """State after the pass at ``point``, from its sums; ``slack`` is their error in the mean likelihood."""
         total, more = result.total, result.curvature
         total_weight, close = total.weight.sum(), self.close
         now = self
@@ -212,7 +212,7 @@ class Descent:
         here = _place(now.fit_state, now.point, total, now.slopes, now.unit)
         rounding = _rounding_length(now.point, now.slopes, total_weight)
         best = now.best
-        if best is not None and not here.value <= best.value + _slack(best.value, rounding, total_weight):
+        if best is not None and not here.value <= best.value + _slack(best.value, rounding, total_weight) + slack:
             return now._shorter_step(best)
         now = replace(now, best=here, result=result, history=(*now.history, here.per_sample))
         move = _newton_move(now.fit_state, here)

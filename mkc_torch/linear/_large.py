@@ -1,8 +1,8 @@
-"""MKC-EM on many rows: a pilot fit to few rows, Newton steps on more rows, and at last on all.
+"""MKC-EM on many rows: a pilot fit to few rows, and Newton steps on all.
 
-Each fit starts at the result and with the curvature of the fit before, so that few passes over all rows are needed;
-four or five are usual. The last fit ends where a Newton step with the curvature of all rows would be shorter than a
-millionth of a standard error.
+The steps start at the result of the pilot, with the curvature of a few more rows, so that few passes over all rows are
+needed; four or five are usual. They end where a step with the curvature of all rows would be shorter than a millionth
+of a standard error.
 """
 
 from __future__ import annotations
@@ -27,30 +27,16 @@ from mkc_torch.linear._robust_start import RobustStart, robust_start
 from mkc_torch.linear._rows import Rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from jaxtyping import Float, Float64
 
 LARGE = 20_000
 """Number of values from which a fit starts with a pilot; with nine columns it is four times as fast there."""
-
-_GROWTH = 16
-"""Growth factor of the rows between fits: each fit starts some ten of its standard errors from its maximum."""
-
-_LEAST_FACTOR_TO_ALL = 8
-"""An intermediate fit is made if all rows are at least this many times its rows; else passes over all cost less."""
 
 _NEAR = 0.03
 """Distance from the maximum, in standard errors, below which the curvature of all rows is computed."""
 
 _STOP = 1e-6
 """Length of the next step, in standard errors, below which the fit has converged."""
-
-_NEAR_INTERMEDIATE = 0.5
-"""As :data:`_NEAR`, for an intermediate fit, whose standard errors are four times those of the next."""
-
-_STOP_INTERMEDIATE = 0.5
-"""As :data:`_STOP`, for an intermediate fit."""
 
 _PASSES = 15
 """Largest number of passes; a fit that has not converged then is left to the alternation over all rows."""
@@ -125,23 +111,18 @@ def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: 
     # rows drawn by leverage do not represent the curvature of all rows, and another draw may lack rare rows
     count = pilot.problem.num_samples
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
-    if known.bound is None:
-        half = torch.maximum(rows.range_at(fit_state.beta[0]).half(), TIGHT * pilot.begin.scale)
-        fit_state = replace(fit_state, log_bound=torch.log(half))
-    # on a GPU a pass over all rows takes less time than drawing some of them
-    for some in _intermediate_subsets(values, count, pilot.frame, seed) if pilot.alike and not rows.Y.is_cuda else ():
-        descent = Descent.begin(fit_state, slopes, near=_NEAR_INTERMEDIATE, stop=_STOP_INTERMEDIATE)
-        end = _descended(some, descent, passes)
-        if end is None:
-            return None
-        fit_state, slopes = _moved(fit_state, end), end.slopes
     first: PassResult | None = None
     if known.bound is None:
+        # the sums do not depend on the domain, so this is also the first pass of the descent
+        begin = rows.evaluate(fit_state.beta[0], _density(fit_state), with_range=True)
+        half = torch.maximum(_half_range(begin), TIGHT * pilot.begin.scale)
+        fit_state = replace(fit_state, log_bound=torch.log(half))
         descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
-        end = _descended(rows, descent, passes, with_range=True) if pilot.alike else None
-        if end is not None:
+        end = _descended(rows, descent, passes, first=begin, with_range=True) if pilot.alike else None
+        if end is not None and end.result is not None:
             fit_state, first = _moved(fit_state, end), end.result
-        fit_state, first = _on_final_domain(rows, pilot, known, fit_state, first)
+        fit_state, same = _on_final_domain(pilot, known, fit_state, begin if first is None else first)
+        first = first if same else None
     weights = torch.empty_like(rows.Y)
     descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
     end = _descended(rows, descent, passes, weights, first)
@@ -217,28 +198,26 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
 
 
 def _on_final_domain(
-    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: FitState, first: PassResult | None
-) -> tuple[FitState, PassResult | None]:
-    """Starting point on the domain of the rule; with the sums at it if it equals the rough fit."""
+    pilot: _Pilot, known: FixedParameters, rough: FitState, found: PassResult
+) -> tuple[FitState, bool]:
+    """Starting point on the domain of the rule, from the pass at the rough fit; whether it equals the rough fit."""
     d = torch.exp(rough.log_d)
-    extent = None if first is None else first.extent
-    extent = rows.range_at(rough.beta[0]) if extent is None else extent
-    bound = torch.maximum(extent.half(), WIDE * d)
+    bound = torch.maximum(_half_range(found), WIDE * d)
     beta = pilot.in_basis(rough.beta)
-    state = known.initial_state(pilot.problem, beta, d, bound, least_d(pilot.begin), tails=(rough.kappa,))
+    least = least_d(pilot.problem, pilot.begin)
+    state = known.initial_state(pilot.problem, beta, d, bound, least, tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
-        return replace(rough, log_bound=state.log_bound), first
-    return _at(rough.beta, state), None
+        return replace(rough, log_bound=state.log_bound), True
+    return _at(rough.beta, state), False
 
 
-def _intermediate_subsets(
-    values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int
-) -> Iterator[Rows]:
-    """Yield random subsets of growing size, smaller than all rows."""
-    count *= _GROWTH
-    while _LEAST_FACTOR_TO_ALL * count < values.Y.shape[-2]:
-        yield _drawn(values, count, frame, seed)
-        count *= _GROWTH
+def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
+    assert found.extent is not None
+    return found.extent.half()
+
+
+def _density(fit_state: FitState) -> Density:
+    return Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
 
 
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
@@ -299,8 +278,7 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
-    total, found, _ = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
+    total, found, _ = rows.evaluate(fit_state.beta[0], _density(fit_state), with_curvature=True)
     assert found is not None
     total_weight = total.weight.sum()
     grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])

@@ -14,7 +14,7 @@ from mkc_torch.density.em import gaussian_state, normalised, replace_problems, w
 from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
-from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
+from mkc_torch.linear._robust_start import RobustStart, Start, robust_start, small_sample_factor
 
 __all__ = ["TIGHT", "FixedParameters", "LikelihoodMaximum", "given_bound", "least_d", "maximise", "rough_fit"]
 
@@ -167,7 +167,7 @@ def maximise(
         seed: seed of the start.
     """
     begin = robust_start(problem, known.start, seed=seed)
-    d_min = least_d(begin)
+    d_min = least_d(problem, begin)
     if known.bound is None:
         rough = rough_fit(problem, known, begin, max_iter=max_iter)
         beta, kappa, d = rough.beta, rough.state.kappa, torch.exp(rough.state.log_d)
@@ -182,9 +182,14 @@ def maximise(
     return begin, maximum
 
 
-def least_d(begin: RobustStart) -> Tensor:
-    """Lower bound of d."""
-    return _FLOOR * begin.scale
+def least_d(problem: LinearProblem, begin: RobustStart) -> Tensor:
+    """Lower bound of d; a whole-number weight counts as so many samples in its small-sample factor."""
+    weight, N, p = problem.sample_weight, problem.num_samples, problem.coefficients_per_channel
+    if weight is None:
+        return _FLOOR * begin.scale
+    # d often ends at this bound, so that a weight of 2 and two samples need the same
+    count = torch.where((weight == weight.round()).all(-2), weight.sum(-2), float(N))
+    return _FLOOR * begin.scale * small_sample_factor(count, p) / small_sample_factor(weight.new_tensor(float(N)), p)
 
 
 def given_bound(problem: LinearProblem, known: FixedParameters, begin: RobustStart) -> Tensor:
@@ -223,7 +228,7 @@ def rough_fit(
         bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)
     else:
         bound = given_bound(problem, known, begin)
-    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin), tails=tails)
+    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(problem, begin), tails=tails)
     return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
 
 

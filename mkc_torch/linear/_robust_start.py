@@ -66,15 +66,20 @@ def elemental_count(num_coefficients: int) -> int:
 
 
 def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
-    """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with small-sample factors.
+    """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with small-sample factors."""
+    middle = order_statistic(residual.abs(), problem.sample_weight, default_coverage(problem))
+    count = middle.new_tensor(float(problem.num_samples))
+    return 1.4826 * small_sample_factor(count, problem.coefficients_per_channel) * middle
+
+
+def small_sample_factor(count: Float[Tensor, "*#batch #m"], coefficients: int) -> Float[Tensor, "*#batch #m"]:
+    """Factor of the scale of ``count`` residuals after a search for the smallest.
 
     1 + 5 / (N - p) is from Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202; N / (N - p)
-    corrects for the degrees of freedom that a search for the smallest residuals uses.
+    corrects for the degrees of freedom that the search uses.
     """
-    N, p = problem.num_samples, problem.coefficients_per_channel
-    middle = order_statistic(residual.abs(), problem.sample_weight, default_coverage(problem))
-    left = max(N - p, 1)
-    return 1.4826 * (1.0 + 5.0 / left) * (N / left) * middle
+    left = (count - coefficients).clamp(min=1.0)
+    return (1.0 + 5.0 / left) * (count / left)
 
 
 _LEAST_SCREENED = 300

@@ -33,7 +33,8 @@ class MKCRegression(Inference):
 
     The domain ``a`` of each channel is fixed beforehand: ``bound``, or from a rough fit half the range of its
     residuals, and at least ten of its d (reason: :func:`mkc_torch.density.fit.domain_rule`). d stays above 0.3 robust
-    scales, since the likelihood of residuals that a fit interpolates grows without limit.
+    scales, since the likelihood of residuals that a fit interpolates grows without limit; weights that are all whole
+    numbers count repetitions in the small-sample factor of this scale.
 
     From 20 000 values on, a single problem starts from a pilot fit to some of its rows, drawn by ``seed``.
     Joint Newton steps in all unknowns over all rows follow, in float64 whatever the dtype of the data: about eight

@@ -2,9 +2,9 @@
 
 The variance alone does not distinguish wrong targets from wide noise. Wrong targets that are independent of their input
 shrink the predictions toward the mean. Under least squares the residuals of right and wrong targets then look alike,
-and a wide bandwidth seems best. The initial loss, which gives far residuals little weight, would stretch such
-predictions again: its influence correlates with the prediction. The risk of a bandwidth is therefore its variance plus
-the square of its shrinkage beyond that of the initial loss, as far as it exceeds chance.
+and a wide bandwidth seems best. The initial loss gives far residuals little weight and would undo the shrinkage: its
+influence correlates with the prediction. The risk of a bandwidth is therefore its variance plus the square of its
+shrinkage relative to the initial loss, if the shrinkage is significant.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ _FAR = 1e4
 
 
 class BandwidthSelection(NamedTuple):
-    """Widest bandwidth of nearly the smallest risk, in scales, and whether it beats the initial loss; (m,) each."""
+    """The widest bandwidth with nearly the smallest risk, in scales, and whether its risk is below the initial loss's.
+
+    Both have shape (m,).
+    """
 
     bandwidth: Any
     better: Any
@@ -92,7 +95,9 @@ def select_bandwidth(
 def _widths(xp: Any, like: Any) -> Any:
     if xp.__name__ == "numpy":
         return xp.asarray(BANDWIDTHS, dtype=like.dtype)
-    return xp.stack([like.new_full((), width) for width in BANDWIDTHS])  # copying a list to a GPU would wait for it
+    return xp.stack(
+        [like.new_full((), width) for width in BANDWIDTHS]
+    )  # copying a list to a GPU would wait for the GPU
 
 
 def _influences(xp: Any, z: Any) -> tuple[Any, Any]:
@@ -108,6 +113,6 @@ def _influences(xp: Any, z: Any) -> tuple[Any, Any]:
 def _standardised(xp: Any, values: Any, share: Any) -> Any:
     """Values shifted and scaled to mean 0 and variance 1; 0 where all values are equal."""
     centred = xp.where(share > 0, values - (values * share).sum(-1)[..., None], 0.0)
-    # divided by the largest, so that squares neither overflow nor underflow
+    # division by the largest value keeps squares from overflow and underflow
     centred = centred / at_least(xp, xp.amax(xp.abs(centred), -1), TINY)[..., None]
     return centred / at_least(xp, xp.sqrt((centred * centred * share).sum(-1)), TINY)[..., None]

@@ -10,7 +10,8 @@ from torch import Tensor
 __all__ = ["snapshot"]
 
 
-@torch.library.custom_op("mkc_torch::snapshot", mutates_args=())
+# the schema is stated, because torch 2.6 derives none from `list`
+@torch.library.custom_op("mkc_torch::snapshot", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")
 def snapshot(values: Sequence[Tensor]) -> list[Tensor]:
     """Copies that the compiler keeps for the backward pass.
 

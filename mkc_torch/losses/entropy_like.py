@@ -376,7 +376,7 @@ def least_entropy_like(
     # reverse mode twice: every trainable model supports it
     derivatives = torch.func.vmap(torch.func.jacrev(slope, has_aux=True))
 
-    def function(theta: Tensor, index: Tensor) -> Quadratic:  # noqa: ARG001
+    def function(theta: Tensor, index: Tensor) -> Quadratic:  # noqa: ARG001 - signature of an objective of the trust region
         hessian, (gradient, value) = derivatives(theta)
         hessian = torch.where(torch.isfinite(hessian), 0.5 * (hessian + hessian.mT), 0.0)
         return Quadratic(value.to(theta.dtype), gradient, hessian)

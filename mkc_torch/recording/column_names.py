@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from mkc_torch.recording.unit_words import CANONICAL, conversion
 
-__all__ = ["Meaning", "is_about_magnetometer", "meaning", "split_unit"]
+__all__ = ["Meaning", "is_about_magnetometer", "is_derived", "meaning", "split_unit"]
 
 _STRONG = {
     "mag": {
@@ -117,6 +117,16 @@ def split_unit(name: str) -> tuple[str, str]:
     if found is None or found[2].isdigit() or not found[2]:
         return name.strip(), ""
     return found[1], found[2]
+
+
+def is_derived(name: str) -> bool:
+    """Whether a word of a name marks an estimate, an expected value, or a derived value.
+
+    Example:
+        >>> is_derived("field offset X [uT]"), is_derived("Feld X [uT]")
+        (True, False)
+    """
+    return any(word.lower() in _OTHERS for word in _TOKEN.findall(split_unit(name)[0]))
 
 
 def meaning(name: str) -> Meaning | None:

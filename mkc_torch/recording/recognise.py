@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from mkc_torch._support.note import Note
-from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, meaning, split_unit
+from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, is_derived, meaning, split_unit
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
 from mkc_torch.recording.unit_words import conversion
@@ -142,7 +142,7 @@ def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
 
     Args:
         topic: a topic of a file.
-        weak: accept a column ``t`` too.
+        weak: accept a column ``t`` without a unit too.
 
     Example:
         >>> from mkc_torch.recording.formats.base import Table
@@ -152,7 +152,7 @@ def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
     found = []
     for place, name in enumerate(topic.table.names):
         known = meaning(name) if name else None
-        if known is None or known.quantity != "time" or not (weak or known.sure):
+        if known is None or known.quantity != "time" or not (weak or known.sure or _is_timed(name, known.unit)):
             continue
         rank = next(
             (i for i, usual in enumerate(("time", "timestamp", "header_stamp")) if known.sensor == usual),
@@ -163,6 +163,11 @@ def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
         return None
     _, _, name, unit = min(found)
     return name, unit
+
+
+def _is_timed(name: str, unit: str) -> bool:
+    """Whether a column t states a unit of time, as ``t_s``; ``T`` is usually a temperature or a torque."""
+    return bool(unit) and name.strip().startswith("t")
 
 
 def companion_columns(topics: Sequence[Topic], own: int) -> list[tuple[int, dict[str, str], dict[str, str]]]:
@@ -227,7 +232,17 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
         if is_px4_message(topic.table.names):
             units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
-    return groups
+    return groups or _by_unit(topic)
+
+
+def _by_unit(topic: Topic) -> list[_Group]:
+    """The only three columns that differ by x, y, z and state a unit of a magnetic field, whatever their names."""
+    found = []
+    for triple in candidates(topic):
+        units = {name[-1]: _unit_of(topic, column, split_unit(column)[1]) for name, column in triple.items()}
+        if all(_is_magnetic(unit) for unit in units.values()) and not any(map(is_derived, triple.values())):
+            found.append(_Group("mag", {name[-1]: column for name, column in triple.items()}, units, True))
+    return found if len(found) == 1 else []
 
 
 def _has_no_header(topic: Topic) -> bool:

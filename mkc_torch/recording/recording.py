@@ -426,6 +426,8 @@ def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumn
     where, present = f"{recording}: " if recording else "", list(present)
     like = {column.casefold(): column for column in present if column not in DEFAULT_UNITS}
     nearest = next((like[key] for key in get_close_matches(name.casefold(), like, 1, 0.55)), "COLUMN")
+    if name == "time" and nearest == "COLUMN" and "t" in present:
+        nearest = "t"
     return MissingColumnError(
         f"{where}there is no column `{name}`; there are {listed(present)}. If it has another name, give that name, "
         f'such as `--columns {name}={nearest}` (in Python `columns={{"{name}": "{nearest}"}}`).'

@@ -7,7 +7,6 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital
 from mkc_torch.calibration.coverage import nearest_axis
 from mkc_torch.report.words import numbers as wording
@@ -25,7 +24,7 @@ def render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters["coded"] = _coded
-    environment.globals.update(w=wording, term=term, capital=capital, nearest_axis=nearest_axis, zip=zip)
+    environment.globals.update(w=wording, capital=capital, nearest_axis=nearest_axis, zip=zip)
     return environment.get_template(template).render(**values)
 
 

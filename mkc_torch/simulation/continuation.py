@@ -56,7 +56,7 @@ def is_plain(parameters: Tensor) -> bool:
 
 
 class Continuation:
-    """The residual as a function of a fit's parameters; it remembers the evaluations of this fit only.
+    """The residual as a function of a fit's parameters; stores the recent evaluations of this fit.
 
     Args:
         prepared: the simulation.
@@ -84,7 +84,7 @@ class Continuation:
         if is_wrapped(parameters):
             return self._prepared.answer(*self._meaning(parameters), self._last).residual
         key = _key(parameters)
-        # a solution that was found is not always found again from another start
+        # from another start, the solver may not find the same solution again
         near = self._last if key == self._last_key else self._known.get(key, self._last)
         residual, nearby = self._answer(parameters, near)
         if nearby is not None:

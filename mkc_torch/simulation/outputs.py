@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.context import SEVERAL
 from mkc_torch.effects.kinds import kind_of
-from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.ports import Changes, Port, SignalSizes
 
 if TYPE_CHECKING:

@@ -196,7 +196,7 @@ class PreparedPaired(ClosedForm):
             precision[runs, runs] *= _HELD
         return GaussianPrior(torch.zeros_like(known), precision)
 
-    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.time.new_zeros(len(self.parameter_names))
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
@@ -206,7 +206,7 @@ class PreparedPaired(ClosedForm):
         self,
         theta: Float[Tensor, " p"],
         changes: Changes,
-        near: Nearby | None = None,  # noqa: ARG002
+        near: Nearby | None = None,
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         return output_signals(self._outputs(theta), self.channels, changes)
 

@@ -54,19 +54,19 @@ class ClosedForm(ABC):
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         """The residual, recording minus prediction."""
 
-    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:  # noqa: ARG002
+    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
         """The residual; see :meth:`PreparedSimulation.answer`."""
         return Answer(self.residual(theta, changes))
 
-    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:  # noqa: ARG002
+    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:
         """None: torch evaluates the closed form."""
         return None
 
-    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:  # noqa: ARG002
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:
         """The prior, which no effect changes."""
         return self.prior
 
-    def observed(self, observer: Observer | None) -> Self:  # noqa: ARG002
+    def observed(self, observer: Observer | None) -> Self:
         """The simulation itself: it has no states to observe."""
         return self
 
@@ -74,11 +74,11 @@ class ClosedForm(ABC):
         """The simulation itself: it has no observer."""
         return self
 
-    def with_input_hold(self, hold: Mapping[str, str]) -> Self:  # noqa: ARG002
+    def with_input_hold(self, hold: Mapping[str, str]) -> Self:
         """The simulation itself: it uses no values between samples."""
         return self
 
-    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> Self:  # noqa: ARG002
+    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> Self:
         """The simulation itself: its outputs have no offsets of single recordings."""
         return self
 

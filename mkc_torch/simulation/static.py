@@ -236,7 +236,7 @@ class PreparedStatic(ClosedForm):
         self.state: Mapping[str, object] = {"class": system.name, "fixed": list(fixed)}
         self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed)
 
-    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.time.new_tensor([parameter.value for parameter in self.known.values()])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
@@ -246,7 +246,7 @@ class PreparedStatic(ClosedForm):
         self,
         theta: Float[Tensor, " p"],
         changes: Changes,
-        near: Nearby | None = None,  # noqa: ARG002
+        near: Nearby | None = None,
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         inputs = {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)

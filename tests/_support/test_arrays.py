@@ -145,9 +145,7 @@ def test_data_without_numbers_are_refused_by_name(value, message):
     ],
 )
 def test_missing_values_are_counted_or_replaced(value):
-    with pytest.raises(
-        ValueError, match=r"column `a` of argument `X` to have a value everywhere but got 1 missing of 3"
-    ):
+    with pytest.raises(ValueError, match=r"column `a` of argument `X` to have a value everywhere.*got 1 missing of 3"):
         as_tensor("X", value)
     got = as_tensor("X", value, missing=NAN).flatten()
     torch.testing.assert_close(got, torch.tensor([1.0, NAN, 3.0], dtype=torch.float64), equal_nan=True)
@@ -183,9 +181,9 @@ def test_columns_that_differ_from_the_fit_are_refused(frame):
     refuse_other_columns("X", value, ("b", "a"))
     refuse_other_columns("X", value, None)
     refuse_other_columns("X", np.ones((1, 2)), ("a", "b"))
-    with pytest.raises(ValueError, match=r"of the fit, `a`, `b`, but got `b`, `a`; take .* X\[\['a', 'b'\]\]"):
+    with pytest.raises(ValueError, match=r"of the fit, `a`, `b`.*got `b`, `a`; take.*X\[\['a', 'b'\]\]"):
         refuse_other_columns("X", value, ("a", "b"))
-    with pytest.raises(ValueError, match=r"of the fit, `a`, `c`, but got `b`, `a`; give it those of the fit"):
+    with pytest.raises(ValueError, match=r"of the fit, `a`, `c`.*got `b`, `a`; give it those of the fit"):
         refuse_other_columns("X", value, ("a", "c"))
 
 

@@ -16,6 +16,7 @@ from mkc_torch._support.small_factors import (
     symmetric_eigen,
     symmetric_pinv,
 )
+from tests.draws import normal as sample
 
 EPS = torch.finfo(torch.float64).eps
 SIZES = [1, 2, 3, 5, 6, 9, 12, LARGEST]
@@ -25,10 +26,6 @@ SIZES = [1, 2, 3, 5, 6, 9, 12, LARGEST]
 def _off_the_cpu():
     with forced():
         yield
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def eye(n: int) -> Tensor:

@@ -9,7 +9,7 @@ from mkc_torch._support.trust_region import Quadratic, minimise
 def made(f):
     """A batch of a function with its derivatives by automatic differentiation."""
 
-    def function(point: Tensor, index: Tensor) -> Quadratic:  # noqa: ARG001
+    def function(point: Tensor, index: Tensor) -> Quadratic:
         return Quadratic(
             torch.func.vmap(f)(point),
             torch.func.vmap(torch.func.grad(f))(point),

@@ -53,9 +53,9 @@ def bytes_read(X: Tensor, y: Tensor) -> int:
     read = 0
     blocks = _rows.blocks
 
-    def counted(*given: Tensor | None) -> Iterator[object]:
+    def counted(*given: Tensor | None, **options: object) -> Iterator[object]:
         nonlocal read
-        for block in blocks(*given):
+        for block in blocks(*given, **options):
             read += block.y.numel() * (COLUMNS + 1) * y.element_size()
             yield block
 

@@ -79,6 +79,7 @@ def passes(batches: MemmapBatches) -> dict[str, Callable[[], object]]:
         return lambda: sums_pass(batches, SHAPE, None, *POINT, **wanted)
 
     return {
+        "gradient in float32": one_pass(rough=True),
         "gradient": one_pass(),
         "gradient and range of residuals": one_pass(with_range=True),
         "the last, with the covariance": one_pass(with_curvature=True),

@@ -21,7 +21,7 @@ def test_nothing_of_nothing_is_unknown():
 
 
 def test_more_than_all_is_refused():
-    with pytest.raises(ValueError, match="Expected 0 <= count <= total but got 3 of 2"):
+    with pytest.raises(ValueError, match=r"0 <= count <= total.*got 3 of 2"):
         share(3, 2)
 
 

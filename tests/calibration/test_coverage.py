@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from mkc_torch.calibration.coverage import GAP_DEGREES, NEAR_DEGREES, Gap, coverage, fibonacci_sphere, nearest_axis
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+from tests.draws import normal as sample
 
 
 def cap_share(degrees: float) -> float:

@@ -31,11 +31,8 @@ from mkc_torch.linear import (
     Ridge,
     SRegression,
 )
+from tests.draws import normal as sample
 from tests.shared_data import shared_data
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def rotation(seed: int) -> Tensor:
@@ -382,7 +379,7 @@ def test_the_finish_has_the_kind_of_errors_of_its_estimator():
 
 def test_without_a_finish_finish_is_none():
     assert EllipsoidFit().fit(disturbed(0)).finish_ is None
-    with pytest.raises(ValueError, match="`finish` to be None or 'maximum_likelihood' but got 'ml'"):
+    with pytest.raises(ValueError, match=r"`finish`.*None or 'maximum_likelihood'.*got 'ml'"):
         EllipsoidFit(finish="ml")
 
 
@@ -530,7 +527,7 @@ def test_half_of_the_points_equal_gives_no_nan():
     try:
         fit = EllipsoidFit().fit(points)
     except NotIdentifiableError as error:
-        assert "Not identifiable" in str(error)  # noqa: PT017
+        assert "Not identifiable" in str(error)  # noqa: PT017 - the message is the point
     else:
         torch.testing.assert_close(fit.semi_axes_, AXES, rtol=0, atol=1.0)
 
@@ -624,7 +621,7 @@ def test_in_a_batch_the_cloud_of_noise_is_named_and_its_points_of_weight_0_do_no
 
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_fewer_than_nine_points_are_refused(count):
-    with pytest.raises(ValueError, match=f"at least 9 points.* but got {count}"):
+    with pytest.raises(ValueError, match=rf"at least 9 points.*got {count}"):
         EllipsoidFit().fit(torch.zeros(count, 3))
 
 
@@ -637,7 +634,7 @@ def test_nine_points_determine_an_exact_ellipsoid():
 def test_points_that_are_not_finite_are_refused(bad):
     points = surface(20)
     points[3, 1] = bad
-    with pytest.raises(ValueError, match=r"finite but got .* at index \(3, 1\)"):
+    with pytest.raises(ValueError, match=r"finite.*at index \(3, 1\)"):
         EllipsoidFit().fit(points)
 
 
@@ -649,7 +646,7 @@ def test_points_must_be_a_floating_tensor(points):
 
 @pytest.mark.parametrize("estimator", ["lts", 3, MKCRegression, np.ones(3)])
 def test_an_invalid_estimator_is_rejected_by_the_constructor(estimator):
-    with pytest.raises(TypeError, match=r"`estimator` to be an estimator of mkc_torch\.linear but got") as refused:
+    with pytest.raises(TypeError, match=r"`estimator`.*estimator of mkc_torch\.linear") as refused:
         EllipsoidFit(estimator)
     assert ("the class MKCRegression; make one, MKCRegression(...)" in str(refused.value)) == (
         estimator is MKCRegression
@@ -687,14 +684,12 @@ def test_points_to_calibrate_are_checked():
         with pytest.raises(error, match=message):
             fit.calibrate(points)
     batch = EllipsoidFit().fit(surface(100).expand(2, 100, 3))
-    with pytest.raises(
-        ValueError, match=r"`points` and `calibration_matrix_` that broadcast but got \(3,\) and \(2,\)"
-    ):
+    with pytest.raises(ValueError, match=r"`points` and `calibration_matrix_` that broadcast.*got \(3,\) and \(2,\)"):
         batch.calibrate(surface(20).expand(3, 20, 3))
 
 
 def test_half_precision_is_rejected_with_advice():
-    with pytest.raises(TypeError, match=r"`points` of dtype float32 or float64 but got torch\.float16; use \.float"):
+    with pytest.raises(TypeError, match=r"`points` of dtype float32 or float64.*got torch\.float16; use \.float"):
         EllipsoidFit().fit(surface(20).half())
 
 
@@ -872,10 +867,10 @@ def test_arrays_and_frames_are_fitted_as_tensors_of_the_same_numbers_are(library
     assert torch.equal(got.center_, want.center_)
     assert got.feature_names_in_ == tuple(names)
     assert torch.equal(got.calibrate(frame), want.calibrate(points))
-    with pytest.raises(ValueError, match=r"`points` with the columns of the fit, `mag_x`, .* but got `mag_z`"):
+    with pytest.raises(ValueError, match=r"`points` with the columns of the fit, `mag_x`,.*got `mag_z`"):
         got.calibrate(frame[names[::-1]])
     with pytest.raises(AttributeError):
-        got.fit(points).feature_names_in_  # noqa: B018
+        got.fit(points).feature_names_in_
 
 
 def test_a_point_of_no_weight_can_be_anything_in_an_array_too():

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from mkc_torch import Recording
-from mkc_torch.calibration import calibrate
+from mkc_torch.calibration import NotIdentifiableError, calibrate
 from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.calibration.clipped_samples import CLIPPED, distinct_rows
 from mkc_torch.calibration.frozen_samples import FROZEN
@@ -149,6 +149,21 @@ def test_the_remaining_samples_of_a_clipped_recording_are_calibrated():
     assert any(CLIPPED in w for w in c.warnings)
     assert c.center == pytest.approx((4.0, -7.0, 11.0), abs=0.3)
     assert c.semi_axes == pytest.approx((45.0, 45.0, 45.0), abs=0.4)
+
+
+def test_clipping_is_reported_before_the_directions_that_it_removed():
+    points = digits(turned(4000), 0.1)
+    points[:, 0] = points[:, 0].clamp(max=30.0)
+    warnings = calibrate(recorded(points)).warnings
+    assert CLIPPED in warnings[0]
+    assert warnings[-1].startswith("Directions not covered")
+
+
+def test_a_refusal_begins_with_the_clipping():
+    points = digits(turned(4000), 0.1)
+    points[:, 0] = points[:, 0].clamp(max=-20.0)
+    with pytest.raises(NotIdentifiableError, match=r"^Not identifiable: Left out \d+ of 4000 clipped samples"):
+        calibrate(recorded(points))
 
 
 @pytest.mark.e2e

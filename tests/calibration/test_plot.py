@@ -82,9 +82,9 @@ def test_a_calibration_from_a_file_needs_a_recording(calibration, recording):
 
 
 def test_another_plane_and_other_axes_are_clear_errors(calibration):
-    with pytest.raises(ValueError, match="`plane` to be one of xy, xz, yz but got 'zx'"):
+    with pytest.raises(ValueError, match=r"`plane`.*xy, xz, yz.*got 'zx'"):
         calibration.plot.sphere("zx")
-    with pytest.raises(ValueError, match="projection 'mollweide' but got 'rectilinear'"):
+    with pytest.raises(ValueError, match=r"projection 'mollweide'.*got 'rectilinear'"):
         calibration.plot.coverage(ax=pyplot.subplots()[1])
     with pytest.raises(TypeError, match="got int"):
         calibration.plot.density(ax=1)

@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from importlib.metadata import version
@@ -276,6 +277,13 @@ def test_columns_and_units_of_the_users_own(tmp_path):
     assert "counts" in result.stdout
     content = json.loads((tmp_path / "out" / "own" / "calibration.json").read_text(encoding="utf-8"))
     assert (content["unit"], content["field_strength"]) == ("counts", {"value": 48.0, "unit": "µT"})
+    (proposed,) = [line for line in result.stdout.splitlines() if line.startswith("to do")]
+    words = shlex.split(proposed.removeprefix("to do"))
+    assert words[:2] == ["mkc", "apply"]
+    applied = mkc(*words[1:-1], tmp_path / words[-1])  # the proposed command, as it stands
+    assert applied.exit_code == 0, applied.output
+    page = (tmp_path / "out" / "own" / "report.html").read_text(encoding="utf-8")
+    assert "own.csv --columns mag_x=mx,mag_y=my,mag_z=mz --unit-label counts --output corrected.csv" in page
     refused(mkc("calibrate", path, "--output", tmp_path / "o", "--columns", "mag_x=none"), "no column `none`")
 
 

@@ -9,7 +9,8 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region, Row
+from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region
+from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section
 from tests.diagnosis.factory import (
     graded,
     make_diagnosis,
@@ -118,8 +119,10 @@ def test_every_width(width):
     assert "hard-iron step" in text
 
 
-def test_each_test_of_evidence_has_a_line():
-    said = EvidenceResult("my_test", rows=(Row("remaining", "white"), Row("in print", "more", in_terminal=False)))
+def test_each_test_of_evidence_has_a_line(monkeypatch):
+    section = Section((Row("remaining", "white"), Row("in print", "more", in_terminal=False)))
+    monkeypatch.setitem(SECTIONS, "my_test", lambda _: section)
+    said = EvidenceResult("my_test", "white")
     made = make_diagnosis(1)
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
     for diagnosis in (with_evidence(made, said), of_finding):

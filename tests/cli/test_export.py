@@ -16,13 +16,16 @@ pytest.importorskip("matplotlib")
 
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports import EXPORTS
-from mkc_torch.cli.export_options import KINDS
+from mkc_torch.cli.export_options import KINDS as EVERY_KIND
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import page
 from tests.calibration.exports import formulas
 from tests.calibration.test_calibrate import noisy_ellipsoid
 from tests.cli.test_cli import mkc, refused, table
 from tests.diagnosis.files.test_sensor_correction import CABLE, WARMTH, model_of
+
+KINDS = tuple(kind for kind in EVERY_KIND if kind != "imu-calib")
+"""Exports of a magnetometer."""
 
 EVERY = tuple(word for kind in KINDS for word in ("--export", kind))
 
@@ -282,3 +285,25 @@ def test_a_full_disk_behind_stdout_is_reported_in_a_line(done, good, tmp_path, c
         )
     assert ended.returncode == 1
     assert ended.stderr == "mkc: the output could not be written: No space left on device.\n"
+
+
+def test_apply_writes_the_fields_of_the_message_of_ros(good, done, tmp_path):
+    folder, _ = done
+    output = tmp_path / "messages.csv"
+    result = mkc("apply", folder / "calibration.json", good, "--output", output, "--ros")
+    assert result.exit_code == 0, result.output
+    assert "median length" in result.output
+    assert " T: " in result.output
+    written = Recording.read(output, recognise=False)
+    calibration = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
+    field = torch.stack([written[f"magnetic_field.{axis}"] for axis in "xyz"], -1)
+    assert torch.allclose(field, 1e-6 * calibration.corrected(Recording.read(good).magnetometer()), rtol=1e-9)
+    covariance = torch.stack([written[f"magnetic_field_covariance[{i}]"] for i in range(9)], -1)
+    assert (covariance[:, [0, 4, 8]] > 0).all()
+    assert torch.equal(covariance[:, 1], covariance[:, 3])
+
+
+def test_a_model_has_no_covariance_for_ros(model, good, tmp_path):
+    result = mkc("apply", model, good, "--output", tmp_path / "a.csv", "--ros")
+    assert result.exit_code == 1
+    assert "calibration.json" in result.stderr

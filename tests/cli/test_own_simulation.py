@@ -217,7 +217,7 @@ def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     assert "--columns mag_x=axis_x,mag_y=axis_y" in flat(mkc("diagnose", sensor, "--output", output).stderr)
     named = "mag_x=axis_x,mag_y=axis_y,mag_z=axis_z"
     result = mkc("diagnose", sensor, "--output", output, "--columns", named, "--surrogates", 19)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 3, result.output
     assert "the recording has a magnetometer, so `--simulation magnetometer` is used" in flat(result.stderr)
     content = json.loads((output / "sensor" / "diagnosis.json").read_text(encoding="utf-8"))
     assert content["simulation"] == "magnetometer"

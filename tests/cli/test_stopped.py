@@ -56,11 +56,11 @@ def search_of(folder):
 
 
 @pytest.mark.e2e
-def test_a_time_limit_writes_what_is_known_and_exits_with_0(tmp_path, monkeypatch):
+def test_a_time_limit_writes_what_is_known_and_exits_with_3(tmp_path, monkeypatch):
     path = quiet(tmp_path / "a.csv")
     stopped_in_the_search(monkeypatch)
     result = mkc("diagnose", path, *ON_A_MAGNETOMETER, "--output", tmp_path / "out", "--time-limit", "3600")
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (3, "")
     assert "Stopped after" in result.stdout.splitlines()[2]
     assert search_of(tmp_path / "out" / "a")["stopped"]["reason"] == "time limit"
 
@@ -83,7 +83,7 @@ def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, m
         result, folder = mkc("diagnose", *paths, "--simulation", "magnetometer", *limit, *how), "together"
     else:
         result, folder = mkc("diagnose", paths[0], "--simulator-output", paths[1], *limit), "a"
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 3, result.output
     assert search_of(tmp_path / "out" / folder)["stopped"]["reason"] == "time limit"
 
 
@@ -119,7 +119,7 @@ def test_a_quick_look_and_a_limit_are_passed_on(tmp_path, monkeypatch):
     path = quiet(tmp_path / "a.csv")
     options = ("--quick", "--time-limit", "8", "--output", tmp_path / "out")
     result = mkc("diagnose", path, "--simulation", "magnetometer", *options)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 3, result.output
     assert (seen["quick"], seen["time_limit"]) == (True, 8.0)
     flat = " ".join(result.stdout.split())
     assert (

@@ -10,12 +10,9 @@ from torch import Tensor
 
 from mkc_torch.covariance import ExactFitError, MinimumCovarianceDeterminant, outlier_map
 from mkc_torch.linear import MMRegression
+from tests.draws import normal as sample
 
 MCD = MinimumCovarianceDeterminant
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def on_a_plane(on: int = 40, N: int = 60) -> Tensor:

@@ -12,12 +12,9 @@ from torch import Tensor
 from mkc_torch.covariance import MinimumCovarianceDeterminant
 from mkc_torch.covariance._corrections import consistency_factor, small_sample_factor
 from tests.covariance.reference import REFERENCES, SETS
+from tests.draws import normal as sample
 
 MCD = MinimumCovarianceDeterminant
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def contaminated(seed: int, N: int = 60, p: int = 3, share: float = 0.3) -> Tensor:

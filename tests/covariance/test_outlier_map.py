@@ -105,7 +105,7 @@ def test_the_map_of_a_batch_equals_the_maps_of_its_problems():
             torch.testing.assert_close(many.residuals[b], alone.residuals, rtol=1e-6, atol=1e-8)
             torch.testing.assert_close(many.distances[b], alone.distances)
             assert torch.equal(many.kind[b], alone.kind)
-    with pytest.raises(ValueError, match=r"map of a single problem but got a batch of shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"map of a single problem.*got a batch of shape \(3,\)"):
         single.plot()
 
 
@@ -147,7 +147,7 @@ def test_bad_arguments_are_refused():
     for options, message in (({"residual_cutoff": 0.0}, "`residual_cutoff`"), ({"cutoff": 2.0}, "`cutoff`")):
         with pytest.raises(ValueError, match=message):
             outlier_map(fit, X, y, **options)
-    with pytest.raises(TypeError, match="`estimator` to be an MCD"):
+    with pytest.raises(TypeError, match=r"`estimator`.*MCD"):
         outlier_map(fit, X, y, estimator=fit)
 
 

@@ -178,31 +178,29 @@ def test_icdf_of_many_probabilities_equals_icdf_of_few():
 
 @pytest.mark.parametrize("probability", [-1e-3, 1.001, math.nan])
 def test_icdf_refuses_values_that_are_not_probabilities(probability):
-    with pytest.raises(ValueError, match=r"`value` to be probabilities in \[0, 1\] but got .* at index \(1,\); divide"):
+    with pytest.raises(ValueError, match=r"`value`.*probabilities in \[0, 1\].*at index \(1,\); divide"):
         MKCDistribution(2.0, 1.0, 10.0, validate_args=True).icdf(torch.tensor([0.5, probability]))
 
 
 @pytest.mark.parametrize("name", ["log_prob", "cdf", "icdf"])
 def test_values_that_are_not_tensors_are_refused(name):
-    with pytest.raises(
-        TypeError, match=r"`value` to be a tensor.* but got float; make a tensor of it, torch\.as_tensor"
-    ):
+    with pytest.raises(TypeError, match=r"`value`.*tensor.*got float; make a tensor of it, torch\.as_tensor"):
         getattr(MKCDistribution(2.0, 1.0, 10.0, validate_args=True), name)(0.5)
 
 
 @pytest.mark.parametrize("shape", [3, "a", None, (2.5,)])
 def test_bad_shapes_of_samples_are_refused(shape):
     for draw in (MKCDistribution(2.0, 1.0, 10.0).rsample, MKCDistribution(2.0, 1.0, 10.0).sample):
-        with pytest.raises(TypeError, match=r"`sample_shape` to be a shape but got .*; write \(1000,\)"):
+        with pytest.raises(TypeError, match=r"`sample_shape`.*shape.*; write \(1000,\)"):
             draw(shape)
-    with pytest.raises(TypeError, match=r"`batch_shape` to be a shape but got"):
+    with pytest.raises(TypeError, match=r"`batch_shape`.*shape"):
         MKCDistribution(2.0, 1.0, 10.0).expand(shape)
 
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "loc"])
 @pytest.mark.parametrize("value", ["2", None, torch.ones(1) + 0j])
 def test_parameters_that_are_not_numbers_are_refused_by_name(name, value):
-    with pytest.raises(TypeError, match=rf"Expected argument `{name}` to be (a number, or a tensor of them|real)"):
+    with pytest.raises(TypeError, match=rf"`{name}`.*(a number|real)"):
         MKCDistribution(**{"sigma": 2.0, "d": 1.0, "bound": 10.0, name: value})
 
 
@@ -448,7 +446,7 @@ def test_support_is_the_domain():
 def test_arguments_outside_their_constraints_are_refused(name, value):
     arguments = {"sigma": 1.0, "d": 1.0, "bound": 5.0, "loc": 0.0, name: torch.tensor([1.0, value])}
     assert set(MKCDistribution.arg_constraints) == {"sigma", "d", "bound", "loc"}
-    with pytest.raises(ValueError, match=f"Expected parameter {name}"):
+    with pytest.raises(ValueError, match=f"parameter {name}"):
         MKCDistribution(**arguments, validate_args=True)  # torch.compile turns the default off permanently
 
 

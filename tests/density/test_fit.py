@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from mkc_torch import fit_density
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density import likelihood
 from mkc_torch.density.domain import domain_rule
 from mkc_torch.density.likelihood import (
     DensityState,
@@ -24,16 +26,9 @@ from mkc_torch.density.likelihood import (
     normaliser_derivatives,
 )
 from mkc_torch.linear import LeastSquares, MKCRegression
+from tests.draws import normal, uniform
 
 KAPPAS = [0.0, 1e-9, 1e-3, 0.019, 0.021, 0.049, 0.051, 1.0, 50.0, 400.0]
-
-
-def normal(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def uniform(seed: int, *shape: int) -> Tensor:
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def contaminated(seed: int, count: int, share: float = 0.2, low: float = -20.0, high: float = 20.0) -> Tensor:
@@ -144,6 +139,28 @@ def test_a_newton_step_never_increases_the_value():
         assert bool((after.value <= state.value + 1e-14).all())
         torch.testing.assert_close(after.value, negative_log_likelihood(error, None, after), rtol=0, atol=1e-12)
         state = after
+
+
+@pytest.mark.parametrize("free", [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize("weighted", [True, False])
+def test_a_newton_step_of_one_problem_is_that_of_a_batch(free, weighted, monkeypatch):
+    error = torch.stack([contaminated(s, 80, share) for s, share in ((0, 0.0), (2, 0.3), (4, 0.45))], -1).unsqueeze(0)
+    weight = uniform(5, *error.shape) if weighted else None
+    weight = None if weight is None else weight / weight.sum(-2, keepdim=True)
+    scale = robust_scale(error[0]).unsqueeze(0)
+    state = initial_state(error, weight, 3.0 * scale, domain_rule(error, scale), 1e-3 * scale)
+    state = replace(state, free_kappa=free[0], free_d=free[1])
+    moved = False
+    for _ in range(6):
+        with monkeypatch.context() as patch:
+            patch.setattr(likelihood, "is_short", lambda _: False)
+            expected = newton_step(error, weight, state)
+        found = newton_step(error, weight, state)
+        for field in ("kappa", "log_d", "value"):
+            torch.testing.assert_close(getattr(found, field), getattr(expected, field), rtol=1e-9, atol=1e-7)
+        moved = moved or bool((found.value < state.value).any())
+        state = expected
+    assert moved
 
 
 # the optimum
@@ -450,11 +467,9 @@ def test_weights_that_are_negative_or_all_zero_are_refused(weight):
 
 def test_weights_of_another_shape_are_refused_with_a_remedy():
     error = normal(0, 10, 10)
-    with pytest.raises(
-        ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(10,\); .*weight\[:, None\]"
-    ):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\).*got \(10,\);.*weight\[:, None\]"):
         fit_density(error, weight=torch.ones(10))
-    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(3, 10\)\."):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\).*got \(3, 10\)\."):
         fit_density(error, weight=torch.ones(3, 10))
     with pytest.raises(ValueError, match=r"`weight` .* channels of the sums \[0\.0\]"):
         fit_density(error[:, :1], weight=torch.zeros(10, 1))
@@ -477,17 +492,17 @@ def test_residuals_of_another_type_are_refused_with_a_remedy(error, message):
 
 
 def test_a_missing_channel_dimension_is_refused_with_a_remedy():
-    with pytest.raises(ValueError, match=r"but got \(1000,\); .*error\[:, None\]"):
+    with pytest.raises(ValueError, match=r"but got \(1000,\);.*error\[:, None\]"):
         fit_density(torch.zeros(1000))
-    with pytest.raises(ValueError, match=r"at least one channel but got \(10, 0\)"):
+    with pytest.raises(ValueError, match=r"at least one channel.*got \(10, 0\)"):
         fit_density(torch.zeros(10, 0))
 
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
 def test_parameters_that_are_not_numbers_or_of_another_shape_are_refused(name):
-    with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=rf"`{name}`.*number.*got 'a'"):
         fit_density(normal(0, 10, 2), **{name: "a"})
-    with pytest.raises(ValueError, match=rf"`{name}` to be a number or of shape \(m,\) or \(2,\) but got \(3,\)"):
+    with pytest.raises(ValueError, match=rf"`{name}`.*number or of shape \(m,\) or \(2,\).*got \(3,\)"):
         fit_density(normal(0, 10, 2), **{name: torch.full((3,), 9.0)})
 
 
@@ -534,7 +549,7 @@ def test_barrons_line_has_the_published_likelihood():
 def test_residuals_whose_squares_overflow_are_refused(dtype, size):
     error = torch.linspace(-1.0, 1.0, 50, dtype=dtype).unsqueeze(-1)
     error[3] = size
-    with pytest.raises(ValueError, match=r"`error` within .*, beyond which squares overflow, but got 1e\+"):
+    with pytest.raises(ValueError, match=r"`error` within.*, beyond which squares overflow.*got 1e\+"):
         fit_density(error)
 
 

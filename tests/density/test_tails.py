@@ -13,16 +13,9 @@ from mkc_torch import MKCDistribution, fit_density
 from mkc_torch.density import ChannelTails, Tails, assess_tails
 from mkc_torch.density.likelihood import DensityState, energy_derivatives, normaliser_derivatives
 from mkc_torch.density.tails import GAUSSIAN_BELOW, _share_beyond, percent_with_error, time_series_tails
+from tests.draws import normal, uniform
 
 FIELDS = [f.name for f in dataclasses.fields(Tails)]
-
-
-def normal(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def uniform(seed: int, *shape: int) -> Tensor:
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def with_outliers(seed: int, share: float, *shape: int) -> Tensor:

@@ -8,16 +8,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, MMRegression
+from mkc_torch.linear._estimator import LinearEstimator
 from tests.device.modes import synchronise
+from tests.estimators import estimators
 
-ESTIMATORS: dict[str, Callable[[], object]] = {
-    "LeastSquares": LeastSquares,
-    "FixedPointLinear": lambda: FixedPointLinear(sigma=2.0, d=0.1),
-    "MKCRegression": MKCRegression,
-    "LeastAbsoluteDeviations": LeastAbsoluteDeviations,
-    "MMRegression": MMRegression,
-}
+SHOWN = ("LeastSquares", "FixedPointLinear", "MKCRegression", "LeastAbsoluteDeviations", "MMRegression")
+ESTIMATORS: dict[str, Callable[[], LinearEstimator]] = {name: estimators(0.1)[name] for name in SHOWN}
 
 
 def problem(device: torch.device, *shape: int) -> tuple[Tensor, Tensor]:
@@ -36,7 +32,7 @@ def print_fits(device: torch.device, *, large: int, many: int) -> None:
             X, y = problem(device, *shape)
             start = time.perf_counter()
             try:
-                make().fit(X, y)  # type: ignore[attr-defined]
+                make().fit(X, y)
                 synchronise(device)
                 found = f"{1e3 * (time.perf_counter() - start):10.1f} ms"
             except (RuntimeError, ValueError) as error:

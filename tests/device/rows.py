@@ -56,8 +56,8 @@ def print_rows(device: torch.device, sizes: tuple[int, ...]) -> bool:
     for rows in sizes:
         for dtype in (torch.float32, torch.float64):
             X, y = sample(rows, dtype, device)
-            taken = milliseconds(lambda: MKCRegression().fit(X, y), device)  # noqa: B023
-            normal = milliseconds(lambda: torch.linalg.solve(X.mT @ X, X.mT @ y), device)  # noqa: B023
+            taken = milliseconds(lambda: MKCRegression().fit(X, y), device)  # noqa: B023 - called in this round of the loop
+            normal = milliseconds(lambda: torch.linalg.solve(X.mT @ X, X.mT @ y), device)  # noqa: B023 - called in this round of the loop
             # the domain, which depends on the pilot's rounding, is that of the device
             fit = MKCRegression().fit(X, y)
             own = apart(fit, MKCRegression(bound=fit.bound_.cpu()).fit(X.cpu(), y.cpu()))

@@ -11,36 +11,18 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
-from mkc_torch.linear import (
-    FixedPointLinear,
-    LeastAbsoluteDeviations,
-    LeastEntropyLike,
-    LeastMedianOfSquares,
-    LeastSquares,
-    LeastTrimmedSquares,
-    MEstimator,
-    MinimumEntropy,
-    MKCRegression,
-    MMRegression,
-    ReweightedLeastSquares,
-    SRegression,
-)
 from mkc_torch.linear._estimator import LinearEstimator
 from tests.device.modes import synchronise
+from tests.estimators import estimators
+
+_GOALS = {
+    "FixedPointLinear": 2.0,
+    "MKCRegression": 5.0,
+    **dict.fromkeys(("LeastAbsoluteDeviations", "SRegression", "MMRegression", "LeastTrimmedSquares"), 20.0),
+}
 
 ESTIMATORS: dict[str, tuple[Callable[[], LinearEstimator], float]] = {
-    "LeastSquares": (LeastSquares, math.inf),
-    "FixedPointLinear": (lambda: FixedPointLinear(sigma=2.0, d=1.0), 2.0),
-    "MKCRegression": (MKCRegression, 5.0),
-    "LeastAbsoluteDeviations": (LeastAbsoluteDeviations, 20.0),
-    "SRegression": (SRegression, 20.0),
-    "MMRegression": (MMRegression, 20.0),
-    "LeastTrimmedSquares": (LeastTrimmedSquares, 20.0),
-    "MEstimator": (lambda: MEstimator("tukey"), math.inf),
-    "ReweightedLeastSquares": (ReweightedLeastSquares, math.inf),
-    "LeastMedianOfSquares": (lambda: LeastMedianOfSquares(starts=300), math.inf),
-    "MinimumEntropy": (MinimumEntropy, math.inf),
-    "LeastEntropyLike": (LeastEntropyLike, math.inf),
+    name: (make, _GOALS.get(name, math.inf)) for name, make in estimators(1.0).items()
 }
 """Estimators with the goal of microseconds a fit at 100,000 problems of 100 x 2."""
 

@@ -18,8 +18,8 @@ class Line(ClosedForm):
     parameter_names = ("level", "slope")
     warnings = ()
     bounds = None
-    state = {}  # noqa: RUF012
-    ports = {  # noqa: RUF012
+    state = {}
+    ports = {
         "mixed": Port(("a", "b", "c"), "mV", allows_drift=True),
         "summed": Port(("flow",), "l/s", pointwise=False),
     }
@@ -33,7 +33,7 @@ class Line(ClosedForm):
         self.recording = Recording({"time": self.time, "left": self.measured[:, 0]}, name="line")
         self.prior = prior
 
-    def start(self, rows=None):  # noqa: ARG002
+    def start(self, rows=None):
         return torch.tensor([0.8, 0.4], dtype=torch.float64)
 
     def residual(self, theta, changes):
@@ -44,7 +44,7 @@ class Line(ClosedForm):
             left = left - changes["summed"](self.time.new_zeros(len(self.time), 1)).cumsum(0) / len(self.time)
         return left
 
-    def signals(self, theta, changes=None, near=None):  # noqa: ARG002
+    def signals(self, theta, changes=None, near=None):
         level = theta[0] + theta[1] * self.time
         return {"mixed": torch.stack([level, 2.0 * level, level.square()], -1)}
 

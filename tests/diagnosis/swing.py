@@ -27,18 +27,18 @@ class Pendulum(Dynamics):
     states = ("angle", "rate")
     inputs = ("torque",)
     outputs = ("angle",)
-    units = {"angle": "rad", "rate": "rad/s"}  # noqa: RUF012
-    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.3, lower=0.0)}  # noqa: RUF012
+    units = {"angle": "rad", "rate": "rad/s"}
+    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.3, lower=0.0)}
     input_hold = "held"
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.rate, "rate": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
 
 
 class UpsideDown(Pendulum):
     """The angle is measured from the wrong end: gravity drives it away."""
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.rate, "rate": u.torque + p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
 
 

@@ -270,16 +270,16 @@ def test_a_magnet_removed_from_a_real_sensor_is_found(name, onset, step):
 class Swing(Dynamics):
     states = ("angle", "speed")
     outputs = ("angle",)
-    parameters = {"stiffness": 2.0}  # noqa: RUF012
+    parameters = {"stiffness": 2.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * x.angle}
 
 
 class Divider(Static):
     inputs, outputs, parameters = ("supply",), ("voltage",), {"share": 1.0}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"voltage": p.share * u.supply}
 
 

@@ -24,10 +24,10 @@ NOISE = 0.01
 
 class Pendulum(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": 8.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}  # noqa: RUF012
-    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+    parameters = {"stiffness": 8.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}
+    units = {"angle": "rad", "speed": "rad/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
@@ -107,11 +107,11 @@ class Tanks(Dynamics):
 
     states = ("upper", "lower")
     inputs = ("pump",)
-    parameters = {"inflow": Parameter(1.0, lower=0.0), "drain": Parameter(0.3, lower=0.0)}  # noqa: RUF012
-    units = {"upper": "m", "lower": "m"}  # noqa: RUF012
+    parameters = {"inflow": Parameter(1.0, lower=0.0), "drain": Parameter(0.3, lower=0.0)}
+    units = {"upper": "m", "lower": "m"}
     input_hold = "held"
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"upper": p.inflow * u.pump - p.drain * x.upper, "lower": -p.drain * x.lower}
 
 
@@ -164,11 +164,11 @@ class Servo(Dynamics):
 
     states = ("angle", "speed")
     inputs = ("command",)
-    parameters = {"stiffness": 22.0, "damping": Parameter(3.5, lower=0.0)}  # noqa: RUF012
-    units = {"angle": "rad", "speed": "rad/s", "command": "rad"}  # noqa: RUF012
+    parameters = {"stiffness": 22.0, "damping": Parameter(3.5, lower=0.0)}
+    units = {"angle": "rad", "speed": "rad/s", "command": "rad"}
     step = 0.04
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": p.stiffness * (u.command - x.angle) - p.damping * x.speed}
 
 
@@ -230,11 +230,11 @@ class Buoy(Dynamics):
 
     states = ("heave", "speed")
     inputs = ("force",)
-    parameters = {"drag": Parameter(0.2, lower=0.0)}  # noqa: RUF012
-    units = {"heave": "m", "speed": "m/s", "force": "m/s²"}  # noqa: RUF012
+    parameters = {"drag": Parameter(0.2, lower=0.0)}
+    units = {"heave": "m", "speed": "m/s", "force": "m/s²"}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"heave": x.speed, "speed": u.force - 4.0 * x.heave - p.drag * x.speed}
 
 
@@ -256,11 +256,11 @@ def test_added_mass_is_named_and_sized():
 
 class Ball(Dynamics):
     states = ("x", "y", "vx", "vy")
-    parameters = {"drag": Parameter(0.01, lower=0.0)}  # noqa: RUF012
-    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+    parameters = {"drag": Parameter(0.01, lower=0.0)}
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
     step = 0.02
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         speed = torch.sqrt(x.vx.square() + x.vy.square() + 1e-6)
         return {"x": x.vx, "y": x.vy, "vx": -p.drag * speed * x.vx, "vy": -9.81 - p.drag * speed * x.vy}
 
@@ -308,9 +308,9 @@ def test_buoyancy_leads_the_search_of_all_effects():
 
 class Sinking(Dynamics):
     states = ("height", "speed")
-    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": -9.81 - 0.8 * x.speed}
 
 
@@ -332,9 +332,9 @@ def test_a_submerged_body_has_a_constant_force():
 
 class Fall(Dynamics):
     states = ("height", "speed")
-    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
 

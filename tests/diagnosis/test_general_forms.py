@@ -18,11 +18,11 @@ class Body(Dynamics):
 
     states = ("temp",)
     inputs = ("power", "room")
-    parameters = {"capacity": Parameter(40.0, lower=1.0), "loss": Parameter(0.4, lower=0.0)}  # noqa: RUF012
-    units = {"temp": "°C"}  # noqa: RUF012
+    parameters = {"capacity": Parameter(40.0, lower=1.0), "loss": Parameter(0.4, lower=0.0)}
+    units = {"temp": "°C"}
     input_hold = "held"
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"temp": (u.power - p.loss * (x.temp - u.room)) / p.capacity}
 
 
@@ -68,11 +68,11 @@ class Joint(Dynamics):
 
     states = ("angle", "speed")
     inputs = ("torque",)
-    parameters = {"inertia": Parameter(0.9, lower=0.1), "damping": Parameter(0.3, lower=0.0)}  # noqa: RUF012
-    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+    parameters = {"inertia": Parameter(0.9, lower=0.1), "damping": Parameter(0.3, lower=0.0)}
+    units = {"angle": "rad", "speed": "rad/s"}
     step = 0.02
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": (u.torque - 6.0 * x.angle - p.damping * x.speed) / p.inertia}
 
 
@@ -95,9 +95,9 @@ def test_a_flexible_joint_is_named_with_its_period():
 class Free(Pendulum):
     """With a damping that is known."""
 
-    parameters = {"stiffness": 8.0}  # noqa: RUF012
+    parameters = {"stiffness": 8.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - 0.05 * x.speed}
 
 

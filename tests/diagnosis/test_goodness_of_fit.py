@@ -216,7 +216,7 @@ def test_the_verdict_of_a_vector_without_states(useful, said):
     class Vector(Static):
         inputs, outputs, parameters = ("a",), ("x", "y", "z"), {"k": 1.0}
 
-        def output(self, time, u, p):  # noqa: ARG002
+        def output(self, time, u, p):
             return {"x": p.k * u.a, "y": -p.k * u.a, "z": p.k * u.a**2}
 
     a = smooth(1, 3)

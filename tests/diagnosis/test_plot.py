@@ -127,7 +127,7 @@ def test_a_map_is_drawn_where_there_is_one(found):
 
 
 def test_axes_that_are_none_are_a_type_error(found):
-    with pytest.raises(TypeError, match="`ax` to be axes of matplotlib or None but got Figure"):
+    with pytest.raises(TypeError, match=r"`ax`.*axes of matplotlib or None.*got Figure"):
         found.plot.residual(ax=pyplot.figure())
 
 

@@ -33,6 +33,7 @@ MANUAL = {
     "measured.md",
     "own_simulation.md",
     "promises.md",
+    "ros.md",
     "wrong_targets.md",
 }
 FOLDERS = {"decisions/index.md"}

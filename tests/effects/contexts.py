@@ -3,7 +3,7 @@
 import torch
 
 from mkc_torch.effects import DYNAMICS, PAIRED, Context
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL
 from mkc_torch.simulation.outputs import ALL, output_ports
 from mkc_torch.simulation.ports import SignalSizes
 

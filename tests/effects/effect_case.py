@@ -221,7 +221,7 @@ class OfEveryShape:
         assert not any(word in equation for word in ("terms", "degree", "radius", "power", "order", "width =", "nan"))
         assert all(effect.reports(name) == (name not in effect.form_parameters) for name in shape)
 
-    def test_moments_ascend_within_the_recording(self, effect, shape, context):  # noqa: ARG002
+    def test_moments_ascend_within_the_recording(self, effect, shape, context):
         moments = effect.moments(context)
         assert list(moments) == sorted(set(moments))
         assert all(float(context.time[0]) <= moment <= float(context.time[-1]) for moment in moments)

@@ -36,7 +36,7 @@ class SupplyOffset(GainEffect):
     plausible = 1.0
     source = "our bench"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return context.drivers[:, 0]
 
 
@@ -50,10 +50,10 @@ class Square(Effect):
     advice = "Look for a magnet near the element."
     source = "our bench"
 
-    def quantities(self, shape, context):  # noqa: ARG002
+    def quantities(self, shape, context):
         return (Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}"),)
 
-    def change(self, gamma, shape, context):  # noqa: ARG002
+    def change(self, gamma, shape, context):
         return gamma * context.signal.square()
 
 

@@ -131,10 +131,10 @@ def test_an_excess_states_its_reference():
 
 class Cup(Dynamics):
     states = ("temp",)
-    parameters = {"loss": 0.1}  # noqa: RUF012
-    units = {"temp": "degC"}  # noqa: RUF012
+    parameters = {"loss": 0.1}
+    units = {"temp": "degC"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"temp": -p.loss * (x.temp - 20.0)}
 
 

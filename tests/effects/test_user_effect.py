@@ -27,7 +27,7 @@ class SupplyOffset(GainEffect):
     plausible = 2.0
     source = "our bench"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return context.drivers[:, 0]
 
 

@@ -17,7 +17,7 @@ DRAG = 0.02
 @pytest.fixture
 def load(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
-    for name in ("baselines", "free_run", "systems", "held_out"):
+    for name in ("baselines", "free_run", "held_out", "library", "neural", "problem", "sparse", "systems"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module
 
@@ -36,7 +36,7 @@ def drop(seconds, speed):
 def problem(load):
     systems = load("systems")
     case = systems.Case("ball", systems.Ball(), drop(3.5, 0.0), {"other drop": drop(3.2, 0.3)}, scored_from=1.0)
-    return load("baselines").problem_of(case, torch.zeros(0, dtype=torch.float64))
+    return load("problem").problem_of(case, torch.zeros(0, dtype=torch.float64))
 
 
 def oscillation(load, lengths):
@@ -109,7 +109,7 @@ def test_inputs_between_samples(load, between):
 
 def test_simple_choices_and_words(load):
     baselines = load("baselines")
-    assert baselines.simplest([2.0, 1.0, 1.04, 1.02], [1, 5, 3, 3]) == 3
+    assert load("sparse").simplest([2.0, 1.0, 1.04, 1.02], [1, 5, 3, 3]) == 3
     assert baselines.mean_of([1.0, math.inf, 3.0]) == (2.0, 1)
     assert baselines.counted(["drag", "nothing", "drag"]) == "drag (2), nothing (1)"
     physics = baselines.PHYSICS["Silverbox"]
@@ -118,31 +118,31 @@ def test_simple_choices_and_words(load):
     assert baselines.in_unit([math.inf], physics) == "diverged"
 
 
-def test_every_term_of_a_library_is_computed_and_none_is_there_for_nothing(load):
-    baselines, systems = load("baselines"), load("systems")
+def test_every_term_of_a_library_has_a_value_and_every_used_term_exists(load):
+    library, systems = load("library"), load("systems")
     for system in (systems.Ball(), systems.Heaters(), systems.Silverbox(), systems.Servo()):
-        physics = baselines.PHYSICS[system.name]
+        physics = library.PHYSICS[system.name]
         x, u, p = (
             load("free_run").named(tuple(names), torch.full((5, len(names)), 0.5, dtype=torch.float64))
             for names in (system.states, system.inputs, system.parameters)
         )
-        terms = physics.terms(x, u, p, baselines.Shape())
+        terms = physics.terms(x, u, p, library.Shape())
         used = {term for state in physics.own for term in physics.own[state] + physics.more[state]}
         assert used <= set(terms)
         assert all(term().shape == (5,) for term in terms.values())
 
 
 def test_the_held_out_part_is_not_among_the_shortened_runs(load, problem):
-    short = load("baselines").shortened(problem.case)
+    short = load("problem").shortened(problem.case)
     assert float(short.train["time"][-1]) <= 0.7 * float(problem.case.train["time"][-1])
     assert short.tests == {}
 
 
 def test_the_neural_ode_learns_the_air_of_a_drop(load, problem, monkeypatch):
-    baselines = load("baselines")
-    monkeypatch.setattr(baselines, "EPOCHS", 40)
+    neural = load("neural")
+    monkeypatch.setattr(neural, "EPOCHS", 40)
     (before,) = problem.unseen(load("free_run").rate_of(problem.case.system, problem.fitted))
-    rate = baselines.trained(problem, problem.train, 17, 40, lambda *_: None, 0)
+    rate = neural.trained(problem, problem.train, 17, 40, lambda *_: None, 0)
     with torch.no_grad():
         (after,) = problem.unseen(rate)
     assert before > 1.0
@@ -151,9 +151,9 @@ def test_the_neural_ode_learns_the_air_of_a_drop(load, problem, monkeypatch):
 
 def test_pysindy_names_the_air_of_a_drop(load, problem, monkeypatch):
     pytest.importorskip("pysindy", reason="PySINDy is not installed", exc_type=ImportError)
-    baselines = load("baselines")
-    monkeypatch.setattr(baselines, "THRESHOLDS", (0.03, 0.2))
-    outcome = baselines.sindy(problem, problem)
+    sparse = load("sparse")
+    monkeypatch.setattr(sparse, "THRESHOLDS", (0.03, 0.2))
+    outcome = sparse.sindy(problem, problem)
     assert outcome.name == "speed' = simulation + *v|v|*"
     assert outcome.errors[0] < 0.1
 

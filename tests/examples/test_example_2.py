@@ -45,7 +45,7 @@ def test_a_rough_fit_on_a_tight_domain_finds_the_head_under_outliers_on_one_side
         return (MKCRegression().fit(X, Y).coef_ - 1.0).norm(dim=-1)
 
     tight = error()
-    monkeypatch.setattr(_maximum, "domain_rule", lambda e, scale, used=None, scales=10.0: domain_rule(e, scale, used))  # noqa: ARG005
+    monkeypatch.setattr(_maximum, "domain_rule", lambda e, scale, used=None, scales=10.0: domain_rule(e, scale, used))
     wide = error()
     assert int((tight < wide - 1e-3).sum()) >= 10
     assert int((tight > wide + 1e-3).sum()) <= 2

@@ -63,6 +63,21 @@ def test_a_right_diagnosis_is_compared_with_the_fit_by_hand(load):
     }
 
 
+def test_the_size_of_an_alternative_counts_if_the_recording_cannot_rule_it_out(load):
+    expected = next(item for item in load("known").real() if item.name == ROCKET).expected
+    drag = row()["findings"][0]
+    line = {"effect": "linear_drag", "parameters": []}
+
+    def wrong(value, *, separable=False):
+        parameters = [drag["parameters"][0] | {"value": value}]
+        other = {"effect": "quadratic_drag", "drivers": [], "separable": separable, "parameters": parameters}
+        return load("judge").judged(row(findings=[drag | line | {"alternatives": [other]}]), expected)["wrong"]
+
+    assert wrong(9.2e-5) == []
+    assert wrong(2.0e-4) == ["drag of quadratic_drag is 0.0002, not 9.2e-05 +- 9.2e-06"]
+    assert "no drag of quadratic_drag" in wrong(9.2e-5, separable=True)
+
+
 def test_a_diagnosis_that_names_nothing_is_wrong_and_has_no_size(load):
     found = cells(load, row(verdict="unexplained", findings=[], residual_after={}))
     assert found["claimed"] == "unexplained (wrong)"

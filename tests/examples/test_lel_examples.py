@@ -19,6 +19,8 @@ def example(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
+    if str(FOLDER) not in sys.path:
+        sys.path.append(str(FOLDER))  # an example may import its neighbour, as in a run of the script
     spec.loader.exec_module(module)
     return module
 

@@ -63,7 +63,7 @@ def main() -> None:
         fuzz(options.child, options.output, 60.0 * options.minutes)
         return
     try:
-        import atheris  # noqa: F401
+        import atheris  # noqa: F401 - tests whether it is installed
     except ImportError:
         print("atheris is not installed, so that nothing is fuzzed; it is part of the extra dev, on Linux.")
         return

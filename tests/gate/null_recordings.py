@@ -57,7 +57,7 @@ class Spring(Dynamics):
         {"stiffness": Parameter(3.0, lower=0.0), "damping": Parameter(0.4, lower=0.0), "gain": 0.8}
     )
 
-    def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
         return {"place": x.speed, "speed": p.gain * u.force - p.stiffness * x.place - p.damping * x.speed}
 
 
@@ -112,7 +112,7 @@ def _autoregressive(random: np.random.Generator) -> Array:
     return NOISE * _autoregressive_series(random, AR)
 
 
-def _none(random: np.random.Generator) -> Array:  # noqa: ARG001 - one signature
+def _none(random: np.random.Generator) -> Array:
     return np.zeros(SAMPLES)
 
 

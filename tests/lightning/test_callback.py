@@ -585,22 +585,22 @@ def refused(module, *callbacks, error=None, match):
 
 
 def test_several_losses_without_a_name_are_refused():
-    refused(TwoLosses(), match="`loss` to name one of `criterion`, `heads.b` but got None")
+    refused(TwoLosses(), match=r"`loss` to name one of `criterion`, `heads.b`.*got None")
 
 
 def test_another_name_is_refused():
-    refused(TwoLosses(), MKCExpectationMaximization("b"), match="one of `criterion`, `heads.b` but got 'b'")
+    refused(TwoLosses(), MKCExpectationMaximization("b"), match=r"one of `criterion`, `heads.b`.*got 'b'")
 
 
 def test_a_module_without_a_loss_is_refused():
     module = Replay()
     module.criterion = nn.MSELoss()
-    refused(module, match="Replay to hold an MKCLoss but got none; make it an attribute")
+    refused(module, match=r"Replay to hold an MKCLoss.*got none; make it an attribute")
 
 
 def test_two_callbacks_for_one_loss_are_refused():
     callbacks = MKCExpectationMaximization(), MKCExpectationMaximization("criterion")
-    refused(Replay(), *callbacks, match="one MKCExpectationMaximization for the loss `criterion` but got two")
+    refused(Replay(), *callbacks, match=r"one MKCExpectationMaximization for the loss `criterion`.*got two")
 
 
 @pytest.mark.parametrize(("learned", "named"), [("sigma", "raw_kappa"), ("d", "raw_d")])
@@ -679,7 +679,7 @@ def _losses_of(module):
 def test_residuals_that_are_not_finite_are_refused_with_step_channel_and_remedy(bad, monkeypatch):
     error = drawn(500, 2)
     error[320, 1] = bad
-    refused(Replay(), error=error, match=r"`input` to be finite but got 1 values .* \(20, 1\)")
+    refused(Replay(), error=error, match=r"`input`.*finite.*got 1.*\(20, 1\)")
     # as on an accelerator, for which the loss does not wait
     monkeypatch.setattr("mkc_torch.losses.mkc.refuse_bad_batch", lambda *_: None)
     refused(Replay(), error=error, match=r"step 3 of the loss `criterion`.*channel 1; .*torch.isfinite\(target\)")
@@ -906,7 +906,7 @@ def test_a_checkpoint_of_other_channels_is_refused():
     few, many = MKCExpectationMaximization(), MKCExpectationMaximization()
     trained(Replay(2), loader(drawn(300, 2)), few)
     many.load_state_dict(few.state_dict())
-    with pytest.raises(ValueError, match="a checkpoint of 3 channels but got 2"):
+    with pytest.raises(ValueError, match=r"a checkpoint of 3 channels.*got 2"):
         trained(Replay(3), loader(drawn(300, 3)), many)
 
 

@@ -168,7 +168,7 @@ def test_autocast_does_not_affect_the_histogram():
 def test_residuals_that_are_not_finite_are_refused_by_channel(bad):
     histogram, error = ResidualHistogram(torch.ones(3)), torch.rand(4, 3)
     error[2, 1] = bad
-    with pytest.raises(ValueError, match=r"finite residuals but got .*channel 1; .*isfinite"):
+    with pytest.raises(ValueError, match=r"finite residuals.*channel 1;.*isfinite"):
         histogram.add(error)
     assert histogram.batches == 0
 
@@ -177,7 +177,7 @@ def test_residuals_that_are_not_finite_are_refused_by_channel(bad):
 def test_weights_that_are_negative_or_not_finite_are_refused(bad):
     histogram, weight = ResidualHistogram(torch.ones(2)), torch.ones(4, 2)
     weight[1, 0] = bad
-    with pytest.raises(ValueError, match=r"weights >= 0 but got .*channel 0"):
+    with pytest.raises(ValueError, match=r"weights >= 0.*channel 0"):
         histogram.add(torch.rand(4, 2), weight)
 
 

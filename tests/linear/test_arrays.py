@@ -47,7 +47,7 @@ def test_frames_give_what_tensors_give_and_their_columns_are_remembered(kind, li
         got.predict(frame[["b", "a"]])
     assert "feature_names_in_" not in vars(got.fit(X, y))
     with pytest.raises(NotFittedError):
-        got.feature_names_in_  # noqa: B018
+        got.feature_names_in_
 
 
 def test_arrays_given_with_tensors_take_the_dtype_of_the_tensors():

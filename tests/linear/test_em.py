@@ -16,14 +16,8 @@ from mkc_torch.functional import mkc_nll
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, RankDeficientError
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._robust_start import robust_start
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def uniform(seed: int, *shape: int) -> Tensor:
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+from tests.draws import normal as sample
+from tests.draws import uniform
 
 
 def line(seed: int, N: int = 100, n: int = 3, share: float = 0.2) -> tuple[Tensor, Tensor]:
@@ -596,3 +590,19 @@ def test_the_likelihood_is_never_below_that_of_a_gaussian_at_least_squares():
     d = residual.square().mean(-1, keepdim=True).sqrt()
     gaussian = -mkc_nll(residual, math.inf, d, fit.bound_).sum(-1)
     assert float((fit.log_likelihood_ - gaussian).min()) > -1e-9
+
+
+def test_a_weight_of_two_is_two_samples_where_d_ends_at_its_least():
+    """The least of d is a share of a robust scale, whose small-sample factor counts the samples."""
+    apart = []
+    for seed in (0, 6, 8, 13, 20, 32):
+        X = torch.cat([torch.ones(20, 1).double(), sample(seed, 20, 2)], 1)
+        y = X.sum(-1) + 0.1 * sample(seed + 1, 20)
+        y[::5] += 5.0 + sample(seed + 2, 4)
+        count = 1 + torch.arange(20) % 2
+        weighted = MKCRegression(bound=8.0).fit(X, y, count.double())
+        repeated = MKCRegression(bound=8.0).fit(X.repeat_interleave(count, 0), y.repeat_interleave(count))
+        apart.append(float((weighted.d_ / repeated.d_ - 1.0).abs()))
+    # the start's coverage, a share of the samples, still differs a little
+    assert sorted(apart)[3] < 1e-6
+    assert max(apart) < 0.06

@@ -13,11 +13,8 @@ from mkc_torch.linear import FixedPointLinear, LeastSquares, RankDeficientError,
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._robust_start import robust_start
 from mkc_torch.linear.covariance import andrews_bandwidth, long_run_covariance
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def lstsq(X: Tensor, y: Tensor) -> Tensor:

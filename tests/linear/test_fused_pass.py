@@ -9,6 +9,7 @@ from torch import Tensor
 from mkc_torch.linear import MKCRegression, _large, _rows
 from mkc_torch.linear._blocks import Density
 from mkc_torch.linear._rows import Rows
+from tests.triton_interpreter import skip_without_interpreter
 
 pytest.importorskip("triton")
 from mkc_torch.linear import _fused_pass
@@ -20,6 +21,8 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 def _runs():
     if DEVICE == "cpu" and not _fused_pass._KERNEL.is_interpreted:
         pytest.skip("the kernel was imported before TRITON_INTERPRET=1 was set")
+    if DEVICE == "cpu":
+        skip_without_interpreter()
 
 
 def sample(n: int, rows: int = 150) -> tuple[Tensor, Tensor]:

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
-from torch import Tensor
 
 from mkc_torch.linear import GeneralizedMaximumEntropy, LeastSquares, Ridge
+from tests.draws import normal as sample
 
 POINTS = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0], dtype=torch.float64)
 
 
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
 def primal(X: np.ndarray, y: np.ndarray, z: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     """(35)-(38) by sequential quadratic programming over the probabilities."""
-    N, n, l, k = *X.shape, z.shape[-1], v.shape[-1]  # noqa: E741
+    N, n, l, k = *X.shape, z.shape[-1], v.shape[-1]  # noqa: E741 - the paper's name
 
     def split(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return u[: n * l].reshape(n, l), u[n * l :].reshape(N, k)

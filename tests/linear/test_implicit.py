@@ -11,13 +11,10 @@ from torch.func import vmap
 from mkc_torch import EllipsoidFit
 from mkc_torch.linear import FixedPointLinear, LeastSquares, MKCRegression
 from mkc_torch.linear._implicit.refusal import NotDifferentiableError
+from tests.draws import normal as sample
 
 # torch's own forward mode
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def leaves(*values: Tensor) -> list[Tensor]:

@@ -22,6 +22,7 @@ from mkc_torch.linear import (
 )
 from mkc_torch.linear._estimator import NotFittedError
 from mkc_torch.linear._inference import Inference, RobustInference
+from tests.draws import normal as sample
 
 ROBUST = [
     MMRegression(),
@@ -39,10 +40,6 @@ ALL = [*ROBUST, LeastSquares(), FixedPointLinear(sigma=3.0), MKCRegression()]
 
 def label(estimator: Inference) -> str:
     return repr(estimator)[:30]
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def line(seed: int, N: int, n: int = 3, *batch: int, outliers: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -358,7 +355,7 @@ def test_arguments(estimator):
     with pytest.raises(ValueError, match="`level`"):
         estimator().fit(*line(40, 30)).confidence_interval(95.0)
     with pytest.raises(NotFittedError):
-        estimator().standard_error_  # noqa: B018
+        estimator().standard_error_
     with pytest.raises(NotFittedError):
         estimator().summary()
 

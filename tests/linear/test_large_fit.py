@@ -8,20 +8,17 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from mkc_torch.density.likelihood import energy_derivatives
-from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _rows, em
-from mkc_torch.linear._blocks import Density, energy_of, kernel, residual, sums
+from mkc_torch.linear import MKCRegression, RankDeficientError, _block_sums, _large, _rows, em
+from mkc_torch.linear._blocks import Density, energy_of
 from mkc_torch.linear._descent import sandwich_of
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
 from mkc_torch.linear._problem import checked_shapes, linear_problem
 from mkc_torch.linear._rows import Rows, blocks
+from tests.draws import normal
 
 N = 24_000
 """Rows of a fit that starts with a pilot."""
-
-
-def normal(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tuple[Tensor, Tensor]:
@@ -226,16 +223,6 @@ def test_results_are_continuous_where_fits_become_large(monkeypatch, piloted):
     assert large.n_iter_ < small.n_iter_
 
 
-def test_more_levels_end_at_the_same_maximum(monkeypatch, piloted):
-    X, y = sample()
-    fit = MKCRegression().fit(X, y)
-    monkeypatch.setattr(_large, "_GROWTH", 2)
-    monkeypatch.setattr(_large, "_LEAST_FACTOR_TO_ALL", 2)
-    again = MKCRegression(bound=fit.bound_).fit(X, y)
-    assert piloted == [True, True]
-    assert apart(fit, again) < 1e-6
-
-
 def test_float32_data_have_float64_sums(monkeypatch):
     X, y = (v.float() for v in changed(move_x=100.0))
     fit = MKCRegression(bound=20.0).fit(X, y)
@@ -315,9 +302,9 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
     X, y = sample(rows=rows)
     read = 0
 
-    def counted(*args):
+    def counted(*args, **kwargs):
         nonlocal read
-        for block in blocks(*args):
+        for block in blocks(*args, **kwargs):
             read += block.y.shape[0]
             yield block
 
@@ -348,11 +335,38 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
     covariance = coefficient_covariance(problem, in_basis, density.kappa[None], density.d[None], "sandwich", None)
     used = 2 * N if weight is None else int((weight > 0).sum())
     torch.testing.assert_close(sandwich_of(curvature_sums, used, used - 3), covariance, rtol=1e-7, atol=0.0)
-    monkeypatch.setattr(_blocks, "_STRIP", 100)
-    monkeypatch.setattr(_rows, "blocks", lambda *args: blocks(*args, 1234))
+    monkeypatch.setattr(_block_sums, "_STRIP", 100)
+    monkeypatch.setattr(_rows, "blocks", lambda *args, **kwargs: blocks(*args, values=1234, **kwargs))
     again, transformed, _ = Rows(X, Y, weight).evaluate(beta, density, with_curvature=True)
     for reference, other in zip((*total, *curvature_sums), (*again, *(transformed or ())), strict=True):
         torch.testing.assert_close(reference, other, rtol=1e-9, atol=1e-6)
+
+
+class SumsByTorch(_block_sums.BlockSums):
+    """The operations of a GPU, on the CPU."""
+
+    def __init__(self, *args, **options) -> None:
+        super().__init__(*args, **options)
+        self._on_cpu, self._operations, self._number = False, torch, _block_sums._same
+        for name, value in vars(self).items():
+            if hasattr(value, "__array__") and not isinstance(value, Tensor):
+                setattr(self, name, torch.from_numpy(value))
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_sums_by_the_operations_of_a_gpu(kappa, weighted, monkeypatch):
+    X, Y = channels()
+    rows = Rows(X, Y, (torch.arange(2 * N) % 3).double().reshape(N, 2) if weighted else None)
+    density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
+    by_numpy, by_torch = torch.empty_like(Y), torch.empty_like(Y)
+    options = {"with_curvature": True, "with_range": True}
+    expected = rows.evaluate(torch.ones(3).double(), density, weights=by_numpy, **options)
+    monkeypatch.setattr(_rows, "BlockSums", SumsByTorch)
+    found = rows.evaluate(torch.ones(3).double(), density, weights=by_torch, **options)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(by_torch, by_numpy)
 
 
 def test_a_frame_is_a_change_of_columns():
@@ -375,9 +389,7 @@ def test_score_is_the_slope_of_the_energy():
     density = Density(torch.tensor([0.3]).double(), torch.tensor([1.2]).double())
 
     def energy_at(beta: Tensor) -> Tensor:
-        block = next(iter(blocks(X[:, None], y[:, None], None)))
-        error = residual(block, beta)
-        found = sums(block, error, *kernel(error, density), density, plain=True)
+        found = Rows(X[:, None], y[:, None], None).evaluate(beta, density).total
         return torch.cat([energy_of(found, density.kappa).value, found.score.flatten()])
 
     beta, step = torch.full((5,), 0.9).double(), 1e-5

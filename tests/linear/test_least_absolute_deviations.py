@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.linear import RankDeficientError
 from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
 
 properties = settings(derandomize=True, deadline=None, max_examples=25)
@@ -26,10 +27,6 @@ def linear_program(X: Tensor, y: Tensor, weight: Tensor | None = None) -> tuple[
     cost = np.concatenate([np.zeros(n), w, w])
     coef = torch.from_numpy(linprog(cost, A_eq=equal, b_eq=y.numpy(), bounds=bounds, method="highs").x[:n])
     return coef, float((w * (y - X @ coef).abs()).sum())
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def heavy(seed: int, *shape: int) -> Tensor:
@@ -303,7 +300,7 @@ def test_a_result_that_the_estimator_lacks_is_not_blamed_on_a_missing_fit():
     X, Y = torch.randn(20, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
     fitted = LeastAbsoluteDeviations().fit(X, Y)
     with pytest.raises(AttributeError, match=r"its results are .*coef_") as error:
-        fitted.standard_error_  # noqa: B018
+        fitted.standard_error_
     assert "first" not in str(error.value)
     with pytest.raises(AttributeError, match="call fit"):
-        LeastAbsoluteDeviations().coef_  # noqa: B018
+        LeastAbsoluteDeviations().coef_

@@ -14,14 +14,11 @@ from mkc_torch.linear import LeastEntropyLike, LeastSquares, RankDeficientError
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_entropy_like import _Directions
 from mkc_torch.losses.entropy_like import entropy_like
+from tests.draws import normal as sample
 from tests.literature import hbk
 
 properties = settings(derandomize=True, deadline=None, max_examples=20)
 seeds = st.integers(0, 2**31 - 1)
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def problem(seed: int, N: int = 60, n: int = 3, outliers: float = 0.15) -> tuple[Tensor, Tensor]:

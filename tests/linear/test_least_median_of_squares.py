@@ -11,11 +11,8 @@ from torch import Tensor
 from mkc_torch._support.side_by_side import forced
 from mkc_torch.linear import LeastMedianOfSquares
 from mkc_torch.linear._chebyshev import equal_heights, minimax
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def linear_program(X: np.ndarray, y: np.ndarray) -> float:

@@ -8,11 +8,8 @@ from torch import Tensor
 
 from mkc_torch.linear import LeastSquares, RankDeficientError, Ridge
 from mkc_torch.linear._estimator import LinearEstimator, NotFittedError
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def lstsq(X: Tensor, y: Tensor) -> Tensor:
@@ -204,7 +201,7 @@ def test_result_before_fit_raises_not_fitted(estimator, name):
 
 def test_unknown_attribute_is_not_called_unfitted():
     with pytest.raises(AttributeError, match="no attribute 'slope'") as raised:
-        LeastSquares().slope  # noqa: B018
+        LeastSquares().slope
     assert not isinstance(raised.value, NotFittedError)
 
 

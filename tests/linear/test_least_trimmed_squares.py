@@ -13,12 +13,9 @@ from torch import Tensor
 from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, least_trimmed_squares
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_trimmed_squares import TrimmedScale, gaussian_consistency, order_statistic
+from tests.draws import normal as sample
 from tests.linear.test_mm_regression import clustered
 from tests.literature import COLEMAN_LTS, DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def lstsq(X: Tensor, y: Tensor) -> Tensor:

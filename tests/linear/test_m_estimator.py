@@ -10,12 +10,9 @@ from torch import Tensor
 
 from mkc_torch.linear import LeastSquares, MEstimator
 from mkc_torch.linear._psi import TUNING_95
+from tests.draws import normal as sample
 from tests.linear.test_psi import PSI
 from tests.literature import DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.2) -> tuple[Tensor, Tensor]:

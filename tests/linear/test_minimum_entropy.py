@@ -11,12 +11,9 @@ from torch import Tensor
 from mkc_torch.linear import LeastSquares, MinimumEntropy, RankDeficientError
 from mkc_torch.linear import minimum_entropy as module
 from mkc_torch.linear._problem import linear_problem
+from tests.draws import normal as sample
 
 KINDS = [(e, s) for e in ("shannon", "renyi") for s in ("median", "symmetric")]
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def line(seed: int, N: int = 80, share: float = 0.25) -> tuple[Tensor, Tensor]:

@@ -8,11 +8,8 @@ from torch import Tensor
 
 from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, MMRegression, SRegression
 from mkc_torch.linear._estimator import LinearEstimator
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def clustered(seed: int, draws: int, spread: float = 0.3) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,39 +13,23 @@ from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.covariance import MinimumCovarianceDeterminant
 from mkc_torch.linear import (
-    FixedPointLinear,
-    LeastAbsoluteDeviations,
-    LeastEntropyLike,
     LeastMedianOfSquares,
     LeastSquares,
     LeastTrimmedSquares,
     MEstimator,
     MinimumEntropy,
     MKCRegression,
-    MMRegression,
     RankDeficientError,
-    ReweightedLeastSquares,
     Ridge,
-    SRegression,
 )
 from mkc_torch.linear._estimator import LinearEstimator
+from tests.estimators import estimators
 
 ESTIMATORS = [
-    LeastSquares(),
+    *(make() for make in estimators(0.2).values()),
     Ridge(1.0),
-    FixedPointLinear(sigma=2.0, d=0.2),
-    MKCRegression(),
-    LeastAbsoluteDeviations(),
-    MEstimator("tukey"),
     MEstimator("huber", scale="proposal2"),
-    LeastTrimmedSquares(),
-    LeastMedianOfSquares(starts=300),
-    ReweightedLeastSquares(),
-    SRegression(),
-    MMRegression(),
-    MinimumEntropy(),
     MinimumEntropy("renyi"),
-    LeastEntropyLike(),
 ]
 
 

@@ -6,10 +6,7 @@ from torch import Tensor
 
 from mkc_torch.linear import RankDeficientError
 from mkc_torch.linear._problem import LinearProblem, canonical_shapes, linear_problem, solve_gram
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+from tests.draws import normal as sample
 
 
 def gram_of_basis(problem: LinearProblem) -> Tensor:

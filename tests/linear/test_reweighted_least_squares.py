@@ -3,16 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from mkc_torch.linear import LeastAbsoluteDeviations, LeastSquares, LeastTrimmedSquares, ReweightedLeastSquares
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
 
 WITH_ROWS = [n for n in REFERENCE if REFERENCE[n].lts is not None]
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize("name", WITH_ROWS)

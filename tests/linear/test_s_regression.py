@@ -12,13 +12,10 @@ from mkc_torch.linear import LeastSquares, SRegression
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, bisquare_for_breakdown, bisquare_rho, bisquare_weight
 from mkc_torch.linear.s_regression import MScale, starts_worth_drawing
+from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
 
 WITH_SCALE = [n for n in REFERENCE if REFERENCE[n].mm is not None]
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.3) -> tuple[Tensor, Tensor]:

@@ -50,7 +50,7 @@ def test_a_picture_shows_the_three_curves_of_a_channel():
         assert float(x.max()) == pytest.approx(24.0)  # three bandwidths of four scales of two
         torch.testing.assert_close(y, factor * of(x.unsqueeze(-1).expand(-1, 2))[:, 1].detach())
     for channel in (2, -1, True):
-        with pytest.raises(ValueError, match=rf"`channel` in \[0, 2\) but got {channel}; 0 is the first"):
+        with pytest.raises(ValueError, match=rf"`channel` in \[0, 2\).*got {channel}; 0 is the first"):
             LOSS.plot(channel)
 
 
@@ -64,7 +64,7 @@ def test_a_gaussian_is_drawn_undivided_on_given_axes():
 
 
 def test_errors_of_other_channels_are_refused():
-    with pytest.raises(ValueError, match=r"`error` with 2 channels in its last dimension but got \(3,\)"):
+    with pytest.raises(ValueError, match=r"`error`.*2 channels.*got \(3,\)"):
         LOSS.weight(torch.zeros(3))
     with pytest.raises(TypeError, match="`error` to be"):
         LOSS.rho([0.0, 1.0])
@@ -127,7 +127,7 @@ def test_curves_of_a_label_at_probability_0_and_1():
     assert loss.rho(ends).tolist() == [4.0, 0.0]
     assert loss.influence(ends).tolist() == [-math.inf, -1.0]
     assert loss.weight_at(ends).tolist() == [0.0, 1.0]
-    with pytest.raises(ValueError, match=r"`probability` to be .*\[0, 1\] but got 1\.5.*softmax"):
+    with pytest.raises(ValueError, match=r"`probability`.*\[0, 1\].*got 1\.5.*softmax"):
         loss.rho(torch.tensor([0.5, 1.5]))
     with pytest.raises(TypeError, match="`probability` to be"):
         loss.weight_at(0.5)

@@ -183,12 +183,10 @@ def test_weights_that_total_one_are_refused():
 
 def test_unmasked_residuals_that_are_not_finite_are_refused():
     for bad in (math.nan, math.inf):
-        with pytest.raises(
-            ValueError, match=r"`residual` to be finite but got 1 .* \(1,\)\. Leave them out by a weight"
-        ):
+        with pytest.raises(ValueError, match=r"`residual`.*finite.*got 1.*\(1,\)\. Leave them out by a weight"):
             entropy_like(torch.tensor([1.0, bad, 2.0]))
     for residual in ("a", [1.0, 2.0], np.ones(3)):
-        with pytest.raises(TypeError, match="`residual` to be a real tensor but got"):
+        with pytest.raises(TypeError, match=r"`residual`.*real tensor"):
             entropy_like(residual)
     assert float(entropy_like(torch.tensor([1, 1, 1]))) == pytest.approx(1.0)
 
@@ -251,12 +249,12 @@ def test_bad_arguments_of_the_loss_are_refused():
     with pytest.raises(ValueError, match="reduction"):
         LELoss(reduction="median")
     for dim in ("a", 1.5, (0, "a")):
-        with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
+        with pytest.raises(TypeError, match=r"`dim`.*dimension, several, or None"):
             LELoss(dim=dim)
-        with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
+        with pytest.raises(TypeError, match=r"`dim`.*dimension, several, or None"):
             entropy_like(x, dim)
     for dim in (7, (0, 0), (0, -1)):
-        with pytest.raises(ValueError, match=r"`dim` to be dimensions of the residuals \(3,\), each once, but got"):
+        with pytest.raises(ValueError, match=r"`dim`.*dimensions of the residuals \(3,\), each once"):
             LELoss(dim=dim)(x, 2 * x)
     masked = LELoss()(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, math.nan, 0.0]), torch.tensor([1.0, 0.0, 1.0]))
     assert bool(torch.isfinite(masked))

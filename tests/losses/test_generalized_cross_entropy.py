@@ -352,7 +352,7 @@ def test_sigma_out_of_range_is_refused_in_every_argument(sigma):
     with pytest.raises(ValueError, match=message):
         generalized_cross_entropy(logits, labels, sigma=sigma)
     for name in ("start", "end"):
-        with pytest.raises(ValueError, match=rf"`{name}` to be in \[0\.5, inf\] but got"):
+        with pytest.raises(ValueError, match=rf"`{name}`.*\[0\.5, inf\]"):
             graduated_sigma(0.5, **{name: sigma})
     assert loss.sigma.item() == pytest.approx(1.2)
 
@@ -361,13 +361,13 @@ def test_a_learned_sigma_and_a_sigma_per_class_are_refused():
     logits, labels, _ = data(5, 4)
     with pytest.raises(ValueError, match="`sigma` without a gradient"):
         generalized_cross_entropy(logits, labels, sigma=torch.tensor(1.2, requires_grad=True))
-    with pytest.raises(ValueError, match=r"`sigma` to be a single number but got shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"`sigma`.*single number.*got shape \(4,\)"):
         GeneralizedCrossEntropyLoss(torch.full((4,), 1.2))
 
 
 @pytest.mark.parametrize(("progress", "until"), [(-0.1, 0.5), (1.1, 0.5), (NAN, 0.5), (0.5, 0.0), (0.5, 1.5)])
 def test_progress_beyond_the_training_is_refused(progress, until):
-    with pytest.raises(ValueError, match=r"Expected argument `(progress` to be in \[0|until` to be in \(0), 1\]"):
+    with pytest.raises(ValueError, match=r"`(progress`.*\[0|until`.*\(0), 1\]"):
         graduated_sigma(progress, until=until)
 
 
@@ -387,7 +387,7 @@ def test_bad_class_weights_are_refused(weight, message):
 
 
 def test_another_reduction_is_refused():
-    with pytest.raises(ValueError, match="`reduction` to be 'none', 'mean' or 'sum' but got 'avg'"):
+    with pytest.raises(ValueError, match=r"`reduction`.*'none', 'mean' or 'sum'.*got 'avg'"):
         GeneralizedCrossEntropyLoss(reduction="avg")
 
 
@@ -468,13 +468,13 @@ def test_arguments_of_another_type_are_refused():
 
 def test_arguments_that_are_not_numbers_are_refused_by_name():
     logits, labels, _ = data(5, 4)
-    with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=r"`sigma`.*number.*got 'a'"):
         GeneralizedCrossEntropyLoss("a")
-    with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=r"`sigma`.*number.*got 'a'"):
         generalized_cross_entropy(logits, labels, sigma="a")
-    with pytest.raises(TypeError, match="`weight` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=r"`weight`.*number.*got 'a'"):
         GeneralizedCrossEntropyLoss(weight="a")
-    with pytest.raises(ValueError, match="`ignore_index` to be a whole number but got 'a'"):
+    with pytest.raises(ValueError, match=r"`ignore_index`.*whole number.*got 'a'"):
         GeneralizedCrossEntropyLoss(ignore_index="a")
     for options in ({"progress": "a"}, {"progress": 0.5, "start": "a"}, {"progress": 0.5, "until": None}):
         with pytest.raises(TypeError, match="to be a number in"):

@@ -145,9 +145,9 @@ def test_a_batch_that_overflows_throughout_does_not_change_the_running_scale(opt
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_an_infinite_prediction_of_another_dtype_is_refused(dtype):
-    with pytest.raises(ValueError, match="`input` to be finite"):
+    with pytest.raises(ValueError, match=r"`input`.*finite"):
         MKCLoss(1)(torch.full((3, 1), math.inf, dtype=dtype), torch.zeros(3, 1))
-    with pytest.raises(ValueError, match="`target` to be finite"):
+    with pytest.raises(ValueError, match=r"`target`.*finite"):
         MKCLoss(1)(torch.zeros(3, 1, dtype=torch.float16), torch.full((3, 1), math.inf))
 
 

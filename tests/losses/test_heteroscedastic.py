@@ -182,8 +182,8 @@ def test_gradcheck_in_input_target_sigma_and_d():
     leaves = [t.requires_grad_() for t in data(3, 2)]
     weight = torch.tensor([[1.0, 0.5], [0.0, 2.0], [1.5, 0.2]], dtype=torch.float64)
     for loss in (HeteroscedasticMKCLoss(30.0), HeteroscedasticMKCLoss(torch.tensor([9.0, 40.0]), reduction="none")):
-        assert gradcheck(lambda *t: loss(*t, weight), leaves, check_forward_ad=True)  # noqa: B023
-        assert gradgradcheck(lambda *t: loss(*t, weight), leaves)  # noqa: B023
+        assert gradcheck(lambda *t: loss(*t, weight), leaves, check_forward_ad=True)  # noqa: B023 - called in this round of the loop
+        assert gradgradcheck(lambda *t: loss(*t, weight), leaves)  # noqa: B023 - called in this round of the loop
 
 
 def test_vmap_of_the_loss_and_its_gradient_equals_a_loop():
@@ -297,9 +297,9 @@ def test_sigma_and_d_of_any_other_shape_are_refused(name, shape):
 def test_integers_and_numbers_are_refused(name):
     given = {k: torch.ones(4, 3) for k in ("input", "target", "sigma", "d")}
     loss = HeteroscedasticMKCLoss(30.0)
-    with pytest.raises(TypeError, match=f"`{name}` to be a real floating-point tensor but got torch.int64"):
+    with pytest.raises(TypeError, match=rf"`{name}`.*floating-point.*got torch.int64"):
         loss(**{**given, name: torch.ones(4, 3, dtype=torch.int64)})
-    with pytest.raises(TypeError, match=f"`{name}` to be a real floating-point tensor but got float; make"):
+    with pytest.raises(TypeError, match=rf"`{name}`.*floating-point.*got float; make"):
         loss(**{**given, name: 1.0})
 
 
@@ -337,9 +337,9 @@ def test_arguments_that_mkc_loss_refuses_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             loss(*arguments, scale, scale)
-    with pytest.raises(ValueError, match="Expected argument `weight` of shape"):
+    with pytest.raises(ValueError, match="`weight` of shape"):
         loss(x, x, scale, scale, torch.ones(3))
-    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite but got -1 at index"):
+    with pytest.raises(ValueError, match=r"`weight`.*>= 0 and finite.*got -1 at index"):
         loss(x, x, scale, scale, -torch.ones(4))
     assert bool(loss(bad, x, scale, scale, bad.isfinite()).isfinite())
 
@@ -350,7 +350,7 @@ def test_bad_bounds_and_reductions_are_refused(bound):
         HeteroscedasticMKCLoss(bound)
     with pytest.raises(ValueError, match="`channel_dim` to be"):
         HeteroscedasticMKCLoss(1.0, channel_dim="last")
-    with pytest.raises(TypeError, match="`bound` to be a number"):
+    with pytest.raises(TypeError, match=r"`bound`.*number"):
         HeteroscedasticMKCLoss("a")
     with pytest.raises(ValueError, match="`reduction` to be"):
         HeteroscedasticMKCLoss(1.0, reduction="average")
@@ -377,11 +377,11 @@ def test_bad_heads_are_refused_with_a_reason(options, message):
 
 
 def test_another_number_of_features_is_refused():
-    with pytest.raises(ValueError, match=r"`features` of shape \(\*, 5\) but got \(4, 3\)"):
+    with pytest.raises(ValueError, match=r"`features` of shape \(\*, 5\).*got \(4, 3\)"):
         MKCHead(5, 2, bound=50.0, d_min=1e-3)(torch.zeros(4, 3))
-    with pytest.raises(TypeError, match="`features` to be a real floating-point tensor but got ndarray"):
+    with pytest.raises(TypeError, match=r"`features`.*floating-point.*got ndarray"):
         MKCHead(5, 2, bound=50.0, d_min=1e-3)(torch.zeros(4, 5).numpy())
-    with pytest.raises(TypeError, match="`d_min` to be a number"):
+    with pytest.raises(TypeError, match=r"`d_min`.*number"):
         MKCHead(5, 2, bound=50.0, d_min="small")
 
 
@@ -400,5 +400,5 @@ def test_a_head_of_images_equals_the_head_at_every_place():
     target = torch.randn(3, 2, 4, 6)
     HeteroscedasticMKCLoss(50.0, channel_dim=1)(head(features).location, target, *head(features)[1:]).backward()
     assert head.scales.weight.grad.abs().sum() > 0
-    with pytest.raises(ValueError, match=r"`features` of shape \(N, 5, \.\.\.\) but got \(3, 4, 5\)"):
+    with pytest.raises(ValueError, match=r"`features` of shape \(N, 5, \.\.\.\).*got \(3, 4, 5\)"):
         head(torch.zeros(3, 4, 5))

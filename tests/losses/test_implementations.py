@@ -161,7 +161,7 @@ def test_impl_compile_equals_impl_eager(monkeypatch):
 
 
 def test_an_unknown_implementation_is_refused():
-    with pytest.raises(ValueError, match="`impl` to be one of 'auto', 'eager', 'compile', 'triton' but got 'cuda'"):
+    with pytest.raises(ValueError, match=r"`impl`.*'auto', 'eager', 'compile', 'triton'.*got 'cuda'"):
         MKCLoss(1, impl="cuda")
 
 

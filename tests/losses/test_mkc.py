@@ -411,18 +411,18 @@ def test_setters_keep_the_parameter_objects_of_an_optimiser():
 @pytest.mark.parametrize("value", [0.049, 0.0, -1.0, NAN])
 def test_sigma_setter_refuses_values_out_of_range(value):
     for loss in (made(), made(**FIXED)):
-        with pytest.raises(ValueError, match="Expected argument `sigma` in"):
+        with pytest.raises(ValueError, match="`sigma` in"):
             loss.sigma = value
-        with pytest.raises(ValueError, match=r"shape \(3,\) but got \(2,\)"):
+        with pytest.raises(ValueError, match=r"shape \(3,\).*got \(2,\)"):
             loss.sigma = torch.ones(2)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, NAN, INF])
 def test_d_setter_refuses_values_that_are_not_positive_and_finite(value):
     for loss in (made(), made(**FIXED)):
-        with pytest.raises(ValueError, match="`d` to be positive and finite"):
+        with pytest.raises(ValueError, match=r"`d`.*positive and finite"):
             loss.d = value
-        with pytest.raises(ValueError, match=r"shape \(3,\) but got \(2,\)"):
+        with pytest.raises(ValueError, match=r"shape \(3,\).*got \(2,\)"):
             loss.d = torch.ones(2)
 
 
@@ -595,7 +595,7 @@ def test_shapes_that_torch_would_broadcast_are_refused(shapes):
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 4), (2, 2, 1)])
 def test_a_wrong_number_of_channels_is_refused(shape):
-    with pytest.raises(ValueError, match="Expected 2 channels in dimension -1"):
+    with pytest.raises(ValueError, match="2 channels in dimension -1"):
         MKCLoss(2)(torch.zeros(shape), torch.zeros(shape))
 
 
@@ -610,21 +610,21 @@ def test_a_missing_channel_dimension_is_refused():
 @pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
 def test_integers_and_complex_numbers_are_refused(dtype):
     x = torch.zeros(4, 2)
-    with pytest.raises(TypeError, match="`target` to be a real floating-point tensor"):
+    with pytest.raises(TypeError, match=r"`target`.*floating-point"):
         MKCLoss(2)(x, x.to(dtype))
-    with pytest.raises(TypeError, match="`input` to be a real floating-point tensor"):
+    with pytest.raises(TypeError, match=r"`input`.*floating-point"):
         MKCLoss(2)(x.to(dtype), x)
 
 
 @each_reduction
 def test_an_empty_batch_is_refused(reduction):
-    with pytest.raises(ValueError, match="Expected at least one element"):
+    with pytest.raises(ValueError, match="at least one element"):
         MKCLoss(2, reduction=reduction)(torch.zeros(0, 2), torch.zeros(0, 2))
 
 
 @pytest.mark.parametrize("shape", [(2,), (3, 2), (4, 1, 1), (3,), ()])
 def test_weights_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\), .* or \(4,\) but got"):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\),.*or \(4,\)"):
         MKCLoss(2)(torch.zeros(4, 2), torch.zeros(4, 2), torch.ones(shape))
 
 
@@ -639,10 +639,10 @@ def test_weights_of_an_image_are_those_of_all_its_elements(shape):
 
 def test_ambiguous_channel_dimension_is_refused():
     x = torch.zeros(2, 3, 4, 5)
-    with pytest.raises(ValueError, match=r"3 channels in dimension -1 but got \(2, 3, 4, 5\); .*`channel_dim=1`"):
+    with pytest.raises(ValueError, match=r"3 channels in dimension -1.*got \(2, 3, 4, 5\);.*`channel_dim=1`"):
         MKCLoss(3)(x, x)
     square = torch.zeros(2, 3, 4, 3)
-    with pytest.raises(ValueError, match=r"`channel_dim` to be named for an input of shape \(2, 3, 4, 3\)"):
+    with pytest.raises(ValueError, match=r"`channel_dim`.*named for an input of shape \(2, 3, 4, 3\)"):
         MKCLoss(3)(square, square)
     for named in (1, -1):
         assert math.isfinite(MKCLoss(3, channel_dim=named)(square, square + 1.0).item())
@@ -738,7 +738,7 @@ def test_a_target_that_is_not_finite_is_refused_with_a_remedy(reduction, value):
     loss = MKCLoss(2, reduction=reduction)
     target = torch.zeros(3, 2)
     target[1, 0] = value
-    with pytest.raises(ValueError, match=r"`target` to be finite but got 1 values.*\(1, 0\).*isfinite\(target\)"):
+    with pytest.raises(ValueError, match=r"`target`.*finite.*got 1.*\(1, 0\).*isfinite\(target\)"):
         loss(torch.zeros(3, 2), target)
     masked = loss(torch.zeros(3, 2), target, weight=torch.isfinite(target))
     assert bool(torch.isfinite(masked).all())
@@ -783,16 +783,16 @@ def test_weights_that_are_negative_or_not_finite_are_refused(reduction, bad, sha
     loss, x = MKCLoss(2, reduction=reduction), torch.zeros(4, 2)
     weight = torch.ones(shape)
     weight[1] = bad
-    with pytest.raises(ValueError, match=rf"`weight` to be >= 0 and finite but got {bad:g} at index \(1"):
+    with pytest.raises(ValueError, match=rf"`weight`.*>= 0 and finite.*got {bad:g} at index \(1"):
         loss(x, x, weight)
 
 
 def test_weights_that_are_not_tensors_or_complex_are_refused():
     loss, x = MKCLoss(2), torch.zeros(4, 2)
     for weight in ([1.0] * 4, np.ones(4), 1.0):
-        with pytest.raises(TypeError, match=r"`weight` to be a tensor of weights or a boolean mask but got"):
+        with pytest.raises(TypeError, match=r"`weight`.*weights.*mask"):
             loss(x, x, weight)
-    with pytest.raises(TypeError, match=r"`weight` to be real"):
+    with pytest.raises(TypeError, match=r"`weight`.*real"):
         loss(x, x, torch.ones(4) + 0j)
 
 
@@ -813,7 +813,7 @@ def test_an_unmasked_prediction_that_is_not_finite_is_refused(reduction, bad, le
 
 def test_infinite_prediction_and_target_do_not_cancel():
     x = torch.full((2, 1), INF)
-    with pytest.raises(ValueError, match="`target` to be finite but got 2 values"):
+    with pytest.raises(ValueError, match=r"`target`.*finite.*got 2"):
         MKCLoss(1)(x, x)
 
 
@@ -845,15 +845,13 @@ def test_values_are_not_checked_in_a_compiled_loss():
 @pytest.mark.parametrize("value", [np.zeros((4, 2)), [[0.0, 0.0]] * 4, None, 3.0])
 def test_data_that_are_not_tensors_are_refused_by_name(name, value):
     arguments = {"input": torch.zeros(4, 2), "target": torch.zeros(4, 2), name: value}
-    with pytest.raises(
-        TypeError, match=f"`{name}` to be a real floating-point tensor but got {type(value).__name__}; "
-    ):
+    with pytest.raises(TypeError, match=rf"`{name}`.*floating-point.*got {type(value).__name__}; "):
         MKCLoss(2)(**arguments)
 
 
 def test_a_missing_channel_dimension_is_refused_with_a_remedy():
     flat, column = torch.zeros(1000), torch.zeros(1000, 1)
-    with pytest.raises(ValueError, match=r"Expected 1 channels .* got \(1000,\); .* unsqueeze\(-1\)"):
+    with pytest.raises(ValueError, match=r"1 channels.*got \(1000,\);.*unsqueeze\(-1\)"):
         MKCLoss(1)(flat, flat)
     with pytest.raises(ValueError, match=r"\(1000, 1\) and \(1000,\); unsqueeze\(-1\) the target"):
         MKCLoss(1)(column, flat)
@@ -864,17 +862,17 @@ def test_a_missing_channel_dimension_is_refused_with_a_remedy():
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
 def test_parameters_that_are_not_numbers_are_refused_by_name(name):
     for value in ("a", [[1.0], [1.0, 2.0]], 1j):
-        with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got"):
+        with pytest.raises(TypeError, match=rf"`{name}`.*number"):
             MKCLoss(2, **{name: value})
     loss = MKCLoss(2, d=1.0)
     if name in ("sigma", "d"):
-        with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+        with pytest.raises(TypeError, match=rf"`{name}`.*number.*got 'a'"):
             setattr(loss, name, "a")
 
 
 @pytest.mark.parametrize("value", ["last", 1.0, True])
 def test_a_channel_dim_that_is_not_an_integer_is_refused(value):
-    with pytest.raises(ValueError, match="`channel_dim` to be a whole number but got"):
+    with pytest.raises(ValueError, match=r"`channel_dim`.*whole number"):
         MKCLoss(2, channel_dim=value)
 
 

@@ -59,7 +59,7 @@ def test_the_objective_is_robust_if_d_is_auto():
     assert MKCLoss(1, objective="likelihood").objective == "likelihood"
     assert MKCLoss(1, objective="likelihood").residual_scale is not None
     assert MKCLoss(1, objective="likelihood").schedule is None
-    with pytest.raises(ValueError, match="`objective` to be 'robust', 'likelihood' or None but got 'median'"):
+    with pytest.raises(ValueError, match=r"`objective`.*'robust', 'likelihood' or None.*got 'median'"):
         MKCLoss(1, objective="median")
 
 
@@ -340,7 +340,7 @@ def test_freezing_the_scale_keeps_the_numbers_and_ends_the_robust_objective():
 
 
 def test_d_cannot_be_set_while_it_follows_the_residuals():
-    with pytest.raises(ValueError, match=r"`d` but got d=.* takes d from the residuals.*freeze_"):
+    with pytest.raises(ValueError, match=r"`d`.*got d=.*takes d from the residuals.*freeze_"):
         MKCLoss(1).d = 2.0
 
 
@@ -402,12 +402,12 @@ def test_with_a_frozen_scale_a_line_search_converges():
 @pytest.mark.parametrize(("options", "names"), [({}, True), (ROBUST["given d"], True), (LIKELIHOOD["given d"], False)])
 def test_a_prediction_that_is_not_finite_is_refused_with_a_remedy_for_line_searches(options, names):
     loss, x = MKCLoss(1, **options), torch.tensor([[math.nan], [0.0]])
-    with pytest.raises(ValueError, match="`input` to be finite but got 1 values") as refused:
+    with pytest.raises(ValueError, match=r"`input`.*finite.*got 1") as refused:
         loss(x, torch.zeros(2, 1))
     assert ("such as L-BFGS, needs loss.freeze_scale() first" in str(refused.value)) == names
     if names:
         loss.freeze_scale()
-        with pytest.raises(ValueError, match="`input` to be finite but got 1 values") as refused:
+        with pytest.raises(ValueError, match=r"`input`.*finite.*got 1") as refused:
             loss(x, torch.zeros(2, 1))
         assert "freeze_scale" not in str(refused.value)
 

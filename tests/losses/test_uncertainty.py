@@ -74,7 +74,7 @@ def test_a_nan_is_refused_as_by_the_loss():
     x, y = data(4, 3)
     y[2, 1] = NAN
     for function in (inlier_weight, outliers):
-        with pytest.raises(ValueError, match=r"without NaN but got 1, the first at index \(2, 1\).*torch\.where"):
+        with pytest.raises(ValueError, match=r"without NaN.*got 1, the first at index \(2, 1\).*torch\.where"):
             function(loss, x, y)
     assert not outliers(loss, x, torch.where(torch.isfinite(y), y, x))[2, 1]
 
@@ -103,7 +103,7 @@ def test_planted_outliers_are_found_and_few_others():
 
 @pytest.mark.parametrize("limit", [0.0, 1.0, -0.1, NAN])
 def test_a_limit_outside_0_and_1_is_refused(limit):
-    with pytest.raises(ValueError, match=r"`weight_below` to be in \(0, 1\) but got"):
+    with pytest.raises(ValueError, match=r"`weight_below`.*\(0, 1\)"):
         outliers(made(), *data(4, 3), weight_below=limit)
 
 
@@ -131,7 +131,7 @@ def test_weights_and_masks_change_the_share_and_exclude_masked_elements():
     assert found.count.tolist() == [1, 0]
     assert found.share[0] == 0.5
     assert found.share[1].isnan()
-    with pytest.raises(ValueError, match="`target` to be finite but got 2 values"):
+    with pytest.raises(ValueError, match=r"`target`.*finite.*got 2"):
         beyond_bound(loss, x, y)
 
 
@@ -212,7 +212,7 @@ def test_interval_of_the_smallest_sigma_in_float32_and_half_precision(dtype):
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 90, NAN])
 def test_a_level_that_is_not_a_probability_is_refused(level):
-    with pytest.raises(ValueError, match=r"`level` to be in \(0, 1\) but got"):
+    with pytest.raises(ValueError, match=r"`level`.*\(0, 1\)"):
         predictive_interval(made(), torch.zeros(4, 3), level)
 
 
@@ -221,13 +221,13 @@ def test_arguments_that_the_loss_refuses_are_refused(function):
     loss, x = made(), torch.zeros(4, 3)
     with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         function(loss, x, torch.zeros(4, 1))
-    with pytest.raises(ValueError, match="Expected 3 channels"):
+    with pytest.raises(ValueError, match="3 channels"):
         function(loss, x[:, :2], x[:, :2])
-    with pytest.raises(TypeError, match="`target` to be a real floating-point tensor"):
+    with pytest.raises(TypeError, match=r"`target`.*floating-point"):
         function(loss, x, x.long())
     with pytest.raises(ValueError, match="at least one element"):
         function(loss, x[:0], x[:0])
-    with pytest.raises(TypeError, match="`input` to be a real floating-point tensor but got ndarray"):
+    with pytest.raises(TypeError, match=r"`input`.*floating-point.*got ndarray"):
         function(loss, x.numpy(), x)
 
 
@@ -248,9 +248,7 @@ def test_another_loss_is_refused_and_a_compiled_loss_accepted(function):
         (MKCLoss, "the class MKCLoss"),
         ("mkc", "str"),
     ):
-        with pytest.raises(
-            TypeError, match=f"`loss` to be an MKCLoss but got {got}; pass the loss that is trained with"
-        ):
+        with pytest.raises(TypeError, match=rf"`loss`.*MKCLoss.*got {got}; pass the loss that is trained with"):
             function(other, x, x)
     loss = made()
     for found, expected in zip(fields(function, torch.compile(loss), x), fields(function, loss, x), strict=True):
@@ -262,15 +260,15 @@ def test_predictions_that_are_not_finite_are_refused():
     bad = x.clone()
     bad[2, 1] = NAN
     for call in (lambda: predictive_interval(loss, bad), lambda: beyond_bound(loss, bad, x)):
-        with pytest.raises(ValueError, match=r"`input` to be finite but got 1 values .* \(2, 1\)"):
+        with pytest.raises(ValueError, match=r"`input`.*finite.*got 1.*\(2, 1\)"):
             call()
-    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite but got -1"):
+    with pytest.raises(ValueError, match=r"`weight`.*>= 0 and finite.*got -1"):
         beyond_bound(loss, x, x, -torch.ones(4))
 
 
 def test_limits_that_are_not_numbers_are_refused():
     x = torch.zeros(4, 3)
-    with pytest.raises(TypeError, match=r"`weight_below` to be a number in \(0, 1\) but got 'a'"):
+    with pytest.raises(TypeError, match=r"`weight_below`.*\(0, 1\).*got 'a'"):
         outliers(made(), x, x, "a")
-    with pytest.raises(TypeError, match=r"`level` to be a number in \(0, 1\) but got None"):
+    with pytest.raises(TypeError, match=r"`level`.*\(0, 1\).*got None"):
         predictive_interval(made(), x, None)

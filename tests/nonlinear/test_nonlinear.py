@@ -15,11 +15,7 @@ from torch import Tensor
 from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.linear import MKCRegression
 from mkc_torch.nonlinear import GaussianPrior, fit, minimise
-
-
-def sample(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
+from tests.draws import normal as sample
 
 T = torch.linspace(0, 4, 120, dtype=torch.float64)
 TRUTH = torch.tensor([3.0, 0.7, 0.5], dtype=torch.float64)
@@ -255,7 +251,7 @@ class Once(torch.autograd.Function):
         return torch.exp(x)
 
     @staticmethod
-    def setup_context(ctx, inputs, output):  # noqa: ARG004
+    def setup_context(ctx, inputs, output):
         ctx.save_for_backward(output)
         ctx.save_for_forward(output)
 
@@ -614,12 +610,12 @@ def test_no_covariance_has_no_standard_error():
 def test_a_residual_that_is_not_finite_is_counted():
     y = noisy(0)
     y[3:6] = math.nan
-    with pytest.raises(ValueError, match="finite at `start` but got 3 of 120"):
+    with pytest.raises(ValueError, match=r"finite at `start`.*got 3 of 120"):
         minimise(residual_to(y), START)
 
 
 def test_derivatives_that_are_not_finite_are_named():
-    with pytest.raises(ValueError, match="finite derivatives at `start` but got"):
+    with pytest.raises(ValueError, match="finite derivatives at `start`"):
         minimise(lambda t: (T + t[0] + t[1].sqrt()).unsqueeze(-1), torch.tensor([1.0, 0.0]).double())
 
 
@@ -629,9 +625,9 @@ def test_a_step_into_nan_is_not_taken():
 
 
 def test_more_parameters_than_residuals_are_refused():
-    with pytest.raises(ValueError, match="at least as many residuals as parameters, 3, but got 2"):
+    with pytest.raises(ValueError, match=r"at least as many residuals as parameters, 3.*got 2"):
         minimise(lambda t: t[:2].unsqueeze(-1), START)
-    with pytest.raises(ValueError, match="parameters, 3, but got 1"):
+    with pytest.raises(ValueError, match=r"parameters, 3.*got 1"):
         minimise(lambda t: t.unsqueeze(-1), START, weight=torch.tensor([1.0, 0.0, 0.0]))
 
 
@@ -665,13 +661,13 @@ def test_bad_arguments_are_refused(arguments, message):
 
 @pytest.mark.parametrize("function", [minimise, fit])
 def test_bad_starts_and_residuals_are_refused(function):
-    with pytest.raises(TypeError, match="`start` to be a real floating-point tensor"):
+    with pytest.raises(TypeError, match=r"`start`.*floating-point"):
         function(residual_to(noisy(0)), torch.ones(3, dtype=torch.int64))
-    with pytest.raises(ValueError, match="`start` to be finite but got 1"):
+    with pytest.raises(ValueError, match=r"`start`.*finite.*got 1"):
         function(residual_to(noisy(0)), torch.tensor([1.0, math.nan, 1.0]).double())
-    with pytest.raises(ValueError, match=r"return a tensor \(N, m\) but got shape \(120,\)"):
+    with pytest.raises(ValueError, match=r"return a tensor \(N, m\).*got shape \(120,\)"):
         function(lambda t: residual_to(noisy(0))(t).squeeze(-1), START)
-    with pytest.raises(TypeError, match=r"dtype of `start`, torch.float32, but got torch.float64"):
+    with pytest.raises(TypeError, match=r"dtype of `start`, torch.float32.*got torch.float64"):
         function(residual_to(noisy(0)), START.float())
 
 
@@ -702,7 +698,7 @@ def test_arguments_of_another_kind_are_refused(function, arguments, message):
 
 def test_sigma_below_its_limit_is_refused_where_the_density_is_normalised():
     minimise(residual_to(noisy(0)), START, sigma=0.04)
-    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
+    with pytest.raises(ValueError, match=r"`sigma`.*\[0\.05, inf\].*got 0\.04"):
         fit(residual_to(noisy(0)), START, sigma=0.04)
 
 

@@ -88,7 +88,7 @@ def test_units_and_names_are_those_after_renaming():
     assert Recording(frame, units={"mx": "G"}, warnings=["w"]).warnings == ("w",)
     with pytest.raises(MissingColumnError, match="`--convert mx=G` names no column"):
         Recording.from_frame(frame, columns={"mag_x": "mx"}, units={"mx": "G"})
-    with pytest.raises(MissingColumnError, match="no column `my` to be `mag_y`; the frame has `mx`"):
+    with pytest.raises(MissingColumnError, match=r"no column `my`.*`mag_y`; the frame has `mx`"):
         Recording.from_frame(frame, columns={"mag_y": "my"})
 
 
@@ -144,7 +144,7 @@ def test_columns_without_numbers_are_rejected(values, message):
 
 
 def test_an_object_that_is_not_a_frame_is_rejected():
-    with pytest.raises(RecordingError, match="expected a DataFrame but got"):
+    with pytest.raises(RecordingError, match="expected a DataFrame"):
         Recording.from_frame({"a": [1.0]})
 
 

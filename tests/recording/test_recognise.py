@@ -335,3 +335,32 @@ def test_a_repeated_header_starts_a_run_without_a_time(tmp_path):
     assert recording["experiment"].tolist() == [1.0, 1.0, 2.0]
     assert "There is no time" in recording.notes[-1]
     assert "experiment" not in read(tmp_path, "mx,my,mz\n1.25,2.25,3.25\nmx,my,mz\nmx,my,mz\n3,4\n")
+
+
+def text_file(path, names):
+    rows = [",".join(f"{0.1 * i + j:.1f}" for j in range(len(names))) for i in range(20)]
+    path.write_text("\n".join([",".join(names), *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_unit_of_a_magnetic_field_shows_a_magnetometer_of_any_name(tmp_path):
+    path = text_file(tmp_path / "logger.csv", ["Zeit [s]", "Feld X [nT]", "Feld Y [nT]", "Feld Z [nT]"])
+    recording = Recording.read(path)
+    assert recording["mag_y"].tolist()[:2] == pytest.approx([2e-3, 2.1e-3])  # µT
+    assert recording.time is not None
+
+
+@pytest.mark.parametrize("names", [
+    ["Feld X [mG]", "Feld Y [mG]", "Feld Z [mG]"],  # also milli-g
+    ["offset X [nT]", "offset Y [nT]", "offset Z [nT]"],
+    ["in X [nT]", "in Y [nT]", "in Z [nT]", "out X [nT]", "out Y [nT]", "out Z [nT]"],
+])  # fmt: skip
+def test_an_ambiguous_unit_or_a_derived_value_shows_none(tmp_path, names):
+    path = text_file(tmp_path / "logger.csv", ["Zeit [s]", *names])
+    assert recognised(formats.read_topics(path), path.stem).sensors == ()
+
+
+@pytest.mark.parametrize(("name", "is_time"), [("t_s", True), ("t [ms]", True), ("t", False), ("T_s", False)])
+def test_a_column_t_with_a_unit_of_time_is_the_time(tmp_path, name, is_time):
+    path = text_file(tmp_path / "run.csv", [name, "force", "speed"])
+    assert (Recording.read(path, recognise=False).time is not None) == is_time

@@ -11,7 +11,6 @@ pytest.importorskip("jinja2")
 from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import prediction, remaining, residual_noise, timing
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import (
     CandidateScore,
     DensityCheck,
@@ -21,21 +20,16 @@ from mkc_torch.diagnosis.result import (
     Extrapolation,
     HeldOut,
     Region,
-    Row,
     Separability,
     SmoothCorrection,
     StateMap,
-    Table,
 )
-from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.effects import CATALOGUE
 from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
+from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section, Table
 from mkc_torch.report.diagnosis.page import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability, with_evidence
 from tests.report.test_calibration_report import parsed, text_of
-
-BY_LOAD = Term(CATALOGUE[0], Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",)), {})
 
 
 def page_of(findings=1, **options):
@@ -144,8 +138,10 @@ def test_findings_that_are_not_plausible_or_not_held_out_are_marked(three):
     assert "mainly from 12.1 to 18.4 s and from 60.0 to 71.5 s" in text_of(page_of(2, samples=4500))
 
 
-def test_names_and_texts_from_files_are_escaped_everywhere():
+def test_names_and_texts_from_files_are_escaped_everywhere(monkeypatch):
     bad = "<b>x</b> & $a$ \x1b[31m"
+    section = Section((Row(bad, bad),), Table(bad, (bad,), ((bad,),), bad))
+    monkeypatch.setitem(SECTIONS, "bad", lambda _: section)
     diagnosis = make_diagnosis(2, samples=300, channels=2)
     traces = dataclasses.replace(
         diagnosis.traces, channels=(bad, "_y"), unit=bad, drivers={bad: diagnosis.traces.time},
@@ -162,7 +158,7 @@ def test_names_and_texts_from_files_are_escaped_everywhere():
     (rival, *_) = first.alternatives
     hostile = first_changed(
         hostile, prediction.held_out_gain_result(None, bad),
-        EvidenceResult("bad", rows=(Row(bad, bad),), table=Table(bad, (bad,), ((bad,),), bad)),
+        EvidenceResult("bad", bad),
         drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, plausibility=bad,
         parameters=(dataclasses.replace(parameter, name=bad, unit=bad),),
         alternatives=(dataclasses.replace(rival, drivers=(bad,), separable=False),),
@@ -385,9 +381,7 @@ def test_the_noise_has_units_and_its_density_is_compared():
         DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
         DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
     ]
-    changed = with_evidence(
-        dataclasses.replace(made, noise=noise), residual_noise.as_result(checks, EvidenceSettings())
-    )
+    changed = with_evidence(dataclasses.replace(made, noise=noise), residual_noise.as_result(checks))
     text = text_of(diagnosis_report(changed))
     assert "Is the density right? channel distance of the density" in text
     assert "drift of the offset 0.379 µT, its standard deviation over the recording" in text
@@ -458,7 +452,7 @@ def test_extrapolation_of_a_finding_is_reported():
         (-0.02, (-0.12, 0.09), "it is not significant at high values: −0.020"),
         (-0.3, (-0.4, -0.2), "it degrades the prediction at high values: −0.300"),
     ):
-        result = prediction.extrapolation_result(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
+        result = prediction.extrapolation_result(Extrapolation(gain, interval))
         text = text_of(diagnosis_report(first_changed(diagnosis, result)))
         assert f"beyond its range fitted at low values of its driver, {label}" in text
 
@@ -467,7 +461,7 @@ def test_the_gain_of_shifted_copies_of_the_driver_is_reported():
     for as_good, text in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
             make_diagnosis(1, samples=240),
-            timing.driver_shift_result(DriverShift(38, as_good, 22.5), BY_LOAD, EvidenceSettings()),
+            timing.driver_shift_result(DriverShift(38, as_good, 22.5)),
             drivers=("load",),
         )
         verb = "gain" if as_good > 1 else "gains"
@@ -494,12 +488,13 @@ def test_the_region_of_the_states_and_the_share_of_each_run_are_shown():
     assert "Gain of finding 1 over the states" in page
 
 
-def test_rows_and_table_of_any_evidence_test_are_shown():
-    result = EvidenceResult(
-        "my_test",
+def test_rows_and_table_of_any_evidence_test_are_shown(monkeypatch):
+    section = Section(
         rows=(Row("residual", "correlated up to -0.4 s"), Row("in print", "more", in_terminal=False)),
         table=Table("By channel", ("channel", "lag"), (("norm", "0.4 s"),), "As far as -2 errors."),
     )
+    monkeypatch.setitem(SECTIONS, "my_test", lambda _: section)
+    result = EvidenceResult("my_test", 0.4)
     made = make_diagnosis(1, samples=240)
     for changed in (with_evidence(made, result), first_changed(made, result)):
         text = text_of(diagnosis_report(changed))

@@ -16,9 +16,9 @@ TIME = torch.linspace(0.0, 6.0, 121, dtype=torch.float64)
 
 class Pendulum(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": 4.0, "damping": 0.2}  # noqa: RUF012
+    parameters = {"stiffness": 4.0, "damping": 0.2}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
@@ -66,11 +66,11 @@ class RecordedStarts:
     def __init__(self):
         self.starts = []
 
-    def answer(self, theta, changes, near=None):  # noqa: ARG002
+    def answer(self, theta, changes, near=None):
         self.starts.append(near)
         return Answer(theta.unsqueeze(-1), Found(float(theta)))
 
-    def compiled(self, meaning, size):  # noqa: ARG002
+    def compiled(self, meaning, size):
         return None
 
 

@@ -54,6 +54,6 @@ def test_functions_of_math_and_numpy_are_answered_with_those_of_torch(tmp_path, 
     path = write(tmp_path, "Motor", function=function)
     time = torch.arange(60) / 20.0
     recording = Recording({"time": time, "speed": torch.exp(-time)})
-    with pytest.raises(Exception) as error:  # noqa: PT011
+    with pytest.raises(Exception) as error:  # noqa: PT011 - several types, compared below
         diagnose(load_simulation(path), recording, quick=True)
     assert "torch.sin" in str(raised_in(path, error.value))

@@ -28,19 +28,19 @@ class Mass(Dynamics):
 
     states = ("height", "speed")
     inputs = ("drive",)
-    parameters = {"damping": 0.3}  # noqa: RUF012
-    units = {"height": "m", "speed": "m/s", "drive": "m/s²"}  # noqa: RUF012
+    parameters = {"damping": 0.3}
+    units = {"height": "m", "speed": "m/s", "drive": "m/s²"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": u.drive - 4.0 * x.height - p.damping * x.speed}
 
 
 class Ball(Dynamics):
     states = ("x", "y", "vx", "vy")
-    parameters = {"drag": 0.05}  # noqa: RUF012
-    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+    parameters = {"drag": 0.05}
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"x": x.vx, "y": x.vy, "vx": -p.drag * x.vx, "vy": -9.81 - p.drag * x.vy}
 
 
@@ -325,10 +325,10 @@ def test_added_mass_is_not_identifiable_next_to_an_inertia():
     """An inertia of the simulation scales the whole rate: the tangent of the added mass is parallel to its tangent."""
 
     class Own(Mass):
-        parameters = {"inertia": 1.0}  # noqa: RUF012
+        parameters = {"inertia": 1.0}
         step = 0.02
 
-        def derivative(self, time, x, u, p):  # noqa: ARG002
+        def derivative(self, time, x, u, p):
             return {"height": x.speed, "speed": (u.drive - 4.0 * x.height - 0.3 * x.speed) / p.inertia}
 
     truth = runge_kutta(mass(), [0.5, 0.0], TIME)
@@ -370,9 +370,9 @@ class Idle(Dynamics):
     states = ("angle", "speed")
     inputs = ("torque",)
     outputs = ("angle",)
-    parameters = {"stiffness": 9.0}  # noqa: RUF012
+    parameters = {"stiffness": 9.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
 
 

@@ -106,12 +106,12 @@ def test_code_that_raises_while_it_simulates(tmp_path):
 
 class Wrong(Dynamics):
     states = ("level",)
-    parameters = {"rate": 0.5}  # noqa: RUF012
+    parameters = {"rate": 0.5}
 
     def __init__(self, value):
         self.value = value
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return self.value(x)
 
 

@@ -208,19 +208,19 @@ def test_tables_without_common_times_or_columns_are_refused():
         Paired(simulator()).prepare(Recording({"y": times()}))
     with pytest.raises(MissingColumnError, match="time"):
         Paired(Recording({"y": times()}))
-    with pytest.raises(ValueError, match="`rate` to be positive and finite but got 0"):
+    with pytest.raises(ValueError, match=r"`rate`.*positive and finite.*got 0"):
         Paired(simulator(), rate=0.0)
-    with pytest.raises(ValueError, match="`offset` to be positive and finite but got -1"):
+    with pytest.raises(ValueError, match=r"`offset`.*positive and finite.*got -1"):
         Paired(simulator(), offset=-1)
-    with pytest.raises(TypeError, match="`offset` to be a number positive and finite but got 'a'"):
+    with pytest.raises(TypeError, match=r"`offset`.*number positive and finite.*got 'a'"):
         Paired(simulator(), offset="a")
-    with pytest.raises(TypeError, match=r"`simulated` to be a Recording but got 'SIM\.csv'; read it, Recording\.read"):
+    with pytest.raises(TypeError, match=r"`simulated`.*Recording.*got 'SIM\.csv'; read it, Recording\.read"):
         Paired("SIM.csv")
-    with pytest.raises(TypeError, match=r"`recording` to be a Recording but got 'REC\.csv'; read it, Recording\.read"):
+    with pytest.raises(TypeError, match=r"`recording`.*Recording.*got 'REC\.csv'; read it, Recording\.read"):
         Paired(simulator()).prepare("REC.csv")
-    with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'y'; write \('y',\)"):
+    with pytest.raises(TypeError, match=r"`outputs`.*tuple of names of columns.*got 'y'; write \('y',\)"):
         Paired(simulator(), outputs="y")
-    with pytest.raises(ValueError, match="`outputs` to name a column but got none; None takes all in common"):
+    with pytest.raises(ValueError, match=r"`outputs` to name a column.*got none; None takes all in common"):
         Paired(simulator(), outputs=())
     with pytest.raises(SimulationError, match="run of one moment"):
         Paired(Recording({"time": torch.zeros(1), "y": torch.zeros(1)})).prepare(recorded(signal(times())))

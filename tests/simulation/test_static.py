@@ -13,10 +13,10 @@ from mkc_torch.simulation import Parameter, SimulationError, Static
 class Thermistor(Static):
     inputs = ("temperature",)
     outputs = ("voltage",)
-    parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}  # noqa: RUF012
-    units = {"voltage": "V"}  # noqa: RUF012
+    parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}
+    units = {"voltage": "V"}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"voltage": p.bottom + p.slope * u.temperature}
 
 
@@ -52,10 +52,10 @@ def test_the_driver_of_an_output_is_found(simulation):
 class Joint(Static):
     inputs = ("command",)
     outputs = ("angle",)
-    parameters = {"scale": 1.0}  # noqa: RUF012
-    units = {"command": "rad", "angle": "rad"}  # noqa: RUF012
+    parameters = {"scale": 1.0}
+    units = {"command": "rad", "angle": "rad"}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"angle": p.scale * u.command}
 
 
@@ -105,9 +105,9 @@ def test_parameters_that_the_data_cannot_determine_are_named():
     class Divider(Static):
         inputs = ("current",)
         outputs = ("voltage",)
-        parameters = {"upper": 2.0, "lower": 4.0, "unused": 1.0}  # noqa: RUF012
+        parameters = {"upper": 2.0, "lower": 4.0, "unused": 1.0}
 
-        def output(self, time, u, p):  # noqa: ARG002
+        def output(self, time, u, p):
             return {"voltage": p.upper / p.lower * u.current}
 
     warnings = " ".join(Divider().prepare(recording()).warnings)
@@ -122,7 +122,7 @@ class Odd(Thermistor):
         super().__init__()
         self.value = value
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return self.value(u)
 
 
@@ -173,17 +173,17 @@ def test_modules_that_cannot_be_used():
     ],
 )
 def test_other_objects_than_modules_are_refused(module, got):
-    with pytest.raises(TypeError, match=rf"`module` to be a torch\.nn\.Module but got {got}"):
+    with pytest.raises(TypeError, match=rf"`module`.*torch\.nn\.Module.*got {got}"):
         Static(module, inputs=("temperature",), outputs=("voltage",))
 
 
 def test_text_is_refused_as_a_sequence_of_names():
     line = torch.nn.Linear(1, 1)
-    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got 'ab'; write \('ab',\)"):
+    with pytest.raises(TypeError, match=r"`inputs`.*tuple of names of columns.*got 'ab'; write \('ab',\)"):
         Static(line, inputs="ab", outputs=("voltage",))
-    with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'voltage'; write"):
+    with pytest.raises(TypeError, match=r"`outputs`.*tuple of names of columns.*got 'voltage'; write"):
         Static(line, inputs=("temperature",), outputs="voltage")
-    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got \(3,\)"):
+    with pytest.raises(TypeError, match=r"`inputs`.*tuple of names of columns.*got \(3,\)"):
         Static(line, inputs=(3,), outputs=("voltage",))
 
     class Letters(Thermistor):
@@ -191,7 +191,7 @@ def test_text_is_refused_as_a_sequence_of_names():
 
     with pytest.raises(TypeError, match=r"but got 'temperature'; write \('temperature',\)"):
         Letters()
-    with pytest.raises(TypeError, match="`name` to be text but got 3"):
+    with pytest.raises(TypeError, match=r"`name`.*text.*got 3"):
         Static(line, inputs=("temperature",), outputs=("voltage",), name=3)
 
 
@@ -205,5 +205,5 @@ def test_text_is_refused_as_a_sequence_of_names():
     ],
 )
 def test_other_objects_than_recordings_are_refused_with_the_remedy(value, remedy):
-    with pytest.raises(TypeError, match=f"`recording` to be a Recording but got .*; {remedy}"):
+    with pytest.raises(TypeError, match=rf"`recording`.*Recording.*; {remedy}"):
         Thermistor().prepare(value)

@@ -92,7 +92,7 @@ def _lags(x: Array, u: Array, p: Array) -> Array:
     return np.array([p[k] * u[0] - p[k + len(x)] * x[k] for k in range(len(x))])
 
 
-def _puck(x: Array, u: Array, p: Array) -> Array:  # noqa: ARG001 - one signature for all
+def _puck(x: Array, u: Array, p: Array) -> Array:
     return np.array([x[2], x[3], -p[0] * x[2], -p[0] * x[3]])
 
 

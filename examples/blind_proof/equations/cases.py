@@ -64,7 +64,7 @@ def equations() -> Proof:
     return Proof("equations", (scenario,), 150, ratio=ratio_to_oracle)
 
 
-def draw(seed: int, index: int, hidden: bool = True, number: int = 0) -> Case:  # noqa: ARG001 - one signature for all
+def draw(seed: int, index: int, hidden: bool = True, number: int = 0) -> Case:
     """Draw the case at an address. The same address gives the same case.
 
     Args:

@@ -36,7 +36,7 @@ def forchheimer(head: Array, bend: float) -> Array:
 def exchange(first: int, second: int, flow: Callable[[Array], Array], ratio: float) -> RateChange:
     """A flow from the higher state to the lower, by their difference; the second changes by ``-ratio`` times it."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         away = x[second] - x[first]
         passed = size * np.sign(away) * flow(np.abs(away))
         rates = known.copy()
@@ -99,7 +99,7 @@ def radiation(row: int, room: float, slope: float) -> RateChange:
 def melting(row: int, place: float, width: float) -> RateChange:
     """Wax in the body that melts near a temperature: the heat capacity rises there by the size."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         rates = known.copy()
         rates[row] = known[row] / (1.0 + size * np.exp(-(((x[row] - place) / width) ** 2)))
         return rates, z
@@ -119,7 +119,7 @@ def second_store(row: int, flow: Callable[[Array], Array]) -> RateChange:
         (2011).
     """
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         away = x[row] - z[0]
         taken = np.sign(away) * flow(np.abs(away))
         rates = known.copy()
@@ -142,7 +142,7 @@ def second_mass(row: int, omega: float, damping: float, bend: float) -> RateChan
         Den Hartog, "Mechanical Vibrations" (1956), 3.2; Spong, "Modeling and control of elastic joint robots" (1987).
     """
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         stretched, pace = z[0], z[1] - x[row]
         pull = omega**2 * stretched * (1.0 + bend * stretched**2) + 2.0 * damping * omega * pace
         rates = known.copy()

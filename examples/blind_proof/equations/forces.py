@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from examples.blind_proof.equations.plant import Array, RateChange
 
+CONTACT_LOSS = 0.2
+"""Loss of energy of a bumper, s over the unit of the position."""
+
+Force = Callable[[Array, Array, Array], Sequence[Array]]
+"""Returns the change of the rate of each row, given states, own states and size."""
+
 
 def added(row: int, force: Callable[[Array, Array], Array]) -> RateChange:
-    """Returns a term that adds ``size · force(states, inputs)`` to the rate of one state."""
+    """Return a term that adds ``size · force(states, inputs)`` to the rate of one state."""
 
     def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         rates = known.copy()
         rates[row] += size * force(x, u)
         return rates, z
+
+    return change
+
+
+def acting(rows: Sequence[int], force: Force, own: Callable[[Array, Array], Array] = lambda _, z: z) -> RateChange:
+    """Return a term that adds a force to the rates of ``rows``.
+
+    Args:
+        rows: rows of the states.
+        force: the force.
+        own: rates of the term's own states, given states and own states.
+    """
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
+        rates = known.copy()
+        for row, part in zip(rows, force(x, z, size), strict=True):
+            rates[row] += part
+        return rates, own(x, z)
 
     return change
 
@@ -47,32 +71,26 @@ def sphere_drag(row: int, typical: float, reynolds: float) -> RateChange:
     return added(row, lambda x, _: -x[row] * drag_factor(np.abs(x[row]), typical, reynolds))
 
 
-def flight_drag(rows: tuple[int, int], typical: float, reynolds: float, wind: float = 0.0) -> RateChange:
-    """Drag on a flying body, along its velocity through air that moves along the first axis."""
+def flight_drag(rows: tuple[int, int], typical: float, reynolds: float) -> RateChange:
+    """Drag on a flying body, along its velocity."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        item, other = x[rows[0]] - wind, x[rows[1]]
-        factor = size * drag_factor(np.hypot(item, other), typical, reynolds)
-        rates = known.copy()
-        rates[rows[0]] -= factor * item
-        rates[rows[1]] -= factor * other
-        return rates, z
+    def force(x: Array, _: Array, size: Array) -> Sequence[Array]:
+        across, up = x[rows[0]], x[rows[1]]
+        factor = size * drag_factor(np.hypot(across, up), typical, reynolds)
+        return -factor * across, -factor * up
 
-    return change
+    return acting(rows, force)
 
 
 def creeping_drag(rows: tuple[int, int], typical: float) -> RateChange:
     """Oseen's drag of a small body in a viscous medium: Stokes' with a first correction for inertia."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        item, other = x[rows[0]], x[rows[1]]
-        factor = size * (1.0 + 3.0 / 16.0 * 0.5 * np.hypot(item, other) / typical)
-        rates = known.copy()
-        rates[rows[0]] -= factor * item
-        rates[rows[1]] -= factor * other
-        return rates, z
+    def force(x: Array, _: Array, size: Array) -> Sequence[Array]:
+        across, up = x[rows[0]], x[rows[1]]
+        factor = size * (1.0 + 3.0 / 16.0 * 0.5 * np.hypot(across, up) / typical)
+        return -factor * across, -factor * up
 
-    return change
+    return acting(rows, force)
 
 
 def hardening(row: int, position: int, reach: float) -> RateChange:
@@ -88,7 +106,7 @@ def felt(row: int, position: int, reach: float, power: float) -> RateChange:
     )
 
 
-def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss: float = 0.2) -> RateChange:
+def contact(row: int, position: int, place: float, ways: tuple[float, ...]) -> RateChange:
     """A bumper beyond a position, on the sides ``ways`` (1, -1): a Hertz contact with energy loss.
 
     References:
@@ -99,7 +117,7 @@ def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss
         total = np.zeros_like(x[row])
         for way in ways:
             depth = np.maximum(way * x[position] - place, 0.0)
-            total = total - way * depth**1.5 * np.maximum(1.0 + loss * way * x[row], 0.0)
+            total = total - way * depth**1.5 * np.maximum(1.0 + CONTACT_LOSS * way * x[row], 0.0)
         return total
 
     return added(row, force)
@@ -125,49 +143,36 @@ def wind(row: int, speed: float) -> RateChange:
 
 def warming_bias(row: int, constant: float, share: float) -> RateChange:
     """A bias of the actuator that decreases by a share while it warms up; one state of its own."""
-
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        rates = known.copy()
-        rates[row] += size * (1.0 - share * z[0])
-        return rates, (1.0 - z) / constant
-
-    return change
+    return acting([row], lambda _, z, size: [size * (1.0 - share * z[0])], lambda _, z: (1.0 - z) / constant)
 
 
 def hum(row: int, frequency: float) -> RateChange:
     """A vibrating machine nearby: an oscillator with its own frequency in Hz, two states of its own."""
     omega = 2.0 * np.pi * frequency
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        rates = known.copy()
-        rates[row] += size * (z[0] - 1.0)
-        return rates, np.stack([-omega * z[1], omega * (z[0] - 1.0)])
+    def own(_: Array, z: Array) -> Array:
+        return np.stack([-omega * z[1], omega * (z[0] - 1.0)])
 
-    return change
+    return acting([row], lambda _, z, size: [size * (z[0] - 1.0)], own)
 
 
 def lift(rows: tuple[int, int], constant: float) -> RateChange:
     """Magnus force on a spinning body, perpendicular to its velocity; the decaying spin is a state of its own."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        left = size * (1.0 - z[0])
-        rates = known.copy()
-        rates[rows[0]] -= left * x[rows[1]]
-        rates[rows[1]] += left * x[rows[0]]
-        return rates, (1.0 - z) / constant
+    def force(x: Array, z: Array, size: Array) -> Sequence[Array]:
+        spin = size * (1.0 - z[0])
+        return -spin * x[rows[1]], spin * x[rows[0]]
 
-    return change
+    return acting(rows, force, lambda _, z: (1.0 - z) / constant)
 
 
 def fading_drive(row: int, load: int, gain: float, constant: float) -> RateChange:
     """A motor torque that decreases while the windings heat up; one state of its own."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
-        rates = known.copy()
-        rates[row] -= gain * x[load] * size * z[0] / (1.0 + size * z[0])
-        return rates, (x[load] ** 2 - z) / constant
+    def force(x: Array, z: Array, size: Array) -> Sequence[Array]:
+        return [-gain * x[load] * size * z[0] / (1.0 + size * z[0])]
 
-    return change
+    return acting([row], force, lambda x, z: (x[load] ** 2 - z) / constant)
 
 
 def bristles(row: int, deflection: float, speed: float, rise: float = 0.0) -> RateChange:
@@ -184,7 +189,7 @@ def bristles(row: int, deflection: float, speed: float, rise: float = 0.0) -> Ra
         (1995); the exponential after Tustin (1947).
     """
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         v = x[row]
         level = 1.0 + rise * np.exp(-np.abs(v) / speed)
         inner = v - np.abs(v) * z[0] / (deflection * level)
@@ -205,7 +210,7 @@ def teeth(row: int, deflection: float, load: int, gain: float) -> RateChange:
         gain: gain of the load relative to the constant part.
     """
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         v = x[row]
         inner = v - np.abs(v) * z[0] / deflection
         rates = known.copy()
@@ -222,7 +227,7 @@ def rubber(row: int, yields: tuple[float, ...]) -> RateChange:
     """
     limit = np.array(yields)[:, None]
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
         v = x[row]
         inner = v * (1.0 - (z / limit) ** 2 * 0.5 * (1.0 + np.sign(v * z)))
         rates = known.copy()

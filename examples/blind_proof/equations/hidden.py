@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Concatenate, ParamSpec
 
 import numpy as np
 from torch import Generator
@@ -13,7 +14,9 @@ from examples.blind_proof.draws import choose, happens, log_uniform, uniform
 from examples.blind_proof.equations import flows, forces, transducers
 from examples.blind_proof.equations.forces import bristles, rubber
 from examples.blind_proof.equations.integrate import SystemScene
-from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, SignalChange
+from examples.blind_proof.equations.plant import Array, HiddenTerm, Setting, SignalChange, Trial
+
+P = ParamSpec("P")
 
 Draw = Callable[[Generator, SystemScene], HiddenTerm]
 
@@ -21,100 +24,91 @@ Exchange = Callable[[Generator, float], Callable[[Array], Array]]
 """Returns a function of differences ≥ 0 in the same unit, given a typical difference."""
 
 
+def drawn_for(term: Callable[Concatenate[Generator, SystemScene, P], HiddenTerm]) -> Callable[P, Draw]:
+    """Turn ``term(g, scene, *names)`` into a function that takes the names in a system and returns a draw."""
+
+    def named(*names: P.args, **more: P.kwargs) -> Draw:
+        return lambda g, scene: term(g, scene, *names, **more)
+
+    return named
+
+
 def rate_of(state: str) -> str:
     """Return the name of the port in a diagnosis."""
     return f"rate of {state}"
 
 
-def dry_friction(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = bristles(
-            scene.plant.row(speed), uniform(g, 0.008, 0.015) * scene.largest(position), scene.typical(speed)
-        )
-        return HiddenTerm(
-            "coulomb_friction", "LuGre without a rise", (rate_of(speed),), 0.5 * scene.pace(speed), form, own=1
-        )
-
-    return draw
+@drawn_for
+def dry_friction(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    form = bristles(scene.plant.row(speed), uniform(g, 0.008, 0.015) * scene.largest(position), scene.typical(speed))
+    return HiddenTerm(
+        "coulomb_friction", "LuGre without a rise", (rate_of(speed),), 0.5 * scene.pace(speed), form, own=1
+    )
 
 
-def sticking_friction(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = bristles(
-            scene.plant.row(speed),
-            uniform(g, 0.008, 0.015) * scene.largest(position),
-            uniform(g, 0.3, 0.8) * scene.typical(speed),
-            rise=uniform(g, 1.0, 2.5),
-        )
-        return HiddenTerm(
-            "stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), 0.4 * scene.pace(speed), form, own=1
-        )
-
-    return draw
+@drawn_for
+def sticking_friction(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    form = bristles(
+        scene.plant.row(speed),
+        uniform(g, 0.008, 0.015) * scene.largest(position),
+        uniform(g, 0.3, 0.8) * scene.typical(speed),
+        rise=uniform(g, 1.0, 2.5),
+    )
+    return HiddenTerm(
+        "stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), 0.4 * scene.pace(speed), form, own=1
+    )
 
 
-def blunt_drag(speed: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        typical = scene.typical(speed)
-        form = forces.sphere_drag(scene.plant.row(speed), typical, log_uniform(g, 500.0, 5e4))
-        large = 0.7 * scene.pace(speed) / typical
-        return HiddenTerm("quadratic_drag", "drag coefficient of Reynolds' number", (rate_of(speed),), large, form)
-
-    return draw
+@drawn_for
+def blunt_drag(g: Generator, scene: SystemScene, speed: str) -> HiddenTerm:
+    typical = scene.typical(speed)
+    form = forces.sphere_drag(scene.plant.row(speed), typical, log_uniform(g, 500.0, 5e4))
+    large = 0.7 * scene.pace(speed) / typical
+    return HiddenTerm("quadratic_drag", "drag coefficient of Reynolds' number", (rate_of(speed),), large, form)
 
 
-def hard_spring(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        reach = scene.largest(position)
-        form = forces.hardening(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.6, 1.2) * reach)
-        large = scene.pace(speed) / reach**3
-        return HiddenTerm("cubic_stiffness", "hyperbolic sine", (rate_of(speed),), large, form)
-
-    return draw
+@drawn_for
+def hard_spring(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    reach = scene.largest(position)
+    form = forces.hardening(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.6, 1.2) * reach)
+    large = scene.pace(speed) / reach**3
+    return HiddenTerm("cubic_stiffness", "hyperbolic sine", (rate_of(speed),), large, form)
 
 
-def bumper(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        x, reach = scene.state(position), scene.largest(position)
-        further = 1.0 if x.max() >= -x.min() else -1.0
-        ways = (1.0, -1.0) if happens(g, 0.5) else (further,)
-        form = forces.contact(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.55, 0.85) * reach, ways)
-        large = 20.0 * scene.pace(speed) / (0.2 * reach) ** 1.5
-        return HiddenTerm("hard_stop", "Hunt and Crossley's contact", (rate_of(speed),), large, form)
-
-    return draw
+@drawn_for
+def bumper(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    x, reach = scene.state(position), scene.largest(position)
+    further = 1.0 if x.max() >= -x.min() else -1.0
+    ways = (1.0, -1.0) if happens(g, 0.5) else (further,)
+    form = forces.contact(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.55, 0.85) * reach, ways)
+    large = 20.0 * scene.pace(speed) / (0.2 * reach) ** 1.5
+    return HiddenTerm("hard_stop", "Hunt and Crossley's contact", (rate_of(speed),), large, form)
 
 
-def magnets(speed: str, angle: str, orders: tuple[int, ...]) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = forces.cogging(
-            scene.plant.row(speed),
-            scene.plant.row(angle),
-            choose(g, orders),
-            uniform(g, 0.0, 2.0 * math.pi),
-            uniform(g, 0.1, 0.25),
-        )
-        return HiddenTerm(
-            "position_periodic_force", "cogging, second harmonic", (rate_of(speed),), 0.7 * scene.pace(speed), form
-        )
-
-    return draw
+@drawn_for
+def magnets(g: Generator, scene: SystemScene, speed: str, angle: str, orders: tuple[int, ...]) -> HiddenTerm:
+    form = forces.cogging(
+        scene.plant.row(speed),
+        scene.plant.row(angle),
+        choose(g, orders),
+        uniform(g, 0.0, 2.0 * math.pi),
+        uniform(g, 0.1, 0.25),
+    )
+    return HiddenTerm(
+        "position_periodic_force", "cogging, second harmonic", (rate_of(speed),), 0.7 * scene.pace(speed), form
+    )
 
 
-def steady_wind(speed: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = forces.wind(scene.plant.row(speed), uniform(g, 4.0, 10.0) * scene.largest(speed))
-        return HiddenTerm("constant_force", "steady wind", (rate_of(speed),), scene.pace(speed), form)
-
-    return draw
+@drawn_for
+def steady_wind(g: Generator, scene: SystemScene, speed: str) -> HiddenTerm:
+    form = forces.wind(scene.plant.row(speed), uniform(g, 4.0, 10.0) * scene.largest(speed))
+    return HiddenTerm("constant_force", "steady wind", (rate_of(speed),), scene.pace(speed), form)
 
 
-def warm_bias(speed: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = forces.warming_bias(scene.plant.row(speed), uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
-        return HiddenTerm("constant_force", "bias that warms up", (rate_of(speed),), scene.pace(speed), form, own=1)
-
-    return draw
+@drawn_for
+def warm_bias(g: Generator, scene: SystemScene, speed: str) -> HiddenTerm:
+    form = forces.warming_bias(scene.plant.row(speed), uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
+    return HiddenTerm("constant_force", "bias that warms up", (rate_of(speed),), scene.pace(speed), form, own=1)
 
 
 def _at_input(scene: SystemScene, name: str, effect: str, form: str, large: float, change: SignalChange) -> HiddenTerm:
@@ -123,79 +117,62 @@ def _at_input(scene: SystemScene, name: str, effect: str, form: str, large: floa
     return HiddenTerm(effect, form, (f"input {name}",), large, inputs=changed)
 
 
-def late_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        pipe = happens(g, 0.5)
-        change = transducers.transport if pipe else transducers.lags(4)
-        return _at_input(
-            scene, name, "input_delay", "transport" if pipe else "four lags in series", 0.05 * scene.length, change
-        )
-
-    return draw
+@drawn_for
+def late_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    pipe = happens(g, 0.5)
+    change = transducers.transport if pipe else transducers.lags(4)
+    return _at_input(
+        scene, name, "input_delay", "transport" if pipe else "four lags in series", 0.05 * scene.length, change
+    )
 
 
-def slow_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        return _at_input(
-            scene, name, "input_lag", "two lags, of which one is short", 0.05 * scene.length, transducers.follower
-        )
-
-    return draw
+@drawn_for
+def slow_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    return _at_input(
+        scene, name, "input_lag", "two lags, of which one is short", 0.05 * scene.length, transducers.follower
+    )
 
 
-def squared_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        change = transducers.squared(scene.largest_input(name), uniform(g, 1.8, 2.2))
-        return _at_input(scene, name, "input_square", "power near the square", 1.0, change)
-
-    return draw
+@drawn_for
+def squared_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    change = transducers.squared(scene.largest_input(name), uniform(g, 1.8, 2.2))
+    return _at_input(scene, name, "input_square", "power near the square", 1.0, change)
 
 
-def weak_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
-        return _at_input(scene, name, "input_saturation", "smooth limit", 2.5, change)
-
-    return draw
+@drawn_for
+def weak_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
+    return _at_input(scene, name, "input_saturation", "smooth limit", 2.5, change)
 
 
-def lapped_valve(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        change = transducers.soft_gap(scene.largest_input(name))
-        return _at_input(scene, name, "dead_zone", "smooth overlap", 0.4, change)
-
-    return draw
+@drawn_for
+def lapped_valve(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    change = transducers.soft_gap(scene.largest_input(name))
+    return _at_input(scene, name, "dead_zone", "smooth overlap", 0.4, change)
 
 
-def worn_drive(name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        change = transducers.worn_linkage(scene.largest_input(name))
-        return _at_input(scene, name, "backlash", "several gaps in series", 0.4, change)
-
-    return draw
+@drawn_for
+def worn_drive(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
+    change = transducers.worn_linkage(scene.largest_input(name))
+    return _at_input(scene, name, "backlash", "several gaps in series", 0.4, change)
 
 
-def bushing(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        reach = scene.largest(position)
-        form = rubber(scene.plant.row(speed), tuple(reach * uniform(g, 0.1, 0.5) for _ in range(3)))
-        large = 2.0 * scene.pace(speed) / reach
-        return HiddenTerm("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
-
-    return draw
+@drawn_for
+def bushing(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    reach = scene.largest(position)
+    form = rubber(scene.plant.row(speed), tuple(reach * uniform(g, 0.1, 0.5) for _ in range(3)))
+    large = 2.0 * scene.pace(speed) / reach
+    return HiddenTerm("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
 
 
-def felt_spring(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = forces.felt(
-            scene.plant.row(speed), scene.plant.row(position), scene.largest(position), uniform(g, 1.8, 2.4)
-        )
-        return HiddenTerm("power_law", "spring of felt", (rate_of(speed),), 2.0 * scene.pace(speed), form)
-
-    return draw
+@drawn_for
+def felt_spring(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
+    form = forces.felt(scene.plant.row(speed), scene.plant.row(position), scene.largest(position), uniform(g, 1.8, 2.4))
+    return HiddenTerm("power_law", "spring of felt", (rate_of(speed),), 2.0 * scene.pace(speed), form)
 
 
-def second_store(state: str, exchange: Exchange, name: str) -> Draw:
+@drawn_for
+def second_store(g: Generator, scene: SystemScene, state: str, exchange: Exchange, name: str) -> HiddenTerm:
     """Draw a second store that exchanges with a state, with delay.
 
     Args:
@@ -203,70 +180,56 @@ def second_store(state: str, exchange: Exchange, name: str) -> Draw:
         exchange: draws the flow between them, given a typical difference.
         name: name of the store.
     """
-
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        constant = log_uniform(g, 0.02, 0.1) * scene.length
-        row, x = scene.plant.row(state), scene.state(state)
-        away = x - transducers.lagged(x[None], scene.trial.step / scene.plant.fine, constant)[0]
-        head = exchange(g, float(np.abs(away).mean()))
-        form = flows.second_store(row, lambda there: head(there) / constant)
-        return HiddenTerm("hidden_lag", name, (rate_of(state),), 2.0, form, own=1, begin=flows.like(row))
-
-    return draw
+    constant = log_uniform(g, 0.02, 0.1) * scene.length
+    row, x = scene.plant.row(state), scene.state(state)
+    away = x - transducers.lagged(x[None], scene.trial.step / scene.plant.fine, constant)[0]
+    head = exchange(g, float(np.abs(away).mean()))
+    form = flows.second_store(row, lambda there: head(there) / constant)
+    return HiddenTerm("hidden_lag", name, (rate_of(state),), 2.0, form, own=1, begin=flows.like(row))
 
 
-def second_mass(speed: str, name: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        row = scene.plant.row(speed)
-        omega = 2.0 * math.pi / (log_uniform(g, 0.06, 0.25) * scene.length)
-        reach = scene.pace(speed) / omega**2
-        form = flows.second_mass(row, omega, log_uniform(g, 0.02, 0.1), uniform(g, 0.005, 0.02) / reach**2)
-        return HiddenTerm("hidden_mode", name, (rate_of(speed),), 2.0, form, own=2, begin=flows.unstretched(row))
-
-    return draw
+@drawn_for
+def second_mass(g: Generator, scene: SystemScene, speed: str, name: str) -> HiddenTerm:
+    row = scene.plant.row(speed)
+    omega = 2.0 * math.pi / (log_uniform(g, 0.06, 0.25) * scene.length)
+    reach = scene.pace(speed) / omega**2
+    form = flows.second_mass(row, omega, log_uniform(g, 0.02, 0.1), uniform(g, 0.005, 0.02) / reach**2)
+    return HiddenTerm("hidden_mode", name, (rate_of(speed),), 2.0, form, own=2, begin=flows.unstretched(row))
 
 
-def slow_sensor() -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        return HiddenTerm(
-            "sensor_lag",
-            "two lags in series",
-            scene.plant.outputs,
-            0.03 * scene.length,
-            outputs=transducers.housing,
-        )
-
-    return draw
+@drawn_for
+def slow_sensor(g: Generator, scene: SystemScene) -> HiddenTerm:
+    return HiddenTerm(
+        "sensor_lag",
+        "two lags in series",
+        scene.plant.outputs,
+        0.03 * scene.length,
+        outputs=transducers.housing,
+    )
 
 
-def full_vessel(level: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        top, power = scene.largest(level), choose(g, (1.5, 2.5))
-        form = flows.weir(scene.plant.row(level), uniform(g, 0.55, 0.85) * top, power)
-        large = 5.0 * scene.pace(level) / (0.2 * top) ** power
-        name = "rectangular weir" if power == 1.5 else "V-notch weir"
-        return HiddenTerm("overflow", name, (rate_of(level),), large, form)
-
-    return draw
+@drawn_for
+def full_vessel(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
+    top, power = scene.largest(level), choose(g, (1.5, 2.5))
+    form = flows.weir(scene.plant.row(level), uniform(g, 0.55, 0.85) * top, power)
+    large = 5.0 * scene.pace(level) / (0.2 * top) ** power
+    name = "rectangular weir" if power == 1.5 else "V-notch weir"
+    return HiddenTerm("overflow", name, (rate_of(level),), large, form)
 
 
-def gravel_leak(level: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        typical = scene.typical(level)
-        form = flows.seepage(scene.plant.row(level), uniform(g, 0.0, 0.3) / typical)
-        return HiddenTerm(
-            "linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), scene.pace(level) / typical, form
-        )
-
-    return draw
+@drawn_for
+def gravel_leak(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
+    typical = scene.typical(level)
+    form = flows.seepage(scene.plant.row(level), uniform(g, 0.0, 0.3) / typical)
+    return HiddenTerm(
+        "linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), scene.pace(level) / typical, form
+    )
 
 
-def machine_nearby(speed: str) -> Draw:
-    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = forces.hum(scene.plant.row(speed), uniform(g, 5.0, 30.0) / scene.length)
-        return HiddenTerm("vibration", "sinusoid of time", (rate_of(speed),), scene.pace(speed), form, own=2)
-
-    return draw
+@drawn_for
+def machine_nearby(g: Generator, scene: SystemScene, speed: str) -> HiddenTerm:
+    form = forces.hum(scene.plant.row(speed), uniform(g, 5.0, 30.0) / scene.length)
+    return HiddenTerm("vibration", "sinusoid of time", (rate_of(speed),), scene.pace(speed), form, own=2)
 
 
 @dataclass(frozen=True)
@@ -275,11 +238,11 @@ class System:
 
     Attributes:
         draw: draws the plant, its runs, and the runs of the second recording.
-        trial: draws runs of a plant, given their number and the samples of each.
+        trial: draws runs of the plant.
         inside, outside: effects of the catalogue, and others.
     """
 
     draw: Callable[[Generator], Setting]
-    trial: Callable[[Generator, Plant, int, int], RunSet]
+    trial: Trial
     inside: Sequence[Draw]
     outside: Sequence[Draw]

@@ -89,7 +89,7 @@ SignalChange = Callable[[Array, float, float], Array]
 """Returns changed signals (channels, times, R), given the signals, the time step in s, and a size."""
 
 
-def _unchanged(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+def _unchanged(values: Array, step: float, size: float) -> Array:
     return values
 
 
@@ -128,6 +128,16 @@ class Setting:
     plant: Plant
     trial: RunSet
     later: RunSet
+
+
+Trial = Callable[[Generator, Plant, int, int], RunSet]
+"""Draws runs of a plant, given their number and the samples of each."""
+
+
+def setting(g: Generator, plant: Plant, trial: Trial, *, most_runs: int, samples: int, later: int) -> Setting:
+    """Draw up to ``most_runs`` runs with ``samples`` samples in all, and a second recording of ``later`` samples."""
+    runs = whole(g, 1, most_runs)
+    return Setting(plant, trial(g, plant, runs, samples // runs), trial(g, plant, 1, later))
 
 
 def moments(step: float, samples: int) -> Array:

@@ -174,7 +174,7 @@ def draw(scenario: str, seed: int, index: int, hidden: bool, number: int) -> Cas
     return replace(case, key=replace(case.key, kind=kind, effects=(key_effect(effect, size, seen),)))
 
 
-def draw_useless(seed: int, index: int, hidden: bool, number: int) -> Case:  # noqa: ARG001 - nothing to hide
+def draw_useless(seed: int, index: int, hidden: bool, number: int) -> Case:
     """Draw a recording and an unusable simulation: a wrong sign, another system, or an unrelated output.
 
     Cases are drawn until the best of several fits explains at most ``MOST_EXPLAINED`` of every output's variation.

@@ -89,7 +89,7 @@ def play(values: Array, half: float) -> Array:
 def worn_linkage(largest: float) -> SignalChange:
     """A linkage of worn joints (Prandtl-Ishlinskii); the mean half gap is ``size`` times the largest signal."""
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         return np.mean([play(values, share * size * largest) for share in (0.5, 1.0, 1.5)], axis=0)
 
     return change
@@ -98,7 +98,7 @@ def worn_linkage(largest: float) -> SignalChange:
 def soft_limit(largest: float, sharpness: float) -> SignalChange:
     """An amplifier that saturates smoothly at ``largest / size``."""
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         ratio = np.abs(values) * size / largest
         return values / (1.0 + ratio**sharpness) ** (1.0 / sharpness)
 
@@ -108,7 +108,7 @@ def soft_limit(largest: float, sharpness: float) -> SignalChange:
 def soft_gap(largest: float) -> SignalChange:
     """A valve with overlap: commands below ``size`` of the largest have little effect; larger are reduced as much."""
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         width = max(size * largest, 1e-12)
         return values - width * np.tanh(values / width)
 
@@ -123,14 +123,14 @@ def follower(values: Array, step: float, size: float) -> Array:
 def squared(largest: float, power: float) -> SignalChange:
     """An actuator of which a share ``size`` follows about the square of its command; exact at the largest command."""
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         ratio = values / largest
         return values + size * (largest * np.sign(ratio) * np.abs(ratio) ** power - values)
 
     return change
 
 
-def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+def worn_gear(values: Array, step: float, size: float) -> Array:
     """A gear with unevenly worn teeth; the mean half gap is ``size``."""
     return np.mean([play(values, share * size) for share in (0.7, 1.0, 1.3)], axis=0)
 
@@ -138,7 +138,7 @@ def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
 def wrong_zero(share: float, phase: float) -> SignalChange:
     """A zero offset of ``size`` that varies by a share, three times a turn of an angle in rad."""
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         return values + size * (1.0 + share * np.sin(3.0 * values + phase))
 
     return change
@@ -151,7 +151,7 @@ def sagging(level: float) -> SignalChange:
         level: angle at which the link is horizontal; there it deflects by ``size``.
     """
 
-    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def change(values: Array, step: float, size: float) -> Array:
         angle = values
         for _ in range(30):
             angle = values + size * np.cos(angle - level)

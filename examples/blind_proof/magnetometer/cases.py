@@ -95,7 +95,7 @@ def magnetometer(duration: float = DURATION) -> Proof:
     )
 
 
-def _ratio(corrected: Mapping[str, Tensor], second: Recording, key: Key) -> float:  # noqa: ARG001 - one signature
+def _ratio(corrected: Mapping[str, Tensor], second: Recording, key: Key) -> float:
     return ratio_to_oracle(corrected, key)
 
 
@@ -103,7 +103,7 @@ def _stepwise(path: Path) -> Mapping[str, Any] | None:
     return stepwise_bic(Recording.read(path))
 
 
-def draw(duration: float, seed: int, index: int, hidden: bool = True, number: int = 0) -> Case:  # noqa: ARG001
+def draw(duration: float, seed: int, index: int, hidden: bool = True, number: int = 0) -> Case:
     """Draw the case at an address. The same address gives the same case.
 
     An empty case is drawn in the same way, with the same columns, and an effect of size 0.

@@ -105,7 +105,7 @@ def temperature_offset(g: Generator, scene: Scene) -> Hidden:
     return Hidden("temperature_offset", "lagged, slightly exponential", trace, 40.0, driver="temperature")
 
 
-def temperature_gain(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def temperature_gain(g: Generator, scene: Scene) -> Hidden:
     """A gain that follows the temperature of the die."""
     lag, _, center = _bend(g)
 

@@ -140,7 +140,7 @@ def draw(scenario: str, duration: float, seed: int, index: int, hidden: bool, nu
     return Case(recording_of(name, scene, contaminated, columns), key)
 
 
-def draw_useless(duration: float, seed: int, index: int, hidden: bool, number: int) -> Case:  # noqa: ARG001
+def draw_useless(duration: float, seed: int, index: int, hidden: bool, number: int) -> Case:
     """Draw a recording without a field, or with the gyroscope or attitude of another recording."""
 
     def stream(what: str) -> Generator:

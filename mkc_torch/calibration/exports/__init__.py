@@ -12,6 +12,7 @@ from mkc_torch.calibration.exports.base import (
     SensorCorrection,
 )
 from mkc_torch.calibration.exports.c_header import C_HEADER
+from mkc_torch.calibration.exports.imu_calib import IMU_CALIB
 from mkc_torch.calibration.exports.json import JSON
 from mkc_torch.calibration.exports.px4 import PX4
 from mkc_torch.calibration.exports.ros_yaml import ROS_YAML
@@ -26,5 +27,5 @@ __all__ = [
     "SensorCorrection",
 ]
 
-EXPORTS: dict[str, Export] = {export.name: export for export in (PX4, ARDUPILOT, C_HEADER, ROS_YAML, JSON)}
+EXPORTS: dict[str, Export] = {export.name: export for export in (PX4, ARDUPILOT, C_HEADER, ROS_YAML, IMU_CALIB, JSON)}
 """All exports by their name on the command line."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from mkc_torch.calibration.field_covariance import field_covariance
 from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.result import Calibration
 
@@ -47,6 +48,7 @@ class SensorCorrection:
         field_strength: length of the corrected field during the calibration, in ``field_unit``; None if unknown.
         current: the field of a current; None without a current.
         left_out: warnings about findings that the correction does not contain.
+        covariance: covariance of the corrected field of an undisturbed sample, in ``field_unit²``; None if unknown.
 
     Example:
         >>> from mkc_torch.calibration.calibrate import calibrate
@@ -64,12 +66,15 @@ class SensorCorrection:
     field_strength: float | None = None
     current: CurrentCoefficients | None = None
     left_out: tuple[str, ...] = ()
+    covariance: Matrix | None = None
 
     @staticmethod
     def of(calibration: Calibration) -> SensorCorrection:
         """The correction of a calibration."""
         c = calibration
-        return SensorCorrection(c.name, c.unit, c.center, c.matrix, c.field_unit, c.field_strength)
+        return SensorCorrection(
+            c.name, c.unit, c.center, c.matrix, c.field_unit, c.field_strength, covariance=field_covariance(c)
+        )
 
 
 class Destination(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 
 from mkc_torch.calibration.exports.base import ExportError
 
-__all__ = ["SMALLEST", "not_held", "one_line", "single", "symmetric"]
+__all__ = ["SMALLEST", "not_held", "one_line", "single", "symmetric", "yaml_double"]
 
 SMALLEST = float(np.finfo(np.float32).tiny)
 """Smallest normal number of 32 bits."""
@@ -94,3 +94,14 @@ def symmetric(matrix: np.ndarray, kind: str) -> tuple[np.ndarray, str | None]:
             "uses a symmetric matrix and a separate mounting of the sensor. Length and offset are unchanged."
         )
     return (right.T * sizes) @ right, warning
+
+
+def yaml_double(value: float) -> str:
+    """Format a number so that YAML 1.1 reads it as a number: with a decimal point before an exponent.
+
+    Example:
+        >>> yaml_double(1.25e-05), yaml_double(2e-14)
+        ('1.25e-05', '2.0e-14')
+    """
+    digits, power, exponent = repr(float(f"{value:.12g}")).partition("e")
+    return f"{digits if '.' in digits else digits + '.0'}{power}{exponent}"

@@ -9,7 +9,7 @@ import numpy as np
 from mkc_torch._support.unit_text import ratio
 from mkc_torch.calibration.exports.base import ExportError, SensorCorrection
 
-__all__ = ["Converted", "converted", "is_known"]
+__all__ = ["Converted", "converted", "is_known", "unit_ratio"]
 
 _SPELT = {
     "gauss": ("gs", "ga", "gauß"),
@@ -31,6 +31,7 @@ class Converted(NamedTuple):
         per_ampere: (3,), field of the current in the sensor's axes, in the unit per A; zero without a current.
         mean: mean of the current in A.
         strength: length of the field; None if unknown.
+        covariance: (3, 3), of the corrected field of an undisturbed sample, in unit²; None if unknown.
     """
 
     offset: np.ndarray
@@ -38,6 +39,7 @@ class Converted(NamedTuple):
     per_ampere: np.ndarray
     mean: float
     strength: float | None
+    covariance: np.ndarray | None
 
     @property
     def offset_without_current(self) -> np.ndarray:
@@ -61,7 +63,7 @@ def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
         >>> converted(SensorCorrection("a", "uT", (10.0, 0.0, -20.0), eye, "uT"), "gauss", "px4").offset
         array([ 0.1,  0. , -0.2])
     """
-    of_measured, of_field = (_ratio(name, unit) for name in (correction.unit, correction.field_unit))
+    of_measured, of_field = (unit_ratio(name, unit) for name in (correction.unit, correction.field_unit))
     if of_measured is None or of_field is None:
         found = correction.unit if of_measured is None else correction.field_unit
         raise ExportError(
@@ -76,6 +78,7 @@ def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
         per_ampere=np.zeros(3) if current is None else np.array(current.per_ampere) * of_measured,
         mean=0.0 if current is None else current.mean,
         strength=None if correction.field_strength is None else correction.field_strength * of_field,
+        covariance=None if correction.covariance is None else np.array(correction.covariance) * of_field**2,
     )
 
 
@@ -86,10 +89,10 @@ def is_known(unit: str) -> bool:
         >>> is_known("mG"), is_known("counts")
         (True, False)
     """
-    return _ratio(unit, "T") is not None
+    return unit_ratio(unit, "T") is not None
 
 
-def _ratio(unit: str, other: str) -> float | None:
+def unit_ratio(unit: str, other: str) -> float | None:
     """The ratio of a unit of the magnetic field to another unit; None if a unit is unknown."""
     plain = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     return ratio(_NAMES.get(plain.lower(), plain), other)

@@ -1,8 +1,9 @@
 """Tests of evidence for findings and of the residual, one subject per file.
 
-A new test is a function ``evidence(case) -> EvidenceResult`` and a line in :data:`TESTS`. Its result appears in the
-report, on the terminal and in ``diagnosis.json`` under ``evidence``, by its id. It does not change the verdict or the
-findings.
+A new test is a function ``evidence(case) -> EvidenceResult`` and a line in :data:`TESTS`. It returns data, which
+``diagnosis.json`` contains under ``evidence``, by the test's id. Its warnings are worded in
+:mod:`mkc_torch.diagnosis.findings.evidence_warnings`, its lines in the report and on the terminal in
+:mod:`mkc_torch.report.diagnosis.evidence`. It does not change the verdict or the findings.
 """
 
 from mkc_torch.diagnosis.evidence.base import EvidenceTest

@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, score
 from mkc_torch.diagnosis.goodness_of_fit import units_of
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term
 from mkc_torch.diagnosis.model.term import Driver, Term
-from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, Row, SmoothCorrection, Table
+from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, SmoothCorrection
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import Settings
@@ -21,7 +21,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["EvidenceContext", "EvidenceResult", "EvidenceTest", "Row", "SmoothCorrection", "Table", "gain_of"]
+__all__ = ["EvidenceContext", "EvidenceResult", "EvidenceTest", "SmoothCorrection", "gain_of"]
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,14 @@ def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[T
     return -mkc_nll(residual, sigma, d, bound).sum(-1)
 
 
+_DRAWS = 2000
+"""Draws of the block bootstrap."""
+
+
 def gain_interval(
     difference: Float[Tensor, " N"],
     block: Tensor,
     generator: torch.Generator,
-    draws: int = 2000,
     *,
     coverage: float = 0.95,
 ) -> tuple[float, tuple[float, float]]:
@@ -143,7 +146,7 @@ def gain_interval(
     count = int(block.max()) + 1
     total = difference.new_zeros(count).index_add(0, block, difference)
     size = difference.new_zeros(count).index_add(0, block, torch.ones_like(difference))
-    drawn = torch.randint(count, (draws, count), generator=generator)
+    drawn = torch.randint(count, (_DRAWS, count), generator=generator)
     means = total[drawn].sum(-1) / size[drawn].sum(-1)
     tail = 0.5 * (1.0 - coverage)
     low, high = torch.quantile(means, torch.tensor([tail, 1.0 - tail], dtype=means.dtype)).tolist()

@@ -12,13 +12,13 @@ from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out, on_all
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import has_process_noise, refit_open_loop
+from mkc_torch.diagnosis.model.process_noise import has_only_drift, has_process_noise, refit_open_loop
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["OpenLoop", "open_loop_evidence", "running_unjudged"]
+__all__ = ["OpenLoop", "open_loop_at", "open_loop_evidence", "running_unjudged"]
 
 
 _REACH = 3.0
@@ -54,7 +54,7 @@ def open_loop_evidence(
     if not any(has_process_noise(fit) for fit in (base, *(located.fit for located in found))) or alone is None:
         return unchanged
     works = [
-        partial(_released if _of_sensors(located.fit) else _refitted, located.fit, known, blocks, alone)
+        partial(_released if has_only_drift(located.fit) else _refitted, located.fit, known, blocks, alone)
         for located, known in zip(found, evidence[1:], strict=True)
     ]
     runs = run_parallel([partial(_judged, alone, evidence[0], blocks), *works], alone.model.prepared)
@@ -80,32 +80,19 @@ def running_unjudged(base: FittedModel, alone: FittedModel | None, found: tuple[
     return OpenLoop(fits[0], again, tuple(on_all(fit) for fit in fits))
 
 
-def _of_sensors(fit: FittedModel) -> bool:
-    """Whether a fit has drift but no process noise, so that its parameters are those of an open-loop fit."""
-    observer = fit.model.prepared.observer
-    return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
-
-
 _Run = tuple[FittedModel, Evidence]
 
 
-def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
-    """Simulate open loop with a fit's parameters, and on each fold with the parameters without it."""
+def open_loop_at(fit: FittedModel) -> FittedModel | None:
+    """Return the open-loop simulation at a fit's parameters, without a refit; None if it diverges."""
     model = JointModel(fit.model.prepared.open_loop(), fit.model.terms, fit.model.near)
     residual = model.residual(fit.parameters).detach()
     if not bool(residual.isfinite().all()):
-        return _refitted(fit, known, blocks, alone)
-    unseen = residual.clone()
-    for number, parameters in enumerate(known.parameters):
-        out = model.residual(parameters).detach()
-        seen = blocks.fold == number
-        unseen[seen] = out[seen]
-    if not bool(unseen.isfinite().all()):
-        return _refitted(fit, known, blocks, alone)
+        return None
     bound = fit.bound.maximum(_REACH * robust_scale(residual))
     density = fit_density(residual, bound=bound)
     sigma, d = density.sigma, density.d
-    free = replace(
+    return replace(
         fit,
         model=model,
         residual=residual,
@@ -115,7 +102,21 @@ def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: F
         bound=bound,
         log_likelihood=-float(mkc_nll(residual, sigma, d, bound).sum()),
     )
-    return free, replace(known, residual=unseen, sigma=sigma, d=d)
+
+
+def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
+    """Simulate open loop with a fit's parameters, and on each fold with the parameters without it."""
+    free = open_loop_at(fit)
+    if free is None:
+        return _refitted(fit, known, blocks, alone)
+    unseen = free.residual.clone()
+    for number, parameters in enumerate(known.parameters):
+        out = free.model.residual(parameters).detach()
+        seen = blocks.fold == number
+        unseen[seen] = out[seen]
+    if not bool(unseen.isfinite().all()):
+        return _refitted(fit, known, blocks, alone)
+    return free, replace(known, residual=unseen, sigma=free.sigma, d=free.d)
 
 
 def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:

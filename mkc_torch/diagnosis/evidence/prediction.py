@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval, held_out, scored
 from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -149,36 +148,12 @@ def extrapolation_of_finding(case: EvidenceContext) -> Extrapolation | None:
 
 
 def extrapolation_evidence(case: EvidenceContext) -> EvidenceResult:
-    """Score the finding at high values of its driver; warn if it makes the prediction clearly worse."""
-    return extrapolation_result(case.ahead, case.term, case.settings.evidence)
+    """Score the finding at high values of its driver."""
+    return extrapolation_result(case.ahead)
 
 
-def extrapolation_result(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
-    if extrapolation is None:
-        return EvidenceResult("extrapolation")
-    low, high = extrapolation.confidence_interval
-    verb = "improves the prediction" if low > 0.0 else "degrades the prediction" if high < 0.0 else "is not significant"
-    gain = _in_words(extrapolation)
-    row = Row("beyond its range", f"fitted at low values of its driver, it {verb} at high values: {gain}", False)
-    sentence = (
-        f"{term.effect.id} does not extrapolate: fitted to the {100.0 * settings.low_share:.0f} % of samples where "
-        f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
-        "beyond the range recorded."
-    )
-    return EvidenceResult("extrapolation", extrapolation, warnings=(sentence,) if high < 0.0 else (), rows=(row,))
-
-
-def _in_words(extrapolation: Extrapolation) -> str:
-    """Format the gain with its interval, to two digits of its standard error.
-
-    Example:
-        >>> _in_words(Extrapolation(-0.0212, (-0.12, 0.09)))
-        '-0.021 nats per sample (95 %: -0.120 to 0.090)'
-    """
-    low, high = extrapolation.confidence_interval
-    places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
-    gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
-    return f"{gain:+.{places}f} nats per sample (95 %: {low:.{places}f} to {high:.{places}f})"
+def extrapolation_result(extrapolation: Extrapolation | None) -> EvidenceResult:
+    return EvidenceResult("extrapolation", extrapolation)
 
 
 def extrapolated(

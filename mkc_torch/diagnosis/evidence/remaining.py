@@ -31,7 +31,6 @@ __all__ = [
     "nameless",
     "remaining",
     "remaining_evidence",
-    "remaining_warning",
     "within_reach",
 ]
 
@@ -297,15 +296,13 @@ def within_reach(case: EvidenceContext) -> tuple[Ceiling, tuple[str, ...]]:
 
 
 def remaining_evidence(case: EvidenceContext) -> EvidenceResult:
-    """Return the score of a smooth correction, and a warning with the columns of a smooth trend."""
+    """Return the score of a smooth correction, and the columns of a smooth trend."""
     reach, columns = case.ahead
     return as_result(SmoothCorrection(case.spread(reach.evidence), columns))
 
 
 def as_result(smooth: SmoothCorrection) -> EvidenceResult:
-    return EvidenceResult(
-        "remaining", smooth, keys={"ceiling": smooth.reached}, warnings=remaining_warning(smooth.columns)
-    )
+    return EvidenceResult("remaining", smooth, keys={"ceiling": smooth.reached})
 
 
 def nameless(fit: FittedModel) -> bool:
@@ -360,21 +357,3 @@ def remaining(
         return ()
     time = ceiling(fit.model, fit, (), blocks)
     return smooth.columns if gain(smooth.evidence, time.evidence, sure)[1] > 0.0 else ()
-
-
-def remaining_warning(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the warning of a smooth trend.
-
-    Example:
-        >>> remaining_warning(["temperature"])
-        ('The residual has a smooth trend along temperature that no effect of the catalogue explains: ...',)
-        >>> remaining_warning([])
-        ()
-    """
-    if not columns:
-        return ()
-    return (
-        f"The residual has a smooth trend along {', '.join(columns)} that no effect of the catalogue explains: a "
-        f"smooth "
-        "correction by recorded columns is clearly better on held-out blocks.",
-    )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.distribution import MKCDistribution
-from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row, Table
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.result import DensityCheck
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
@@ -24,7 +24,6 @@ __all__ = [
     "as_result",
     "density_checks",
     "density_evidence",
-    "density_warnings",
     "kolmogorov",
     "student_cdf",
     "student_fit",
@@ -41,29 +40,15 @@ _ROUNDS, _NODES = 30, 2001
 _AT_ONCE = 10_000
 """Batch size of the distribution function, which integrates over tens of nodes per sample."""
 
-_COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "critical distance", "")
-_DENSITY_NOTE = (
-    "Kolmogorov distance of the residuals from the fitted density, and from the most likely Student-t; 0 is a perfect "
-    "fit. The critical distance has level {chance:.1g}."
-)
-
 
 def density_evidence(case: EvidenceContext) -> EvidenceResult:
-    """Test the density of each channel; warn if a Student-t is clearly closer."""
+    """Test the density of each channel."""
     fit = case.final.fit
     channels, settings = case.prepared.channels, case.settings.evidence
-    return as_result(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
+    return as_result(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings))
 
 
-def as_result(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> EvidenceResult:
-    # the tail of Kolmogorov's distribution
-    chance = 2.0 * math.exp(-2.0 * settings.density_off**2)
-    table = Table(
-        "Is the density right?",
-        _COLUMNS,
-        tuple(_density_in_words(check) for check in checks),
-        _DENSITY_NOTE.format(chance=chance),
-    )
+def as_result(checks: Sequence[DensityCheck]) -> EvidenceResult:
     content = [
         {
             "channel": check.channel,
@@ -74,28 +59,7 @@ def as_result(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> Evi
         }
         for check in checks
     ]
-    return EvidenceResult(
-        "density",
-        tuple(checks),
-        keys={"noise": {"density_check": content}},
-        warnings=density_warnings(checks),
-        table=table,
-    )
-
-
-def _density_in_words(check: DensityCheck) -> tuple[str, ...]:
-    """Format the distances of a channel and their conclusion.
-
-    Example:
-        >>> _density_in_words(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
-        ('norm', '0.021', '0.034 (4 degrees of freedom)', '0.05', 'not significant')
-    """
-    verdict = "a Student-t is closer" if check.closer else "not significant"
-    if not check.closer and check.distance > check.allowed:
-        verdict = "significant, but a Student-t is not clearly better"
-    freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
-    student = f"{check.student_distance:.2g} ({freedom})"
-    return check.channel, f"{check.distance:.2g}", student, f"{check.allowed:.2g}", verdict
+    return EvidenceResult("density", tuple(checks), keys={"noise": {"density_check": content}})
 
 
 def density_checks(
@@ -133,6 +97,7 @@ def density_checks(
     # beyond the domain: the value at its edge
     likelihood = density.log_prob(torch.minimum(size, bound)).mean(0)
     found = []
+    level = 2.0 * math.exp(-2.0 * settings.density_off**2)  # tail of Kolmogorov's distribution
     for k, channel in enumerate(channels):
         distance = kolmogorov(uniform[:, k])
         allowed = settings.density_off / math.sqrt(effective_size(uniform[:, k]))
@@ -140,29 +105,8 @@ def density_checks(
         near = kolmogorov(student_cdf(size[:, k] / scale, freedom))
         close = near < min(settings.student_closer * distance, allowed)
         closer = distance > allowed and other > float(likelihood[k]) and close
-        found.append(DensityCheck(channel, distance, near, freedom, allowed, closer))
+        found.append(DensityCheck(channel, distance, near, freedom, allowed, closer, level))
     return tuple(found)
-
-
-def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
-    """Return a warning for channels whose residuals a Student-t describes clearly better than the density.
-
-    Outliers that neither describes cause no warning.
-
-    Example:
-        >>> density_warnings([DensityCheck("norm", 0.12, 0.01, 2.0, 0.05, True)])[0].partition(":")[0]
-        'The density does not describe the residuals of norm'
-    """
-    misfit = [check for check in checks if check.closer]
-    if not misfit:
-        return ()
-    worst = max(misfit, key=lambda check: check.distance)
-    return (
-        f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
-        f"Kolmogorov distance is {worst.distance:.2g}, that of a Student-t with {worst.degrees_of_freedom:g} degrees "
-        f"of "
-        f"freedom {worst.student_distance:.2g}. A misfit of the tail is not evidence of physics.",
-    )
 
 
 def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
@@ -224,25 +168,20 @@ _FIRST = 20
 _FARTHEST = 0.25
 """Largest lag that is tested on its own, as a share of the recording."""
 
-_TITLE = "Whiteness of the residual"
-_NOTE = (
-    "Autocorrelation of the final model's residual, without rejected samples: the last significant lag, the "
-    "correlation "
-    "of neighbours, and the p-value of the first {lags} lags together. The level is {level:.2g}."
-)
-
 
 @dataclass(frozen=True)
 class Whiteness:
     """Whiteness of a channel: the last significant lag in samples, 0 if white.
 
-    ``neighbours`` is the correlation at lag 1, ``p_value`` that of the first ``lags`` lags together.
+    ``neighbours`` is the correlation at lag 1, ``p_value`` that of the first ``lags`` lags together, ``level`` that of
+    the test.
     """
 
     lag: int
     neighbours: float
     p_value: float
     lags: int
+    level: float
 
 
 def whiteness_evidence(case: EvidenceContext) -> EvidenceResult:
@@ -257,51 +196,17 @@ def whiteness_evidence(case: EvidenceContext) -> EvidenceResult:
         for name, column, used in zip(case.prepared.channels, values.unbind(-1), counts.unbind(-1), strict=True)
     }
     content = [
-        {"channel": name, "white": found.lag == 0, **asdict(found), "lag": step * found.lag}
+        {
+            "channel": name,
+            "white": found.lag == 0,
+            "lag": step * found.lag,
+            "neighbours": found.neighbours,
+            "p_value": found.p_value,
+            "lags": found.lags,
+        }
         for name, found in channels.items()
     ]
-    rows = tuple(
-        (
-            name,
-            f"{step * found.lag:.3g} {unit}" if found.lag else "white",
-            f"{found.neighbours:.2f}",
-            f"{found.p_value:.2g}" if found.p_value >= 1e-4 else "< 0.0001",
-        )
-        for name, found in channels.items()
-    )
-    table = Table(
-        _TITLE,
-        ("channel", "correlated up to", "correlation of neighbours", "p-value"),
-        rows,
-        _NOTE.format(lags=next(iter(channels.values())).lags, level=settings.white_level),
-    )
-    return EvidenceResult(
-        "whiteness",
-        channels,
-        content={"unit": unit, "channels": content},
-        rows=(Row("residual", _in_words(channels, step, unit)),),
-        table=table,
-    )
-
-
-def _in_words(channels: Mapping[str, Whiteness], step: float, unit: str) -> str:
-    """Return the channel with the longest correlation, and the number of white channels.
-
-    Example:
-        >>> white, coloured = Whiteness(0, 0.01, 0.4, 20), Whiteness(20, 0.8, 0.0, 20)
-        >>> _in_words({"norm": white}, 0.02, "s"), _in_words({"norm": coloured}, 0.02, "s")
-        ('white', 'correlated up to 0.4 s')
-        >>> _in_words({"x": white, "y": coloured}, 1.0, "samples")
-        'y correlated up to 20 samples; 1 of 2 channels white'
-    """
-    name, longest = max(channels.items(), key=lambda item: item[1].lag)
-    if longest.lag == 0:
-        return "white"
-    reach = f"correlated up to {step * longest.lag:.3g} {unit}"
-    if len(channels) == 1:
-        return reach
-    white = sum(found.lag == 0 for found in channels.values())
-    return f"{name} {reach}; {white or 'none'} of {len(channels)} channels white"
+    return EvidenceResult("whiteness", channels, content={"unit": unit, "channels": content})
 
 
 def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings: EvidenceSettings) -> Whiteness:
@@ -331,7 +236,7 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings
     pairs = pairs.round().clamp(min=1.0)
     variance = products[0] / pairs[0]
     if float(variance) <= 0.0:
-        return Whiteness(0, 0.0, 1.0, min(_FIRST, farthest))
+        return Whiteness(0, 0.0, 1.0, min(_FIRST, farthest), settings.white_level)
     correlation = (products / pairs / variance)[1:]
     square = correlation.square()
     first = min(_FIRST, farthest)
@@ -343,7 +248,7 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings
     beyond = (size > most).nonzero().flatten().tolist()
     if not beyond and p_value <= 0.5 * settings.white_level:
         beyond = [int(size[:first].argmax())]
-    return Whiteness(beyond[-1] + 1 if beyond else 0, float(correlation[0]), p_value, first)
+    return Whiteness(beyond[-1] + 1 if beyond else 0, float(correlation[0]), p_value, first, settings.white_level)
 
 
 def _lagged_sums(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:

@@ -39,12 +39,28 @@ def _not_judged(_: EvidenceContext) -> EvidenceResult:
 
 @dataclass(frozen=True)
 class EvidenceReport:
-    """Results of the tests of the whole diagnosis and of each finding, and the context with the final parameters."""
+    """Results of the tests, and the context with the final parameters.
+
+    Attributes:
+        case: the context.
+        results: each result with the number of its finding, None for the whole diagnosis; in the order of the tests.
+    """
 
     case: EvidenceContext
-    of_all: tuple[EvidenceResult, ...]
-    of_findings: tuple[tuple[EvidenceResult, ...], ...]
-    warnings: tuple[str, ...]
+    results: tuple[tuple[int | None, EvidenceResult], ...]
+
+    @property
+    def of_all(self) -> tuple[EvidenceResult, ...]:
+        """Results for the whole diagnosis."""
+        return tuple(result for number, result in self.results if number is None)
+
+    @property
+    def of_findings(self) -> tuple[tuple[EvidenceResult, ...], ...]:
+        """Results for each finding."""
+        return tuple(
+            tuple(result for number, result in self.results if number == finding)
+            for finding in range(len(self.case.found))
+        )
 
 
 def precompute(case: EvidenceContext, tests: Sequence[EvidenceTest] = TESTS) -> list[Callable[[], Any]]:
@@ -66,16 +82,13 @@ def results_of_tests(
     *ahead, final = done
     case = replace(case, estimate=final)
     known = dict(zip(_long(case, tests), ahead, strict=True))
-    of_all: list[EvidenceResult] = []
-    of_findings: list[list[EvidenceResult]] = [[] for _ in case.found]
-    warnings: list[str] = []
+    results: list[tuple[int | None, EvidenceResult]] = []
     for test in tests:
         cases = _cases(test, case)
         for test_case, done_ahead in zip(cases, known.get(test, [None] * len(cases)), strict=True):
-            said = test.test(replace(test_case, ahead=done_ahead))
-            (of_findings[test_case.number] if test.each_finding else of_all).append(said)
-            warnings += said.warnings
-    return EvidenceReport(case, tuple(of_all), tuple(tuple(results) for results in of_findings), tuple(warnings))
+            result = test.test(replace(test_case, ahead=done_ahead))
+            results.append((test_case.number if test.each_finding else None, result))
+    return EvidenceReport(case, tuple(results))
 
 
 def _long(case: EvidenceContext, tests: Sequence[EvidenceTest]) -> list[EvidenceTest]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row, gain_of
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, gain_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
@@ -210,27 +210,14 @@ def driver_shift_of_finding(case: EvidenceContext) -> DriverShift | None:
 
 
 def driver_shift_evidence(case: EvidenceContext) -> EvidenceResult:
-    """Count the shifted copies of the finding's driver with at least its gain; warn if there are many."""
-    return driver_shift_result(case.ahead, case.term, case.settings.evidence)
+    """Count the shifted copies of the finding's driver with at least its gain."""
+    return driver_shift_result(case.ahead)
 
 
-def driver_shift_result(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
+def driver_shift_result(shift: DriverShift | None) -> EvidenceResult:
     if shift is None:
         return EvidenceResult("driver_shift")
-    some = {0: "none", 1: "one"}.get(shift.as_good, str(shift.as_good))
-    gain = "gain" if shift.as_good > 1 else "gains"
-    row = Row("driven by", f"{some} of {shift.copies} copies shifted by up to {shift.reach:.3g} s {gain} as much")
-    columns = ", ".join(term.columns)
-    sentence = (
-        f"{shift.as_good} of {shift.copies} copies of {columns}, shifted by up to {shift.reach:.3g} s, gain as much "
-        f"for {term.effect.id} as the column itself: its timing does not distinguish it from other quantities that "
-        f"change "
-        "as slowly."
-    )
-    many = shift.as_good > settings.shift_many * shift.copies
-    return EvidenceResult(
-        "driver_shift", shift, keys={"driver_shift": shift}, warnings=(sentence,) if many else (), rows=(row,)
-    )
+    return EvidenceResult("driver_shift", shift, keys={"driver_shift": shift})
 
 
 def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = [
+    "all_parameters",
     "ended_shapes",
     "far_from_plausible",
     "finding_of",
@@ -149,7 +150,6 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     cannot_be = far_from_plausible(term, gamma, context)
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
-    shape = _shape_parameters(term, context, final.shape_errors[number])
     of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
     approximations = formulas(curve) if of_motion_or_driver and curve is not None else ()
     event_times = term.effect.moments(context)
@@ -161,7 +161,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         onset=event_times[0] if event_times else term.shape.get("onset"),
         equation="; ".join([term.effect.equation_of(term.shape, context), *approximations]),
         explanation=term.effect.explained(gamma.tolist(), term.shape, context),
-        parameters=(*parameters_of(term, gamma, covariance, context), *shape),
+        parameters=all_parameters(final, number),
         p_value=None if quick else located.p_value,
         alternatives=_alternatives(located, term),
         plausible=plausible and not cannot_be,
@@ -206,6 +206,14 @@ def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:
 def _context(final: FinalEstimate, term: Term) -> Context:
     model = final.fit.model
     return term.context(model.prepared, model.signals(final.fit.parameters).get(term.port))
+
+
+def all_parameters(final: FinalEstimate, number: int) -> tuple[EffectParameter, ...]:
+    """Return the parameters of effect ``number`` of a final model: its amplitude and the reported shape numbers."""
+    term = final.fit.model.terms[number]
+    context = _context(final, term)
+    shape = _shape_parameters(term, context, final.shape_errors[number])
+    return (*parameters_of(term, *_own(final, number), context), *shape)
 
 
 def parameters_of(

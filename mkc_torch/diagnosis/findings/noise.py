@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import sized
+from mkc_torch._support.unit_text import sized, tidy
 from mkc_torch.density.tails import time_series_tails
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, Offset, ProcessNoise, Run
 from mkc_torch.diagnosis.goodness_of_fit import units_of
@@ -223,6 +223,47 @@ def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]
             sentences.append(
                 Offset(output, units[output], number + 1, name, value, math.nan if at is None else float(error[at]))
             )
+    return tuple(sentences)
+
+
+_SHARED_ERRORS = 3.0
+"""Standard errors that a shared offset has to exceed, and that each offset may differ from it."""
+
+_SHARED_SPREAD = 0.2
+"""Largest difference of an offset from the shared offset, relative to it, if its standard error is smaller."""
+
+
+def shared_offsets(offsets: Sequence[Offset]) -> tuple[str, ...]:
+    """Return a sentence for each output with the same offset in all recordings: it repeats, so the simulation lacks it.
+
+    Args:
+        offsets: of each output in each recording.
+
+    Example:
+        >>> each = [Offset("lift", "rad", k, name, 0.037, 0.001) for k, name in ((1, "a.csv"), (2, "b.csv"))]
+        >>> shared_offsets(each)[0].split(". ")[0]
+        'The offset of `lift` is the same in all recordings: 0.037 ± 0.00071 rad'
+        >>> shared_offsets([*each, Offset("lift", "rad", 3, "c.csv", 0.0, 0.001)])
+        ()
+    """
+    sentences = []
+    for output in dict.fromkeys(offset.output for offset in offsets):
+        known = [offset for offset in offsets if offset.output == output]
+        if len(known) < 2 or not all(0.0 < offset.standard_error < math.inf for offset in known):
+            continue
+        weight = [offset.standard_error**-2 for offset in known]
+        mean = sum(w * offset.value for w, offset in zip(weight, known, strict=True)) / sum(weight)
+        if any(
+            abs(offset.value) <= _SHARED_ERRORS * offset.standard_error
+            or abs(offset.value - mean) > max(_SHARED_ERRORS * offset.standard_error, _SHARED_SPREAD * abs(mean))
+            for offset in known
+        ):
+            continue
+        size = f"{mean:.2g} ± {sum(weight) ** -0.5:.2g} {tidy(known[0].unit)}".rstrip()
+        sentences.append(
+            f"The offset of `{output}` is the same in all recordings: {size}. Look for a cause that does not change, "
+            "such as a sensor's zero or a constant load, and add it to the simulation."
+        )
     return tuple(sentences)
 
 

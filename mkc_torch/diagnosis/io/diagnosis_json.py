@@ -14,6 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from mkc_torch.diagnosis.environment import DisturbanceEstimate, NoiseEnvironment, ProcessNoise, ShapeCheck
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts
 from mkc_torch.diagnosis.result import (
     Diagnosis,
     EffectParameter,
@@ -184,6 +185,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "level": d.level,
         "p_value": d.p_value,
         "verdict": d.verdict,
+        "doubts": diagnosis_doubts(d),
         "goodness_of_fit": goodness_of_fit_json(d.environment),
         "reasons": d.environment.reasons,
         **recordings_json(d.environment),
@@ -306,6 +308,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "separable": a.separable,
                 **({"port": a.port} if a.port else {}),
                 **({"distinguishing_state": a.distinguishing_state} if a.distinguishing_state else {}),
+                **({"parameters": [_parameter(p) for p in a.parameters]} if a.parameters else {}),
             }
             for a in f.alternatives
         ],

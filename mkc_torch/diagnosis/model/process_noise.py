@@ -103,6 +103,12 @@ def has_process_noise(fit: FittedModel) -> bool:
     return fit.model.prepared.observer is not None
 
 
+def has_only_drift(fit: FittedModel) -> bool:
+    """Whether a fit has drift but no process noise, so that its parameters are those of an open-loop fit."""
+    observer = fit.model.prepared.observer
+    return observer is not None and not any(disturbance.at_rate for disturbance in observer.disturbances)
+
+
 def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
     """Return the noise model of a fit; None for a simulation without states."""
     system = fit.model.prepared.dynamics

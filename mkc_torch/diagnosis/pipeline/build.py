@@ -12,10 +12,11 @@ import torch
 from mkc_torch._parallel.deadline import within
 from mkc_torch._support.note import notes_of, warnings_of
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
-from mkc_torch.diagnosis.evidence.rejected import called
 from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.alternatives import with_parameters
+from mkc_torch.diagnosis.findings.evidence_warnings import called, evidence_warnings
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
 from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
@@ -27,12 +28,13 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
 from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
+from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
+from mkc_torch.diagnosis.settings import EvidenceSettings, NamingSettings, NoiseSettings
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
@@ -251,7 +253,7 @@ def build_diagnosis(whole: DiagnosisInputs, answers: EvidenceReport) -> Diagnosi
             *prepared.warnings,
             *warnings_of(whole.drivers.warnings),
             *_time_warnings(prepared),
-            *answers.warnings,
+            *evidence_warnings(answers),
             *(_no_size(finding) for finding in without_size),
             *(doubt for finding in findings for doubt in finding.doubts),
         ),
@@ -282,15 +284,27 @@ def _finding(
     """Return a finding with its evidence, shape check and grade."""
     quick = whole.options.quick
     finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
+    finding = replace(finding, clearly_better=_clearly_better(answers.case.fits, number, whole.options.settings.naming))
     if whole.in_short:
         return replace(finding, grade=grade_in_short(finding))
+    others = with_parameters(finding.alternatives, found[number], final, number, whole.options.settings.noise)
     shape = None
     if whole.final.model.prepared.dynamics is not None:
         shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
     grade = grade_of(finding)
     if shape is not None and shape.curve is not None:
         grade = "nearest"
-    return replace(finding, grade=grade, shape=shape)
+    return replace(finding, grade=grade, shape=shape, alternatives=others)
+
+
+def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
+    """Whether the fit without the last finding is clearly less likely, with the residual's correlation."""
+    if number < len(fits) - 2:
+        return False
+    before, after = fits[number], fits[number + 1]
+    numbers = after.model.sizes[-1] + len(after.model.terms[-1].effect.fitted_shape)
+    price = 0.5 * numbers * math.log(len(after.residual)) + naming.separable
+    return agreed_innovation_gain(before.residual, after.residual) > price
 
 
 def _assessment(whole: DiagnosisInputs) -> FitAssessment:

@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, on_all
 from mkc_torch.diagnosis.evidence.open_loop import OpenLoop, open_loop_evidence, running_unjudged
 from mkc_torch.diagnosis.evidence.run import EvidenceReport, all_results, in_short, results_of_tests
-from mkc_torch.diagnosis.findings.noise import offsets_of, runs_of
+from mkc_torch.diagnosis.findings.noise import offsets_of, runs_of, shared_offsets
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, first_samples
 from mkc_torch.diagnosis.model.shapes import candidate_terms, within_a_sample
@@ -127,8 +127,12 @@ class PartialResult:
         result = with_search_notes(build_diagnosis(whole, answers), search)
         offsets = offsets_of(answers.case.final, self.recordings) if self.recordings else ()
         runs = runs_of(self.base.model.prepared, self.recordings, self.run_counts)
+        advice = result.advice if result.verdict == "unfit" else (*result.advice, *shared_offsets(offsets))
         return replace(
-            result, recordings=self.recordings, environment=replace(result.environment, offsets=offsets, runs=runs)
+            result,
+            advice=advice,
+            recordings=self.recordings,
+            environment=replace(result.environment, offsets=offsets, runs=runs),
         )
 
 

@@ -21,6 +21,8 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
+from mkc_torch.diagnosis.pipeline.special_case import with_special_case
+from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop
 from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
 from mkc_torch.diagnosis.search.ranking import alike
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
@@ -237,6 +239,9 @@ def _accept(
     over = replace(search, left=())
     if located.p_value > options.level or options.max_findings == 0:
         return over
+    if located.with_noise and after is None and options.judged and not options.quick:
+        scores = partial(_evidence, blocks=search.blocks, options=options)
+        located = with_special_case(located, scores, search.blocks, options.seed, options.settings.naming)
     before = search.evidence[-1]
     if after is None:
         after = _evidence(located.fit, search.blocks, options)
@@ -345,13 +350,17 @@ def _score(fit: FittedModel, settings: Settings) -> float:
 
 
 def _eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
-    """Remove findings that the other findings make needless, and refit the remaining model."""
+    """Remove findings that the other findings make needless, and refit the remaining model.
+
+    A finding that clearly improves the open loop stays, even if process noise with another finding replaces it one step
+    ahead.
+    """
     declared, settings = options.declared, options.settings
     while len(search.found) > 1:
         final = search.found[-1].fit
         number = needless_term(final, declared, settings)
         fit = None if number is None else without(final, number, declared, settings)
-        if number is None or fit is None:
+        if number is None or fit is None or improves_open_loop(final, fit):
             break
         kept = [finding for place, finding in enumerate(search.found) if place != number]
         fits = [fit]

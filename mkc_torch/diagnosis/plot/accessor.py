@@ -7,7 +7,6 @@ from typing import Any
 
 from mkc_torch._support.drawing import BLUE, GREY, ORANGE, array, axes_or_new
 from mkc_torch._support.unit_text import tidy
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import CandidateScore, Finding, Separability, Traces
@@ -93,7 +92,7 @@ class DiagnosisPlot:
         draw_residual(ax, t, array(t.time), which, unit_of_channel(t, self._environment, which), after=after)
         floor = [fit.noise_floor for fit in self._environment.goodness_of_fit if fit.output == t.channels[which]]
         draw_floor(ax, floor[0] if floor else None)
-        ax.set_title(of_channel(MOMENTS[after] if self._findings else "label.residual", t.channels[which]))
+        ax.set_title(of_channel(MOMENTS[after] if self._findings else "residual", t.channels[which]))
         ax.set_xlabel(of_time(t.has_time))
         return ax
 
@@ -147,7 +146,7 @@ class DiagnosisPlot:
             raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no curve.")
         ax = axes_or_new(ax)
         draw_curve(ax, found.curve, self._traces.has_time, most=2 * MOST_LETTERS)
-        ax.set_title(term("picture.curve_of", effect=capital(words_of(found.effect))))
+        ax.set_title(f"{capital(words_of(found.effect))}, 95 % band")
         if len(found.curve.channels) > 1:
             ax.legend(frameon=False)
         return ax
@@ -180,8 +179,8 @@ class DiagnosisPlot:
             ax.plot(held.confidence_interval, (row, row), color=BLUE, lw=2.2, solid_capstyle="butt")
             ax.plot(held.log_likelihood_gain, row, "o", color=BLUE, ms=6)
         _rows(ax, [_with_drivers(f.effect, f.drivers) for f, _ in known])
-        ax.set_xlabel(term("picture.gain"))
-        ax.set_title(term("picture.held_out"))
+        ax.set_xlabel("gain (nats per sample)")
+        ax.set_title("Gains on held-out blocks, 95 % interval")
         return ax
 
     def candidates(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
@@ -205,8 +204,8 @@ class DiagnosisPlot:
             color = ORANGE if (candidate.effect, candidate.drivers) in found else BLUE
             ax.barh(row, max(candidate.log_likelihood_gain, 0.0), color=color, height=0.66)
         _rows(ax, [_with_drivers(candidate.effect, candidate.drivers) for candidate in shown])
-        ax.set_xlabel(term("table.gain"))
-        ax.set_title(term("section.candidates"))
+        ax.set_xlabel("gain, nats")
+        ax.set_title("Candidates, best first")
         return ax
 
     def separability(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
@@ -230,8 +229,8 @@ class DiagnosisPlot:
         drawn = ax.imshow(share, cmap="cividis", vmin=0.0, vmax=1.0)
         ax.set_xticks(range(len(labels)), labels, rotation=45, ha="right", rotation_mode="anchor")
         ax.set_yticks(range(len(labels)), labels)
-        ax.figure.colorbar(drawn, ax=ax).ax.set_ylabel(term("picture.left"))
-        ax.set_title(term("section.separability"))
+        ax.figure.colorbar(drawn, ax=ax).ax.set_ylabel("remaining share")
+        ax.set_title("Separability of the candidates")
         return ax
 
     def forcing(self, index: int = 0, ax: Any = None) -> Any:
@@ -244,7 +243,7 @@ class DiagnosisPlot:
         _check_number("index", index, len(known), "disturbance was found")
         ax = axes_or_new(ax)
         draw_course(ax, known[index], self._traces.has_time)
-        ax.set_ylabel(named(term("picture.process_noise"), tidy(known[index].unit)))
+        ax.set_ylabel(named("disturbance", tidy(known[index].unit)))
         return ax
 
     def _finding(self, number: int) -> Finding:

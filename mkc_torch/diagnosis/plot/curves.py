@@ -9,7 +9,6 @@ import numpy as np
 
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, array
 from mkc_torch._support.unit_text import tidy
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, NoiseEnvironment
 from mkc_torch.diagnosis.parts import StateMap
@@ -49,8 +48,8 @@ def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) 
         ax.plot(x, value[:, i], color=color, lw=1.6, label=label)
     ax.margins(x=0.01)
     sampled = curve.driver == "time" and not has_time
-    ax.set_xlabel(term("unit.sample") if sampled else named(curve.driver, curve.unit, most))
-    ax.set_ylabel(named(term("finding.effect"), curve.value_unit))
+    ax.set_xlabel("sample" if sampled else named(curve.driver, curve.unit, most))
+    ax.set_ylabel(named("effect", curve.value_unit))
     ax.locator_params(axis="x", nbins=6)
     ax.locator_params(axis="y", nbins=5)
 
@@ -66,8 +65,8 @@ def draw_course(ax: Any, estimate: DisturbanceEstimate, has_time: bool) -> None:
     ax.set_xlabel(of_time(has_time))
     ax.set_ylabel(short(tidy(estimate.unit)))
     ax.locator_params(axis="y", nbins=5)
-    key = "picture.disturbance" if estimate.at_rate else "picture.drift"
-    ax.set_title(term(key, place=short(estimate.place)))
+    key = "Disturbance of the rate of {place}, 95 % band" if estimate.at_rate else "Drift of {place}, 95 % band"
+    ax.set_title(key.format(place=short(estimate.place)))
 
 
 def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -102,12 +101,12 @@ def draw_map(ax: Any, found: StateMap, units: Mapping[str, str], colorbar_axes: 
     drawn = ax.pcolormesh(x, y, shown.T, cmap=gain, vmin=-limit, vmax=limit, rasterized=True)
     for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
         axis.set_label_text(named(name, unit or units.get(name, "")))
-    ax.set_title(term("picture.map"))
+    ax.set_title("Gain over the states")
     bar = ax.figure.colorbar(drawn, cax=colorbar_axes, ax=None if colorbar_axes is not None else ax)
     bar.ax.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
     ticks = [tick for tick in bar.get_ticks() if bar.ax.get_ylim()[0] <= tick <= limit]
     bar.set_ticks(ticks, labels=[_gain(np.sign(tick) * tick**2) for tick in ticks])
-    bar.ax.set_ylabel(term("unit.nats"))
+    bar.ax.set_ylabel("nats")
 
 
 def _gain(nats: float) -> str:
@@ -122,7 +121,7 @@ def _gain(nats: float) -> str:
 
 def of_time(has_time: bool) -> str:
     """Return the label of a time axis."""
-    return term("picture.time" if has_time else "unit.sample")
+    return "time (s)" if has_time else "sample"
 
 
 def named(name: str, unit: str, most: int = MOST_LETTERS) -> str:

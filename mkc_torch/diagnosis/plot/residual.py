@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, SHADE, array
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import Finding, Traces
@@ -29,7 +28,7 @@ __all__ = [
     "unit_of_channel",
 ]
 
-MOMENTS = ("table.before", "table.after")
+MOMENTS = ("before", "after")
 _USED, _REJECTED = "#7FB8DA", "#F2C7AA"
 _MOST_POINTS = 5_000  # of a panel
 _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
@@ -73,7 +72,7 @@ def draw_residual(ax: Any, t: Traces, x: np.ndarray, channel: int, unit: str, *,
     ax.margins(x=0.01)
     ax.locator_params(axis="y", nbins=5)
     ax.locator_params(axis="x", nbins=6)
-    ax.set_ylabel(named(term("label.residual"), unit))
+    ax.set_ylabel(named("residual", unit))
 
 
 def _envelope(ax: Any, bins: _Bins, **style: Any) -> None:
@@ -151,7 +150,7 @@ def unit_of_channel(t: Traces, environment: NoiseEnvironment, channel: int) -> s
 
 
 def of_channel(key: str, channel: str) -> str:
-    return term("picture.of_channel", name=capital(term(key)), channel=short(channel))
+    return f"{capital(key)}, {short(channel)}"
 
 
 def acting_channels(t: Traces, finding: Finding) -> list[int]:

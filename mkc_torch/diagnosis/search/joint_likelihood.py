@@ -59,6 +59,13 @@ _USUAL = 0.9
 _FIRST_DRAWS = 19
 """Surrogates of the first round."""
 
+_FAR_BEHIND = 100.0
+"""Nats behind the most likely noise of the recording, without and with every candidate, beyond which a kind of noise is
+left out of the surrogates' search."""
+
+_HOPELESS = 30.0
+"""The same for the surrogates of the first round, and the recording, in the second round."""
+
 _ENOUGH = 6
 """Surrogates that reach the recording's gain from which no second round is drawn."""
 
@@ -340,10 +347,12 @@ def _surrogate_test(
     """
     gained = np.zeros((len(found.rank), 0))
     own = found.with_candidate[:, :, 0].max(0) - found.without[:, 0].max()
+    models = found.near_the_best(_FAR_BEHIND).models
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
             break
-        some = scene.likelihoods(found.models, _drawn(scene, found.models[kind], left, count, generator))
+        some = scene.likelihoods(models, _drawn(scene, found.models[kind], left, count, generator))
+        models = some.near_the_best(_HOPELESS).models
         drawn = some.with_candidate[:, :, 1:].max(0) - some.without[:, 1:].max(0)
         gained = np.concatenate([gained, drawn], 1)
         usual = np.quantile(gained, _USUAL, axis=1, keepdims=True)

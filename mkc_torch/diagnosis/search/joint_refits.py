@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_with_effect
+from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.linearise import linearise
 from mkc_torch.diagnosis.search.problem import LinearizedSearch, refined
@@ -73,6 +74,7 @@ def strongest(
         ]
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
+    fits = _with_fitted_shapes(fits, base)
     best_log_p = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in in_order((-best_log_p).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
@@ -166,6 +168,23 @@ def _refit_all(
         if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
             fits[term.key] = fit
     return done[len(works) :]
+
+
+def _with_fitted_shapes(fits: dict[Key, FittedModel], base: FittedModel) -> dict[Key, FittedModel]:
+    """Return the fits with their shape numbers fitted, for effects that act through a trajectory.
+
+    At the shapes of the grid a wide dead zone can be far less likely than a constant force, and the comparison would
+    depend on the grid.
+    """
+    known = base.model.prepared
+    places = [key for key, fit in fits.items() if known.ports[fit.model.terms[-1].port].clock is not None]
+    shaped = run_parallel(
+        [partial(shape_fitted, fits[key]) for key in places],
+        known,
+        [fits[key].model.terms[-1] for key in places],
+        "shape of a candidate",
+    )
+    return fits | dict(zip(places, shaped, strict=True))
 
 
 def _leading(

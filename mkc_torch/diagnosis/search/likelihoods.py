@@ -101,6 +101,25 @@ class LogLikelihoods:
             np.concatenate([self.scale, other.scale]),
         )
 
+    def near_the_best(self, within: float) -> LogLikelihoods:
+        """Keep the models within some nats of the most likely for a series, without or with a candidate."""
+        gap = np.minimum(_gap(self.without).min(1), _gap(self.with_candidate).min((1, 2), initial=np.inf))
+        kept = np.flatnonzero(gap <= within)
+        return LogLikelihoods(
+            tuple(self.models[number] for number in kept),
+            self.without[kept],
+            self.with_candidate[kept],
+            self.sizes[kept],
+            self.rank,
+            self.scale[kept],
+        )
+
+
+def _gap(values: Float[np.ndarray, "B *c Y"]) -> Float[np.ndarray, "B *c Y"]:
+    """Return by how much each model is less likely than the best; inf for an impossible model."""
+    best = values.max(0)
+    return np.where(np.isfinite(values), np.where(np.isfinite(best), best, 0.0) - values, np.inf)
+
 
 def log_likelihoods(
     flow: Flow,

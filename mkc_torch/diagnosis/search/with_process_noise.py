@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
+from mkc_torch.diagnosis.search.open_loop_gain import with_open_loop_gain
 from mkc_torch.diagnosis.search.own_noise import free_runs, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
 from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order
@@ -143,6 +144,9 @@ def search_with_process_noise(
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
         best, ranking = _by_free_run(best, ranking, fits, terms, settings)
+        if free is not None and not quick:
+            paying = [fit for fit in fits if _pays(base, fit, prefer, settings)]
+            best, ranking = with_open_loop_gain(best, ranking, paying, free, dict(runs), terms)
         best = refit_noise(best, noise_of_fit(best, declared), declared, settings.noise)
         best = best if quick else refit_input_hold(best, declared, fixed, settings.noise)
     bare = _without(base, best, declared, settings) if fits and has_process_noise(best) else None
@@ -325,6 +329,12 @@ def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn
     numbers = best.model.size - bare.model.size + len(best.model.terms[-1].effect.fitted_shape)
     penalty_per_number = 1.0 if drawn else 0.5 * math.log(len(best.residual))
     return priced(best, settings) - priced(bare, settings) < numbers * penalty_per_number
+
+
+def _pays(base: FittedModel, fit: FittedModel, prefer: ModelPrior, settings: Settings) -> bool:
+    """Whether a candidate under its own noise is more likely than the simulation alone by more than its penalties."""
+    noise = priced(fit, settings) - fit.log_likelihood - (priced(base, settings) - base.log_likelihood)
+    return prefer.score_with_shape(fit, base) + noise > 0.0
 
 
 def _by_free_run(

@@ -39,11 +39,11 @@ class AddedMass(RateEffect):
     advice = "Add the mass of the fluid that moves along, this share of the total mass."
     source = "Lamb, Hydrodynamics (1932), art. 92; Brennen, A Review of Added Mass and Fluid Inertial Forces (1982)"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, ""),)
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -context.part("rate")
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         return (f"-{gamma[0]!r} * {names['rate']}",)

@@ -44,7 +44,7 @@ class Backlash(ShareEffect):
     advice = "Put play of this width behind the input, or preload the gears."
     source = "Visintin, Differential Models of Hysteresis (1994), III.2; Nordin & Gutman, Automatica 38 (2002)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"half_gap": gap} for gap in GAPS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

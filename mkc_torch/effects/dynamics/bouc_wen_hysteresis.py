@@ -53,10 +53,10 @@ class BoucWenHysteresis(RateEffect):
     advice = "Add a hysteretic spring that yields at this deflection."
     source = "Wen (1976); Ismail, Ikhouane & Rodellar, The Hysteresis Bouc-Wen Model, a Survey (2009)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"yield_deflection": share} for share in YIELDS)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, quotient(context.signal_unit, context.unit_of("position")) or "1/s²"),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

@@ -43,7 +43,7 @@ class Buoyancy(RateEffect):
     advice = "Add the weight of the displaced fluid."
     source = "Archimedes' principle; Newman, Marine Hydrodynamics (1977)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"surface": surface, "draught": draught} for surface, draught in DIPS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -45,7 +45,7 @@ class CoulombFriction(RateEffect):
         width = sized(float(shape["width"]), context.unit_of("own"))
         return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"width": width} for width in WIDTHS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -42,14 +42,14 @@ class Coupling(RateEffect):
     def simpler(self) -> Effect:
         return EqualCoupling()
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 2, "1/s"),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:
         away = context.part("other") - context.part("own")
         return torch.stack([gamma[0] * away, -gamma[-1] * away], -1)
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         away = f"({names['other']} - {names['own']})"
         return f"{gamma[0]!r} * {away}", f"-{gamma[-1]!r} * {away}"
 
@@ -57,5 +57,5 @@ class Coupling(RateEffect):
 class EqualCoupling(Coupling):
     """Exchange between equal states: what the first loses, the second gains."""
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, "1/s"),)

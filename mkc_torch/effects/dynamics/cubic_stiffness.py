@@ -36,8 +36,8 @@ class CubicStiffness(RateEffect):
     advice = "Add a cubic spring with this coefficient."
     source = "Duffing's oscillator"
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -context.part("position").pow(3)
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         return (f"-({gamma[0]!r}) * {names['position']} ** 3",)

@@ -40,7 +40,7 @@ class DeadZone(ShareEffect):
     advice = "Subtract this amount from the size of every command."
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"width": width, "softness": CORNER} for width in WIDTHS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

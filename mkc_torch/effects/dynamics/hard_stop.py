@@ -45,10 +45,10 @@ class HardStop(RateEffect):
     advice = "Add a stop at this position."
     source = "penalty contact; Gilardi & Sharf (2002)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"place": place, "exponent": 1.0} for place in PLACES)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("upper_stiffness", 1, self.unit(context)), Quantity("lower_stiffness", 1, self.unit(context)))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:

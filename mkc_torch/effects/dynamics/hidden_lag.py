@@ -87,7 +87,7 @@ class HiddenLag(RateEffect):
         length = float(time.max() - time.min())
         return tuple({"time_constant": share * length} for share in SHARES)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

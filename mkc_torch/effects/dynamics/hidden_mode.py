@@ -129,7 +129,7 @@ class HiddenMode(RateEffect):
         ratio = (LONGEST * length / max(shortest, _MIN_DIVISOR)) ** (1.0 / (PERIODS - 1))
         return tuple({"period": shortest * ratio**k, "damping": DAMPING} for k in range(PERIODS))
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:

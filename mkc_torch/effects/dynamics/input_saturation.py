@@ -32,7 +32,7 @@ class InputSaturation(Saturation):
     explanation = "The actuator saturates: beyond its limit a larger command has no more effect."
     advice = "Limit the input to this size."
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"limit": limit, "softness": CORNER} for limit in self.limits)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

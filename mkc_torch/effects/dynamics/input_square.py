@@ -49,7 +49,7 @@ class InputSquare(ShareEffect):
     def equation_of(self, shape: Shape, context: Context) -> str:
         return f"{self.equation},  c = {sized(float(shape[_SCALE]), context.unit_of('own'))}, the largest input"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return ({_SCALE: 1.0},)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -69,7 +69,7 @@ class LinearDrag(RateEffect):
             self.advice = "Add a loss to the surroundings with this coefficient."
             self.by_kind = {}
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return (dict.fromkeys(self.form_parameters, 1.0),)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -45,10 +45,10 @@ class LoadDependentFriction(RateEffect):
         width = sized(float(shape["width"]), context.unit_of("own"))
         return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"width": width} for width in WIDTHS)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("friction", 1, context.signal_unit), Quantity("share_of_load", 1, ""))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:

@@ -44,16 +44,16 @@ class MagnusLift(RateEffect):
     advice = "Add a force across the path with this coefficient, and record the spin."
     source = "Mehta, Aerodynamics of Sports Balls, Annual Review of Fluid Mechanics 17 (1985)"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         mean = Quantity(self.gain, 1, "1/s")
         if not context.units:
             return (mean,)
         unit = context.units[0]
         return mean, Quantity(f"{self.gain}_per_spin", 1, per("1/s", f"({unit})" if "/" in unit else unit))
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:
         turning = gamma[0] + gamma[1] * context.drivers[:, 0] if context.units else gamma[0]
         return torch.stack([-turning * context.part("other"), turning * context.part("own")], -1)
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         return f"-({gamma[0]!r}) * {names['other']}", f"{gamma[0]!r} * {names['own']}"

@@ -41,7 +41,7 @@ class Overflow(RateEffect):
     advice = "Add a loss above this level."
     source = "flow over weirs; Henderson, Open Channel Flow (1966)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"rim": rim, "exponent": 1.0} for rim in RIMS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

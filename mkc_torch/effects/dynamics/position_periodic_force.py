@@ -42,16 +42,16 @@ class PositionPeriodicForce(RateEffect):
     form_parameters = ("order",)
     source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         return f"{self.equation},  k = {sized(shape['order'])}, periods in a turn"
 
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         return "sin(k x)", "cos(k x)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"order": float(order)} for order in ORDERS)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 2, self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:

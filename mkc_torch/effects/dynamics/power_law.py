@@ -125,7 +125,7 @@ class PowerLaw(RateEffect):
             return f" The excess is counted from {lowest}, the lowest of the recording."
         return f" It is counted from {context.parts[SURROUNDINGS]}." if self.of == "difference" else ""
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({**dict.fromkeys(self.relative, 1.0), "exponent": exponent} for exponent in EXPONENTS)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

@@ -51,9 +51,9 @@ class QuadraticDrag(RateEffect):
     }
     source = "Rayleigh's drag equation"
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return -own * own.abs()
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         return (f"-{gamma[0]!r} * {names['own']} * {names['own']}.abs()",)

@@ -50,7 +50,7 @@ class RateEffect(GainEffect):
         input_ = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""
         return f"{self.equation}{input_}"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, self.unit(context)),)
 
 

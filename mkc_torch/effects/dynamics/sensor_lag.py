@@ -64,5 +64,5 @@ class SensorLag(ShareEffect):
 class AlikeSensorLag(SensorLag):
     """A lag of identical sensors: one share for all outputs."""
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, ""),)

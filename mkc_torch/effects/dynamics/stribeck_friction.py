@@ -47,10 +47,10 @@ class StribeckFriction(RateEffect):
         width = sized(float(shape["width"]), context.unit_of("own"))
         return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"width": width, "stribeck_speed": speed} for width in (0.1, 0.03) for speed in SPEEDS)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("friction", 1, context.signal_unit), Quantity("rise_at_rest", 1, context.signal_unit))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:

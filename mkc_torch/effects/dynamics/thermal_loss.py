@@ -48,10 +48,10 @@ class ThermalLoss(RateEffect):
             self.excludes = ()
             self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return (dict.fromkeys(self.form_parameters, 1.0),)
 
-    def unit(self, context: Context) -> str:  # noqa: ARG002
+    def unit(self, context: Context) -> str:
         return "1/s"
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

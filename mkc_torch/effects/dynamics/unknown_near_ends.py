@@ -59,10 +59,10 @@ class UnknownNearEnds(UnknownRate):
         ends = [sized(float(shape[name]), context.unit_of(self.plot_axis)) for name in self.form_parameters]
         return f"{self.equation} over {' to '.join(ends)}, with breaks near the ends"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return ({self._lowest: 1.0, self._highest: 1.0},)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, NUMBERS + 1))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:

@@ -62,10 +62,10 @@ class UnknownRate(RateEffect):
         series = f"f(x) = Σ γ_j P_j({argument} / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
         return f"{self.equation},  {series}{input_}"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return ({self._reach: 1.0},)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, DEGREE + 1))
 
     def over(self, context: Context) -> Float[Tensor, " N"]:

@@ -38,10 +38,10 @@ class ClockDrift(Effect):
     recurrence = "the error of drifting clocks grows with the length of a recording"
     source = "Mills, RFC 5905 (2010)"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("rate", 1, ""),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         since = _since_middle(context.time, context.runs)
         later = gamma[0] * since
         columns = [shifted(output, context.time, later, context.runs) - output for output in context.signal.unbind(-1)]

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
-from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 from mkc_torch.effects.paired.between import shifted
 
 if TYPE_CHECKING:
@@ -39,10 +38,10 @@ class Delay(Effect):
     recurrence = "a delay does not grow with the length of a recording"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("delay", 1, "s"),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         pairs = zip(context.signal.unbind(-1), gamma.expand(context.signal.shape[-1]).unbind(), strict=True)
         columns = [shifted(own, context.time, -delay.expand(len(own)), context.runs) - own for own, delay in pairs]
         return torch.stack(columns, -1)
@@ -65,7 +64,7 @@ class SeveralDelays(Delay):
     def simpler(self) -> Effect:
         return CommonDelay()
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("delay", len(context.channels), "s"),)
 
 

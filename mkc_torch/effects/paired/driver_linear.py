@@ -41,7 +41,7 @@ class DriverLinear(GainEffect):
     source = "linear response, first order in the driver"
     degree = 1
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         slopes = (
             Quantity("per_unit", 1, self.unit(context)),
             Quantity("per_square", 1, quotient(context.signal_unit, context.units[0], 2)),
@@ -49,7 +49,7 @@ class DriverLinear(GainEffect):
         zero = (Quantity("at_mean", 1, context.signal_unit),) if "fixed zero" in context.parts else ()
         return slopes[: self.degree] + zero
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
         x = context.drivers[:, 0]
         columns = [x.pow(k) for k in range(1, self.degree + 1)]
         if "fixed zero" in context.parts:

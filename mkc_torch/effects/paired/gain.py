@@ -37,8 +37,8 @@ class Gain(GainEffect):
     recurrence = "a scale error grows with the signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity(self.gain, 1, ""),)
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return context.part("own")

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
-from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,12 +24,12 @@ class GravitySag(Effect):
     """A joint sags under its load: most where the link is level, not at all where it hangs.
 
     A servo without integral action holds a load with a static error: the load's torque over its stiffness. Over a small
-    range of angles a sag is indistinguishable from an offset, which is preferred.
+    range of angles a sag is indistinguishable from an offset, and the offset is preferred.
 
     Simulation: adds ``γ cos(y − φ)`` to an output y that is an angle.
     Drivers: the output only.
-    Units: γ in the output's unit; the angle ``phase``, φ, at which the link is level, in rad, within 1 rad of zero:
-        farther away a sag would be equivalent to a scale error.
+    Units: γ in the output's unit; φ, the parameter ``phase``, is the angle at which the link is level, within
+        ±1 rad; beyond, a sag would be equivalent to a scale error.
     Plausible: up to 0.5 rad.
     Source: static error of a proportional joint controller under gravity; Spong, Hutchinson & Vidyasagar, "Robot
         Modeling and Control" (2006), 8.1.
@@ -52,10 +51,10 @@ class GravitySag(Effect):
     recurrence = "a sag changes over a wide range of angles and with the load, an offset does not"
     source = "Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), 8.1"
 
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"phase": phase} for phase in (0.0, -0.7, 0.7))
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("sag", len(context.channels), context.signal_unit),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
@@ -64,7 +63,7 @@ class GravitySag(Effect):
 
 
 class SeveralSag(GravitySag):
-    """A sag of all joints, one for each; they are level at the same angle.
+    """A sag of each joint; all joints are level at the same angle.
 
     Simulation: adds ``γ cos(y − φ)`` to each output y.
     Drivers: the outputs only.

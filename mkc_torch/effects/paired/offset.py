@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
-from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -43,7 +42,7 @@ class Offset(GainEffect):
     recurrence = "an offset is also there without a signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
-    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return torch.ones_like(context.time)
 
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
-from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 from mkc_torch.effects.runs import first_of_runs
 from mkc_torch.effects.waveforms import in_contact
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["OutputBacklash", "SeveralBacklash"]
 
 _START = 1e-9
-"""Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 there is none."""
+"""Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 it does not exist."""
 
 
 class OutputBacklash(Effect):
@@ -50,14 +49,14 @@ class OutputBacklash(Effect):
     recurrence = "play has the same width at any amplitude and speed"
     source = "Visintin, Differential Models of Hysteresis (1994), III.2; Nordin & Gutman, Automatica 38 (2002)"
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("half_gap", len(context.channels), context.signal_unit),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         pairs = zip(context.signal.unbind(-1), gamma.unbind(), strict=True)
         return torch.stack([_crossed(own, gap, context) for own, gap in pairs], -1)
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         return (f"played({names['own']}, time, {gamma[0]!r}, run) - {names['own']}",)
 
 

@@ -47,10 +47,10 @@ class CubicNonlinearity(Effect):
         "linearity of 0.1-1 % of full scale in data sheets of AMR, Hall and TMR sensors; 4e-5 /µT² are 10 % at 50 µT"
     )
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return ({}, {"terms": 2.0})
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         return "δB_i = α_i B_i³" + (" + β_i B_i²" if "terms" in shape else "") + ",  for each axis i"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:

@@ -49,7 +49,7 @@ class DriverOffset(GainEffect):
     source = "linear response, first order in the driver"
     lags: tuple[float, ...] = (0.0,)
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return tuple({"lag": lag} if lag else {} for lag in self.lags)
 
     def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:

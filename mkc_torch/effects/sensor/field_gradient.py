@@ -49,7 +49,7 @@ class FieldGradient(Effect):
     plausible_unit = "µT/m"
     source = "indoor gradients of up to some µT/cm near steel; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021)"
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return ({"degree": 1.0}, {"degree": 2.0})
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
@@ -65,7 +65,7 @@ class FieldGradient(Effect):
             return f"B(p) = B₀ + g·(p − p̄){quadratic},  B the strength,  g = ∂B/∂p{second} at p̄"
         return f"B(p) = B₀ + G (p − p̄){quadratic},  ∇·B = 0, ∇×B = 0,  G = ∂B/∂p{second} at p̄"
 
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         strength_only = len(context.channels) == 1
         if quantity == "gradient":
             return _STRENGTH_GRADIENT if strength_only else _GRADIENT

@@ -53,11 +53,11 @@ class HeadingReset(Effect):
         before = (context.signal <= 0.0).sum(0) - 1
         return tuple(context.time[before].tolist())
 
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         return tuple(f"jump at {moment:.1f} s" for moment in self.moments(context))
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("heading_change", len(context.carries), context.signal_unit),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
         return (context.signal @ gamma).unsqueeze(-1)

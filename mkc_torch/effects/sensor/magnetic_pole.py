@@ -71,12 +71,12 @@ class MagneticPole(Effect):
     )
     fitted_shape: Mapping[str, tuple[float, float]] = {f"place_{axis}": (-_FAR, _FAR) for axis in "xyz"}
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return tuple(
             {"place_x": x, "place_y": y, "place_z": z, "radius": _RADIUS} for x, y, z in product(_GRID, repeat=3)
         )
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         unit = f"{context.signal_unit}·{context.units[0]}²" if context.units[0] else context.signal_unit
         return (Quantity("pole", 3 if len(context.channels) == 1 else 1, unit),)
 
@@ -86,7 +86,7 @@ class MagneticPole(Effect):
         size = sized(float(shape["radius"]), context.units[0])
         return f"B(p) = B₀ + {pole},  r = p − p̄ − c,  s = {size}, chosen, for no pole is a point"
 
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
         return ("q_x", "q_y", "q_z") if len(context.channels) == 1 else ()
 
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:

@@ -52,7 +52,7 @@ class TemperatureOffset(DriverOffset):
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return (*super().shapes(time), {"curvature": 0.02}, {"curvature": -0.02})
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         if "curvature" in shape:
             return self.equation
         if shape.get("lag", 0.0) > 0.0:

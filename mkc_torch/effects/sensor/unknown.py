@@ -46,7 +46,7 @@ class Unknown(Effect):
     advice = "Look at the curve; find out what the column does to the sensor."
     source = "none: a curve, not physics"
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         x, unit = context.drivers[:, 0], context.units[0]
         low, high = sized(float(x.min()), unit), sized(float(x.max()), unit)
         return (
@@ -54,7 +54,7 @@ class Unknown(Effect):
             f"from {low} to {high}, constant beyond"
         )
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return tuple(
             Quantity(f"legendre_{j}", len(context.channels), context.signal_unit) for j in range(1, DEGREE + 1)
         )

@@ -49,7 +49,7 @@ class Unrecorded(GainEffect):
     advice = "Look at its variation over time: find out what was warmed, switched or moved then, and record it."
     source = "none: a waveform, not physics"
 
-    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+    def equation_of(self, shape: Shape, context: Context) -> str:
         waveform = "s(t) = Σ c_k cos(π k (n + ½) / N) less its last value"
         return f"{self.equation},  {waveform},  sample n of N,  {len(shape)} numbers c_k in model.json"
 
@@ -57,7 +57,7 @@ class Unrecorded(GainEffect):
         """Whether reports list a shape parameter; the waveform is plotted, its coefficients are not listed."""
         return not name.startswith(COURSE)
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         # its waveform is estimated from the residual; there is no grid
         return ()
 

@@ -187,17 +187,17 @@ class _Solve(torch.autograd.Function):
         return search.run(X, Y, weight, Given(sigma, d, bound, start))
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:  # noqa: ARG004
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
         ctx.mark_non_differentiable(*output)
         ctx.set_materialize_grads(False)
         ctx.outputs = len(output)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004 - signature of torch.autograd.Function
         return (None,) * 8
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004 - signature of torch.autograd.Function
         return (None,) * ctx.outputs
 
     @staticmethod

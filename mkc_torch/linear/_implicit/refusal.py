@@ -30,7 +30,7 @@ class Refusing(torch.autograd.Function):
         return value.clone()
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, str], output: Tensor) -> None:  # noqa: ARG004
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, str], output: Tensor) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
         ctx.save_for_backward(inputs[1])
         ctx.save_for_forward(inputs[1])
 

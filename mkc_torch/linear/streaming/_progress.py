@@ -31,13 +31,25 @@ __all__ = ["Phase", "StreamChangedError", "StreamProgress"]
 
 Phase = Literal["range", "climb", "done"]
 
-FORMAT = 2
+FORMAT = 3
 """Version of a saved state; another version is refused."""
 
 _SAME = 1e-9
 """Share of a column's absolute sum by which its sum may differ between passes.
 
 Rounding in another order is a hundredth of it, and a millionth of the rows with other values exceeds it."""
+
+_SAME_ROUGH = 1e-5
+"""The same for a pass that forms products in float32."""
+
+_LEAST_KAPPA = 0.05
+"""Least κ of such a pass: differences of its sums then have four digits."""
+
+_LARGEST = 1e3
+"""Largest mean of ``|y| + |x| |coef|`` in such a pass, in units of d: residuals then have four digits."""
+
+_ROUGH = 1e-5
+"""Rounding error of the mean likelihood of such a pass, at most."""
 
 _NEAR = 2e-5
 """Distance from the maximum, in standard errors of one row, below which a pass computes the curvature.
@@ -109,9 +121,26 @@ class StreamProgress:
     @staticmethod
     def begin(settings: dict[str, Any], survey: Survey, begun: PilotFit) -> StreamProgress:
         progress = StreamProgress(settings, survey, begun, "range", 1)
+        if progress._is_rough(begun.fit_state.beta[0], progress.next_pass()[1]):
+            fit_state = replace(begun.fit_state, beta=begun.fit_state.beta.float().double())
+            progress = replace(progress, begun=replace(begun, fit_state=fit_state))
         # with a sample of all rows the range is known
         known = settings["bound"] is not None or begun.rows == survey.rows
-        return progress._climbing(begun.fit_state) if known else progress
+        return progress._climbing(progress.begun.fit_state) if known else progress
+
+    @property
+    def rough(self) -> bool:
+        """Whether the next pass forms products in float32; its coefficients are then float32 numbers."""
+        beta, density, with_curvature = self.next_pass()
+        return not with_curvature and self._is_rough(beta, density)
+
+    def _is_rough(self, beta: Float64[Tensor, " n"], density: Density) -> bool:
+        """Whether a pass in float32 at this point is accurate enough for a step, and saves time."""
+        survey = self.survey
+        if not survey.single or survey.frame() is not None or self.begun.rows == survey.rows:
+            return False
+        size = survey.sizes(beta) / survey.weight
+        return bool(((density.kappa >= _LEAST_KAPPA) & (size <= _LARGEST * density.d)).all())
 
     def next_pass(self) -> tuple[Float64[Tensor, " n"], Density, bool]:
         """Coefficients and density of the next pass, and whether it computes the curvature."""
@@ -139,7 +168,7 @@ class StreamProgress:
         if bool((longer <= _LONGER).all()):
             climbing = now._climbing(replace(start, log_bound=log_bound))
             assert climbing.climb is not None
-            return replace(climbing, climb=climbing.climb.after(result))
+            return climbing._after(result)
         # keep the tail density exp(-1/κ) / bound unchanged on the longer domain
         inverse = torch.where(start.kappa > 0, start.kappa, 1.0).reciprocal() + longer
         kappa = torch.where(start.kappa > 0, inverse.reciprocal(), 0.0) if start.free_kappa else start.kappa
@@ -154,8 +183,10 @@ class StreamProgress:
         assert self.climb is not None
         rows, result = sums_of(flat, self.survey.shape)
         self._refuse_other_rows(rows, result.total.residual, self.climb.point.beta[0])
-        climb, passes = self.climb.after(result), self.passes + 1
-        now = replace(self, passes=passes, climb=climb)
+        passes = self.passes + 1
+        now = replace(self, passes=passes)._after(result)
+        climb = now.climb
+        assert climb is not None
         if climb.done and not self.gaussian and not self.ending and passes < max_passes - 1:
             start = self._gaussian(climb)
             if start is not None:
@@ -168,6 +199,18 @@ class StreamProgress:
             assert climb.best is not None
             return replace(now, climb=replace(climb, point=climb.best.point, left=0.0), ending=True)
         return now
+
+    def _after(self, result: PassResult) -> StreamProgress:
+        """Make the step after a pass."""
+        assert self.climb is not None
+        return replace(self, climb=self.climb.after(result, _ROUGH if self.survey.single else 0.0))._rounded()
+
+    def _rounded(self) -> StreamProgress:
+        """Round the coefficients before a rough pass, whose rounding errors are then independent from row to row."""
+        if self.climb is None or not self.rough:
+            return self
+        point = self.climb.point
+        return replace(self, climb=replace(self.climb, point=replace(point, beta=point.beta.float().double())))
 
     def _refuse_other_rows(self, rows: int, residual: Float64[Tensor, " m"], beta: Float64[Tensor, " n"]) -> None:
         """Refuse a pass whose rows differ from those of the first.
@@ -188,10 +231,8 @@ class StreamProgress:
             )
         coef = beta if frame is None else frame @ beta
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
-        # upper bound of a column's sum of absolute values, by Cauchy-Schwarz
-        size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
-        size = size[:, n] + size[:, :n] @ coef.abs()
-        wrong = ~((residual - expected).abs() <= _SAME * size)
+        same = _SAME_ROUGH if self.rough else _SAME
+        wrong = ~((residual - expected).abs() <= same * survey.sizes(coef))
         if bool(wrong.any()):
             raise StreamChangedError(
                 "Expected `batches` to yield the same values in every pass but got residuals that sum to "
@@ -205,7 +246,7 @@ class StreamProgress:
         climb = Descent.begin(
             fit_state, self.begun.slopes, near=near, stop=2.0 * near, fresh=True, slow=_SLOW, alike=alike
         )
-        return replace(self, phase="climb", climb=climb)
+        return replace(self, phase="climb", climb=climb)._rounded()
 
     def _gaussian(self, climb: Descent) -> FitState | None:
         """Gaussian density at weighted least squares, as in memory, if its likelihood is higher."""

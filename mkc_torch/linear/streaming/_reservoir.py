@@ -59,7 +59,7 @@ class Reservoir:
     def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0, rows: int | None = None) -> None:
         bits = np.random.PCG64(seed)
         self._random = np.random.Generator(bits.jumped(rank) if first is None else bits.advance(first))
-        self._size = size
+        self._size, self._keys = size, np.empty(0)
         self._number = first or 0
         self._limit = 1.0 if rows is None else largest_key(size, rows)
         self._parts: list[Drawn] = []
@@ -68,7 +68,9 @@ class Reservoir:
     def add(self, block: Block) -> None:
         """Draw from the rows of a block."""
         count = block.y.shape[0]
-        keys = self._random.random((count,))
+        if len(self._keys) < count:
+            self._keys = np.empty(count)
+        keys = self._random.random(out=self._keys[:count])
         chosen = np.flatnonzero(keys < self._limit)
         if len(chosen):
             index = torch.from_numpy(chosen).to(block.y.device)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mkc_torch.linear._block_sums import Memory
 from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, ResidualRange, Sums
 from mkc_torch.linear.streaming._batches import Shape, rows_of
 
@@ -38,6 +39,7 @@ def sums_pass(
     *,
     with_curvature: bool = False,
     with_range: bool = False,
+    rough: bool = False,
 ) -> tuple[Float64[Tensor, " k"], ResidualRange | None]:
     """Number of this rank's rows and their sums, and the range of the residuals if wanted and if there are rows.
 
@@ -48,11 +50,15 @@ def sums_pass(
         beta, density: point of the pass.
         with_curvature: whether to form the curvature sums too, which takes three times as long.
         with_range: whether to find the range of the residuals.
+        rough: whether products of float32 rows are formed in float32.
     """
     flat, extent = torch.zeros(flat_length(shape, with_curvature=with_curvature), dtype=torch.float64), None
+    memory = Memory()
     for _, rows in rows_of(batches, shape, frame):
         if len(rows.Y):
-            total, more, part = rows.evaluate(beta, density, with_curvature=with_curvature, with_range=with_range)
+            total, more, part = rows.evaluate(
+                beta, density, with_curvature=with_curvature, with_range=with_range, memory=memory, rough=rough
+            )
             flat[0] += len(rows.Y)
             flat[1:] += torch.cat([value.reshape(-1) for value in (*total, *(more or ()))])
             if part is not None:

@@ -36,13 +36,16 @@ class StreamedMKCRegression(Inference):
     memory. A second pass sets the domain: half the range of all residuals of that fit, and at least that of the sample.
     It is not needed if the sample has all rows. Newton's method on the coefficients and each channel's σ and d then
     maximises the likelihood of all rows, from the sample's maximum, by the passes of :class:`MKCRegression` over many
-    rows: one to three for the gradient, and a last for the covariance. Sums are float64, also for float32 data. Memory
-    does not grow with the rows: one batch, a block of 33 000 values of Y, and during the first pass twice the sample.
+    rows: one to three for the gradient, and a last for the covariance. Sums are float64, also for float32 data; if all
+    rows are float32 on a CPU and residuals are not small compared to Y, passes far from the maximum multiply in
+    float32. Memory does not grow with the rows: one batch, a block of 33 000 values of Y or 8 000 rows, and during the
+    first pass twice the sample.
 
     If the sample has all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8 or to
-    the accuracy of its maximum; the covariance to 1e-4. With more rows the domain depends on the sample:
-    ``MKCRegression(bound=fit.bound_)`` gives the same result to 1e-8 if it finds the same maximum. With ``bound``
-    given, only the start depends on the sample.
+    the accuracy of its maximum. With more rows the domain depends on the sample: ``MKCRegression(bound=fit.bound_)``
+    gives the same result to 1e-8 if it finds the same maximum, except for the covariance, which agrees to 1e-4, and
+    usually to 1e-6: the last pass sums it before the last step, up to 4e-5 standard errors of a row from the maximum.
+    With ``bound`` given, only the start depends on the sample.
 
     In a process group of ``torch.distributed``, for example of torchrun, each rank has its own part of the rows, which
     may be empty, and the sums are over all ranks. All ranks end with bitwise equal numbers. An error on one rank is an
@@ -155,9 +158,9 @@ class StreamedMKCRegression(Inference):
             progress = self._after_range_pass(ranks, source, progress, checkpoint)
         while progress.phase != "done":
             before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
-            beta, density, curvature = progress.next_pass()
+            (beta, density, curvature), rough = progress.next_pass(), progress.rough
             flat = ranks.sum_of(
-                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature)[0],  # noqa: B023
+                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature, rough=rough)[0],  # noqa: B023
                 flat_length(shape, with_curvature=curvature),
             )
             progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
@@ -256,8 +259,10 @@ class StreamedMKCRegression(Inference):
         self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
     ) -> StreamProgress:
         """Progress after the pass for the domain."""
-        survey, (beta, density, _) = progress.survey, progress.next_pass()
-        parts = ranks.gathered(lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True))
+        survey, (beta, density, _), rough = progress.survey, progress.next_pass(), progress.rough
+        parts = ranks.gathered(
+            lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True, rough=rough)
+        )
         return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
 
     def _saved(

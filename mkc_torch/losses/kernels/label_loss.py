@@ -13,7 +13,7 @@ from torch import Tensor
 from mkc_torch.losses._checks import at_least_float32
 from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.labels import count_kernel, labels_kernel
-from mkc_torch.losses.kernels.launch import WARPS, multiprocessors, rescale
+from mkc_torch.losses.kernels.launch import WARPS, multiprocessors, power_of_two, rescale
 
 __all__ = [
     "EachLabel",
@@ -71,10 +71,6 @@ def arranged_labels(input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor
     return Labels(input.contiguous(), target.contiguous(), kappa, weight, ignore_index)
 
 
-def _power(count: int) -> int:
-    return 1 << max(count - 1, 0).bit_length()
-
-
 def _counted(batch: Labels) -> Tensor | None:
     """Partial sums of the labels' weights, for the kernel to add up; None for few labels, which it adds up itself."""
     rows, classes = batch.input.shape
@@ -114,8 +110,8 @@ def pass_over_labels(
     rows, classes = batch.input.shape
     device, dtype = batch.input.device, batch.dtype
     whole = classes <= WIDEST
-    block_class = _power(classes) if whole else BLOCK_OF_ROW
-    block_row = min(max(TILE // block_class, 1), _power(rows)) if whole else 1
+    block_class = power_of_two(classes) if whole else BLOCK_OF_ROW
+    block_row = min(max(TILE // block_class, 1), power_of_two(rows)) if whole else 1
     tiles = -(-rows // block_row)
     alone = sums and rows * classes <= ALONE
     programs = 1 if alone else min(tiles, PROGRAMS_EACH * multiprocessors(device))

@@ -26,6 +26,7 @@ __all__ = [
     "kernels_are_interpreted",
     "make_table",
     "pass_over",
+    "power_of_two",
     "reduce_batch",
     "rescale",
     "weight_sums",
@@ -147,7 +148,8 @@ def multiprocessors(device: torch.device) -> int:
     return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
 
 
-def _power(count: int) -> int:
+def power_of_two(count: int) -> int:
+    """Return the least power of 2 that is at least ``count``."""
     return 1 << max(count - 1, 0).bit_length()
 
 
@@ -192,7 +194,7 @@ def make_table(
         [numbers if tensor is None else tensor for tensor in tensors],
         (rows, m, inner, *batch.strides, *batch.weight_strides, range_rows, *pace),
         (
-            length, max(_power(length), 16), min(max(_power(range_rows), 16), 1024),
+            length, max(power_of_two(length), 16), min(max(power_of_two(range_rows), 16), 1024),
             scale, peek, schedule, table, batch.weight is not None,
             options.has_scale, options.robust, options.follows, options.learn_kappa, options.learn_d,
             options.own_bound, options.own_floor, options.normalize,
@@ -222,21 +224,21 @@ def _tiles(batch: Arranged, *, robust: bool) -> Tiles:
     outer, m, inner = batch.size
     elements = outer * m * inner
     tile = TILE if robust or batch.input.element_size() > 2 else 2 * TILE
-    if inner == 1 and _power(m) == m and m <= LINE_COLUMNS:
+    if inner == 1 and power_of_two(m) == m and m <= LINE_COLUMNS:
         layout, columns = LINE, 1
-        block_col = LINE_COLUMNS if elements >= LINE_COLUMNS else max(_power(elements), m)
+        block_col = LINE_COLUMNS if elements >= LINE_COLUMNS else max(power_of_two(elements), m)
         outer = -(-elements // block_col)
-        block_row = min(max(tile // block_col, 1), _power(outer))
+        block_row = min(max(tile // block_col, 1), power_of_two(outer))
         blocks = -(-outer // block_row)
     elif inner == 1:
         layout = CHANNELS
-        block_col = min(_power(m), MOST_COLUMNS)
-        block_row = min(max(tile // block_col, 1), _power(outer))
+        block_col = min(power_of_two(m), MOST_COLUMNS)
+        block_row = min(max(tile // block_col, 1), power_of_two(outer))
         blocks, columns = -(-outer // block_row), -(-m // block_col)
     else:
         layout = PLACES
-        block_col = min(_power(inner), tile)
-        block_row = min(max(tile // block_col, 1), _power(outer))
+        block_col = min(power_of_two(inner), tile)
+        block_row = min(max(tile // block_col, 1), power_of_two(outer))
         blocks, columns = -(-outer // block_row) * -(-inner // block_col), m
     most = max(1, min(PROGRAMS_EACH * multiprocessors(batch.input.device) // min(columns, 8), PARTIAL_SUMS // m))
     programs = 1 if elements <= ALONE and columns == 1 else min(blocks, most)
@@ -302,14 +304,14 @@ def pass_over(
     )  # fmt: skip
     if partial is None or value is None:
         return value
-    block_col = min(_power(m), MOST_COLUMNS)
+    block_col = min(power_of_two(m), MOST_COLUMNS)
     sums_of = (partial, table, weights, total_weight, value, by_kappa, by_d)
     _FINISH.launch(
         (len(value), 1, 1),
         [table if entry is None else entry for entry in sums_of],
         (m, tiles.programs, outer * inner, count),
         (
-            min(_power(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None,
+            min(power_of_two(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None,
             options.mean, options.robust, *learns, options.normalize, each, dtype == torch.float64,
         ),
         WARPS,

@@ -57,8 +57,8 @@ def gather_mcap(path: Path, log: MessageLog) -> list[str]:
     """Add the messages of a file to a log; returns warnings about lost parts."""
     check_begins(path, "MCAP file", _MAGIC)
     try:
-        import mcap.stream_reader  # noqa: F401
-        import rosbags.typesys  # noqa: F401
+        import mcap.stream_reader  # noqa: F401 - tests whether it is installed
+        import rosbags.typesys  # noqa: F401 - tests whether it is installed
     except ImportError as error:
         raise ImportError(_INSTALL) from error
     size = path.stat().st_size

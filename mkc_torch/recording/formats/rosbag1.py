@@ -48,7 +48,7 @@ def read(path: Path) -> list[Topic]:
     """
     check_begins(path, "ROS 1 bag of version 2.0", _MAGIC)
     try:
-        import rosbags.typesys  # noqa: F401
+        import rosbags.typesys  # noqa: F401 - tests whether it is installed
     except ImportError as error:
         raise ImportError(
             'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'

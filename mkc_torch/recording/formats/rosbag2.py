@@ -42,7 +42,7 @@ def read(path: Path) -> list[Topic]:
         ImportError: rosbags is not installed, or mcap for a bag of MCAP files.
     """
     try:
-        import rosbags.typesys  # noqa: F401
+        import rosbags.typesys  # noqa: F401 - tests whether it is installed
     except ImportError as error:
         raise ImportError(
             'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'

@@ -17,10 +17,10 @@ _SAMPLE = 4096
 """Bytes or characters at the beginning that are examined."""
 
 _UTF_16 = 0.4
-"""Smallest share of zero bytes at even or odd offsets of UTF-16 without a byte order mark; for ASCII text it is 1."""
+"""Smallest share of zero bytes, at even or at odd offsets, in UTF-16 without a byte order mark; 1 for ASCII text."""
 
 _FEW_CUTS = 3
-"""Most lines with zero bytes, if these are a sign of power losses; with more, they are the line ends of a program."""
+"""Most lines that a power loss cuts; a file with more has zero bytes as line ends, written by a program."""
 
 _PLAIN = {"\t", "\n", "\r", "\f", "\0", "\x1a"}
 
@@ -85,7 +85,7 @@ def _decoded(path: Path, data: bytes) -> tuple[str, list[str]]:
     if unmarked := _without_mark(data[:_SAMPLE]):
         return _utf_16(path, data, unmarked)
     try:
-        # an incomplete character at the end is left out
+        # final=False drops an incomplete character at the end
         text = codecs.getincrementaldecoder("utf-8-sig")().decode(data, final=False)
     except UnicodeDecodeError as error:
         return _latin_1(path, data, error.start)

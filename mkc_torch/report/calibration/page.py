@@ -41,6 +41,7 @@ def calibration_report(
     against: Differences | None = None,
     source: str = "RECORDING.csv",
     result: str = "calibration.json",
+    read_with: Sequence[str] = (),
 ) -> str:
     """Return the page of a calibration and its recording.
 
@@ -51,6 +52,7 @@ def calibration_report(
         comparison: other results, or the truth, for comparison.
         against: differences from an older calibration.
         source, result: paths of the recording and of the calibration, for the proposed commands.
+        read_with: options with which the recording was read, such as ``--columns``, for the same commands.
 
     Returns:
         HTML with inline figures.
@@ -75,7 +77,7 @@ def calibration_report(
         enough=ENOUGH_INFORMATION,
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
-        source=shlex.quote(source),
+        source=shlex.join([source, *read_with]),
         result=shlex.quote(result),
         comparison=comparison,
         in_known_unit=is_known(calibration.unit),

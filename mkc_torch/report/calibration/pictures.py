@@ -6,7 +6,6 @@ import matplotlib
 from torch import Tensor
 
 from mkc_torch._support.drawing import STYLE
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.plot import PLANES, draw_coverage, draw_density, draw_residual, draw_sphere
@@ -24,7 +23,7 @@ def sphere(calibration: Calibration, points: Tensor) -> str:
         for corrected in (False, True):
             for plane in PLANES:
                 draw_sphere(panels.axes(), calibration, points, plane, corrected=corrected)
-        return panels.markup("sphere", term("picture.about_sphere"))
+        return panels.markup("sphere", "Samples before and after calibration in three planes, with the fitted outline")
 
 
 def residual(calibration: Calibration, points: Tensor, place: Tensor) -> str:
@@ -35,13 +34,13 @@ def residual(calibration: Calibration, points: Tensor, place: Tensor) -> str:
         whole, close = panels.axes(), panels.axes()
         for ax in (whole, close):
             draw_residual(ax, c, points, place)
-            ax.set_xlabel(term("picture.row" if c.disturbed_unit == "row" else "picture.time"))
+            ax.set_xlabel("row of the recording" if c.disturbed_unit == "row" else "time (s)")
         limit = 5.0 * c.after.robust
         if limit > 0:
             close.set_ylim(-limit, limit)
-        whole.set_title(term("picture.all_samples"))
-        close.set_title(term("picture.close_up"))
-        return panels.markup("residual", term("picture.about_residual"))
+        whole.set_title("All samples")
+        close.set_title("Close up: five times the robust scatter")
+        return panels.markup("residual", "Residual over time with rejected samples and disturbed intervals")
 
 
 def density(calibration: Calibration, points: Tensor) -> str:
@@ -52,12 +51,12 @@ def density(calibration: Calibration, points: Tensor) -> str:
         for tail in (False, True):
             ax = panels.axes()
             draw_density(ax, calibration, points, tail=tail)
-            ax.set_ylabel(term("picture.density", unit=unit) if unit else term("noise.density"))
-            ax.set_title(term("picture.tail" if tail else "picture.head"))
+            ax.set_ylabel(f"density (1/{unit})" if unit else "density")
+            ax.set_title("Head and tail, logarithmic scale" if tail else "Head, linear scale")
             if not tail:
                 ax.legend(loc="upper left", fontsize=9, borderaxespad=0.2, handlelength=1.6)
                 ax.set_ylim(0.0, 1.45 * ax.get_ylim()[1])
-        return panels.markup("density", term("picture.about_density"))
+        return panels.markup("density", "Histogram of residuals with the MKC density and a Gaussian")
 
 
 def coverage_map(found: Coverage, directions: Tensor) -> str:
@@ -65,4 +64,4 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
     panels = Panels(1, height=3.0, margins=Margins(left=0.2, right=0.2, top=0.1, bottom=0.1))
     with matplotlib.rc_context(_STYLE):
         draw_coverage(panels.axes(projection="mollweide"), found, directions)
-        return panels.markup("coverage", term("picture.about_coverage"))
+        return panels.markup("coverage", "Map of the directions covered and not covered, in the sensor's axes")

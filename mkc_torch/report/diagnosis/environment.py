@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from mkc_torch._support.unit_text import sized, tidy
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
-from mkc_torch.diagnosis.result import Diagnosis, Table
+from mkc_torch.diagnosis.result import Diagnosis
+from mkc_torch.report.diagnosis.evidence import Table
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
@@ -30,11 +30,15 @@ _STILL = 2.0
 """Variation, in noise floors, up to which an output hardly varies."""
 _MOST_DECIMALS = 4
 _SOURCES = {
-    "declared": "environment.declared",
-    "samples": "environment.samples",
-    "quantisation": "environment.quantisation",
+    "declared": "declared",
+    "samples": "estimated",
+    "quantisation": "resolution of the recording",
 }
-_BETWEEN = {"held": "environment.held", "linear": "environment.linear", "smooth": "environment.smooth"}
+_BETWEEN = {
+    "held": "`{input}` is constant between samples",
+    "linear": "`{input}` is linear between samples",
+    "smooth": "`{input}` is smooth between samples",
+}
 
 
 def explained(value: float) -> str:
@@ -45,7 +49,7 @@ def explained(value: float) -> str:
         ('99.97 %', '12 %', 'nothing', '98.5 %', '100 %')
     """
     if not value > 0.0:
-        return term("environment.nothing")
+        return "nothing"
     places = 0 if value < 0.9 or value == 1.0 else min(max(-math.floor(math.log10(1.0 - value)) - 2, 1), _MOST_DECIMALS)
     return f"{number(100.0 * value, places)} %"
 
@@ -56,7 +60,7 @@ def output_lines(diagnosis: Diagnosis) -> list[str]:
     lines = [_fit_text(fit, lost=diagnosis.verdict == "unfit") for fit in each[:_MOST_OUTPUTS]]
     more = len(each) - len(lines)
     offsets = [] if diagnosis.verdict == "unfit" else offset_sentences(diagnosis.environment)
-    return [*lines, *([term("environment.more_outputs", count=more)] if more else []), *offsets]
+    return [*lines, *([f"and {more} more outputs; see the table"] if more else []), *offsets]
 
 
 def _fit_text(fit: GoodnessOfFit, *, lost: bool) -> str:
@@ -68,28 +72,29 @@ def _fit_text(fit: GoodnessOfFit, *, lost: bool) -> str:
         'angle: residual 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of the variance'
     """
     if lost:
-        return term(
-            "environment.lost",
-            output=plain(fit.output),
-            share=explained(fit.explained),
-            mean=_sized(fit.rmse_of_mean, fit.unit),
-            residual=_sized(fit.residual, fit.unit),
-            floor=_floor(fit),
+        return (
+            f"{plain(fit.output)}: the simulation explains {explained(fit.explained)} of the variance; "
+            f"RMSE {_sized(fit.residual, fit.unit)}, of the output's mean "
+            f"{_sized(fit.rmse_of_mean, fit.unit)}; noise floor {_floor(fit)}"
         )
-    key = "environment.still" if fit.variation <= _STILL * fit.noise_floor else "environment.fits"
+    key = (
+        "{output}: residual {residual}; noise floor {floor}; the output hardly varies"
+        if fit.variation <= _STILL * fit.noise_floor
+        else "{output}: residual {residual}; noise floor {floor}; explains {share} of the variance"
+    )
     share = explained(fit.explained)
-    return term(key, output=plain(fit.output), residual=_sized(fit.residual, fit.unit), floor=_floor(fit), share=share)
+    return key.format(output=plain(fit.output), residual=_sized(fit.residual, fit.unit), floor=_floor(fit), share=share)
 
 
 def _floor(fit: GoodnessOfFit) -> str:
     if not math.isfinite(fit.noise_floor):
-        return term("environment.floor_unknown")
-    return term("environment.floor", size=_sized(fit.noise_floor, fit.unit), source=term(_SOURCES[fit.floor_source]))
+        return "unknown (sampled too slowly)"
+    return f"{_sized(fit.noise_floor, fit.unit)} ({_SOURCES[fit.floor_source]})"
 
 
 def _sized(value: float, unit: str) -> str:
     if not math.isfinite(value):
-        return term("number.not_known")
+        return "unknown"
     return f"{size(value)} {plain(unit)}".rstrip()
 
 
@@ -110,18 +115,24 @@ def goodness_of_fit_table(environment: NoiseEnvironment) -> Table | None:
         for fit in environment.goodness_of_fit
     )
     return Table(
-        term("section.follows"), tuple(term(key) for key in _FOLLOWS_COLUMNS), rows, term("environment.fit_note")
+        "Goodness of fit",
+        tuple(key for key in _FOLLOWS_COLUMNS),
+        rows,
+        (
+            "Robust RMSE of the open-loop simulation. The noise floor is the sensor's. A residual as "
+            "large as that of the mean: the simulation does not predict that output."
+        ),
     )
 
 
 _FOLLOWS_COLUMNS = (
-    "table.output",
-    "label.residual",
-    "table.noise_floor",
-    "table.variation",
-    "table.explained",
-    "table.rmse_of_mean",
-    "table.rmse_of_last_value",
+    "output",
+    "residual",
+    "noise floor",
+    "standard deviation of the output",
+    "explained variance",
+    "RMSE of the mean",
+    "RMSE of the last value",
 )
 
 
@@ -139,11 +150,15 @@ def process_noise_sentence(process: ProcessNoise) -> str:
         'correlation time 460 s.'
     """
     amount = measured(process.size, process.standard_error, tidy(process.unit))[0]
-    memory = term("environment.white")
+    memory = "white noise"
     if process.correlation_time > 0.0:
-        memory = term("environment.correlation_time", seconds=sized(float(f"{process.correlation_time:.2g}")))
-    key = "environment.process_noise" if process.at_rate else "environment.drift"
-    return term(key, place=plain(process.place), size=amount, memory=memory)
+        memory = f"correlation time {sized(float(f'{process.correlation_time:.2g}'))} s"
+    key = (
+        "Process noise on the rate of `{place}`: {size}, {memory}."
+        if process.at_rate
+        else "Drift of `{place}` in addition to its white noise: {size}, {memory}."
+    )
+    return key.format(place=plain(process.place), size=amount, memory=memory)
 
 
 def process_noise_table(environment: NoiseEnvironment) -> Table | None:
@@ -152,24 +167,25 @@ def process_noise_table(environment: NoiseEnvironment) -> Table | None:
         return None
     rows = tuple(
         (
-            term("environment.rate_of", place=plain(process.place)) if process.at_rate else plain(process.place),
+            f"the rate of {plain(process.place)}" if process.at_rate else plain(process.place),
             measured(process.size, process.standard_error, tidy(process.unit))[0],
-            f"{sized(float(f'{process.correlation_time:.3g}'))} s"
-            if process.correlation_time > 0.0
-            else term("unit.sample"),
-            size(process.log_likelihood_gain)
-            if math.isfinite(process.log_likelihood_gain)
-            else term("number.not_known"),
+            f"{sized(float(f'{process.correlation_time:.3g}'))} s" if process.correlation_time > 0.0 else "sample",
+            size(process.log_likelihood_gain) if math.isfinite(process.log_likelihood_gain) else "unknown",
         )
         for process in environment.process_noise
     )
     columns = (
-        term("table.process_noise"),
-        term("table.standard_deviation"),
-        term("table.lasts"),
-        term("table.without"),
+        "acts on",
+        "standard deviation",
+        "correlation time",
+        "log-likelihood gain, nats",
     )
-    return Table(term("section.process_noise"), columns, rows, term("environment.process_noise_note"))
+    return Table(
+        "Process noise and drift",
+        columns,
+        rows,
+        "± is a standard error; the last column is the log-likelihood gain over a model without it.",
+    )
 
 
 def input_hold_sentence(environment: NoiseEnvironment) -> str:
@@ -179,8 +195,8 @@ def input_hold_sentence(environment: NoiseEnvironment) -> str:
         >>> input_hold_sentence(NoiseEnvironment(input_hold={"torque": "held", "force": "linear"}))
         'Input hold: `torque` is constant between samples, `force` is linear between samples.'
     """
-    each = [term(_BETWEEN[how], input=plain(name)) for name, how in environment.input_hold.items()]
-    return term("environment.between", inputs=", ".join(each)) if each else ""
+    each = [_BETWEEN[how].format(input=plain(name)) for name, how in environment.input_hold.items()]
+    return f"Input hold: {', '.join(each)}." if each else ""
 
 
 def offset_sentences(environment: NoiseEnvironment) -> list[str]:
@@ -196,7 +212,7 @@ def offset_sentences(environment: NoiseEnvironment) -> list[str]:
         known = math.isfinite(offset.standard_error)
         value = measured(offset.value, offset.standard_error, tidy(offset.unit))[0] if known else "0"
         sizes.setdefault(offset.output, []).append(f"{recording_called(offset.recording, offset.name)}: {value}")
-    return [term("environment.offset", output=plain(name), offsets=", ".join(each)) for name, each in sizes.items()]
+    return [f"Offset of {plain(name)} in each recording: {', '.join(each)}." for name, each in sizes.items()]
 
 
 def remainder(diagnosis: Diagnosis) -> str:
@@ -205,7 +221,7 @@ def remainder(diagnosis: Diagnosis) -> str:
     if d.environment.process_noise:
         return " ".join(process_noise_sentence(process) for process in d.environment.process_noise)
     if d.verdict == "adequate" and d.environment.goodness_of_fit:
-        return term("environment.sensor_alone")
+        return "The residual is the sensor's noise."
     return ""
 
 

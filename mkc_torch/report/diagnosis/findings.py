@@ -6,13 +6,12 @@ import re
 import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.environment import Grade, Run
 from mkc_torch.diagnosis.result import Alternative, CandidateScore, Finding, Region
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
-from mkc_torch.report.diagnosis.numbers import TimeFormat, probability
+from mkc_torch.report.diagnosis.numbers import TimeFormat, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
@@ -20,6 +19,7 @@ __all__ = [
     "acts_on",
     "driven_by",
     "finding_name",
+    "fitted_sizes",
     "grade",
     "inseparable",
     "label_name",
@@ -37,21 +37,25 @@ __all__ = [
 
 _MOST_RUNS = 6
 _AXES: dict[tuple[str, ...], str] = {
-    ("x", "y", "z"): "finding.acts_on_axes",
-    ("east", "north", "up"): "finding.acts_on_level_axes",
+    ("x", "y", "z"): "acts on {channels}, the sensor's axes",
+    ("east", "north", "up"): "acts on {channels}, the axes x, y, z of the frame of the attitude",
 }
 _GRADES: dict[Grade, str] = {
-    "left_out": "grade.left_out",
-    "small": "grade.small",
-    "unconfirmed": "grade.unconfirmed",
-    "nearest": "grade.nearest",
+    "left_out": "left out of the simulation",
+    "small": "real, but small compared with the noise",
+    "unconfirmed": "not confirmed on held-out blocks",
+    "nearest": "nearest in the catalogue",
 }
 _BOUNDS = {
-    "below": "where.below",
-    "above": "where.above",
-    "near zero": "where.near_zero",
-    "far from zero": "where.far_from_zero",
+    "below": "below {bound}",
+    "above": "above {bound}",
+    "near zero": "within ±{bound}",
+    "far from zero": "beyond ±{bound}",
 }
+
+
+NOT_TESTED = "not tested on held-out blocks"
+"""Grade of a finding whose held-out blocks were not computed, as in a quick look."""
 
 
 def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = "") -> str:
@@ -72,8 +76,8 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = 
     driven = words_of(effect, kind) + (f" ({_together(drivers)})" if drivers else "")
     if not at:
         return driven
-    key = "finding.on" if at.startswith("all ") else "finding.on_the"
-    return term(key, effect=driven, place=plain(at.removeprefix("loaded ")))
+    key = "{effect} on {place}" if at.startswith("all ") else "{effect} on the {place}"
+    return key.format(effect=driven, place=plain(at.removeprefix("loaded ")))
 
 
 def _together(names: Sequence[str]) -> str:
@@ -85,9 +89,9 @@ def _together(names: Sequence[str]) -> str:
 def finding_name(finding: Finding) -> str:
     """Return the name of a finding with its drivers."""
     if unrecorded(finding):
-        return term("finding.unrecorded")
+        return "an unrecorded cause"
     text = with_drivers(finding.effect, finding.drivers, kind=finding.kind)
-    return term("finding.comes_and_goes", finding=text) if finding.comes_and_goes else text
+    return f"intermittent {text}" if finding.comes_and_goes else text
 
 
 def unrecorded(finding: Finding) -> bool:
@@ -131,11 +135,15 @@ def references_of(finding: Finding) -> str:
     if not finding.references:
         return ""
     marked = re.search("[A-Za-z]\u0304", unicodedata.normalize("NFD", finding.equation))
-    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.reference")
+    symbol = unicodedata.normalize("NFC", marked[0]) if marked else "Reference"
     names = several([item.column for item in finding.references])
     values = ", ".join(f"{size(reference.value)} {plain(reference.unit)}".rstrip() for reference in finding.references)
-    key = "finding.means" if len(finding.references) > 1 else "finding.mean"
-    return term(key, symbol=symbol, columns=names, values=values)
+    key = (
+        "{symbol}: the means of {columns} over this recording, {values}."
+        if len(finding.references) > 1
+        else "{symbol}: the mean of {columns} over this recording, {values}."
+    )
+    return key.format(symbol=symbol, columns=names, values=values)
 
 
 def where(finding: Finding, clock: TimeFormat) -> str:
@@ -162,21 +170,21 @@ def where(finding: Finding, clock: TimeFormat) -> str:
     """
     begins = ""
     if finding.event_times:
-        begins = term("where.event_times", moments=_and([clock.moment(moment) for moment in finding.event_times]))
+        begins = f"at {_and([clock.moment(moment) for moment in finding.event_times])}"
     elif finding.onset is not None:
-        key = "where.first" if finding.comes_and_goes else "where.from_on"
-        begins = term(key, moment=clock.moment(finding.onset))
+        key = "first at {moment}" if finding.comes_and_goes else "from {moment} on"
+        begins = key.format(moment=clock.moment(finding.onset))
     if finding.onset_interval is not None:
-        begins = term("where.band", onset=begins, interval=clock.interval(*finding.onset_interval))
+        begins = f"{begins} (95 %: {clock.interval(*finding.onset_interval)})"
     if finding.comes_and_goes:
-        begins = term("where.then_goes", onset=begins)
-    each = [term("where.from", interval=clock.interval(start, end)) for start, end in finding.intervals]
+        begins = f"{begins}, then intermittent"
+    each = [f"from {clock.interval(start, end)}" for start, end in finding.intervals]
     spans = [end - start for start, end in finding.intervals]
     if len(each) > 3:
-        mainly = term("where.mainly_many", count=len(each), longest=each[spans.index(max(spans))])
+        mainly = f"mainly in {len(each)} intervals, the longest {each[spans.index(max(spans))]}"
     else:
-        mainly = term("where.mainly", intervals=_and(each)) if each else ""
-    return ", ".join(filter(None, [begins, mainly])) or term("where.throughout")
+        mainly = f"mainly {_and(each)}" if each else ""
+    return ", ".join(filter(None, [begins, mainly])) or "throughout the recording"
 
 
 def acts_on(finding: Finding) -> str:
@@ -189,11 +197,11 @@ def acts_on(finding: Finding) -> str:
     """
     if not finding.channels:
         return ""
-    return term(_AXES.get(finding.channels, "finding.acts_on"), channels=several(finding.channels))
+    return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(finding.channels))
 
 
 def _and(each: Sequence[str]) -> str:
-    return term("number.and").join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
+    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def region(found: Region) -> str:
@@ -206,9 +214,9 @@ def region(found: Region) -> str:
         '91 % of the gain, in 10 % of the time: level above 14.2 cm'
     """
     unit = f" {found.unit}" if found.unit else ""
-    bounds = term(_BOUNDS[found.kind], bound=f"{size(found.bound)}{unit}")
+    bounds = _BOUNDS[found.kind].format(bound=f"{size(found.bound)}{unit}")
     gain, time = (f"{100.0 * item:.0f} %" for item in (found.share_of_gain, found.share_of_time))
-    return term("where.region", gain=gain, state=plain(found.state), bounds=bounds, time=time)
+    return f"{gain} of the gain, in {time} of the time: {plain(found.state)} {bounds}"
 
 
 def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
@@ -222,12 +230,10 @@ def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
     """
     known = runs if len(runs) == len(shares) else [Run(0, "", k + 1) for k in range(len(shares))]
     order = sorted(range(len(shares)), key=lambda k: -shares[k])
-    sentences = [
-        term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]
-    ]
+    sentences = [f"{_run(known[k])}: {number(100.0 * shares[k], 0)} %" for k in order[:_MOST_RUNS]]
     more = len(shares) - len(sentences)
     each = ", ".join(sentences)
-    return term("where.more_runs", runs=each, count=more) if more else each
+    return f"{each}, and {more} more" if more else each
 
 
 def _run(run: Run) -> str:
@@ -238,9 +244,9 @@ def _run(run: Run) -> str:
         ('run 3 of recording 2 (b.csv)', 'run 3')
     """
     if not run.recording:
-        return term("where.run", number=run.number)
+        return f"run {run.number}"
     recording = recording_called(run.recording, run.name)
-    return term("where.run_of", number=run.number, recording=recording) if run.number else recording
+    return f"run {run.number} of {recording}" if run.number else recording
 
 
 def grade(finding: Finding) -> str:
@@ -251,8 +257,10 @@ def grade(finding: Finding) -> str:
         'real, but small compared with the noise'
     """
     if finding.grade == "unconfirmed" and finding.cannot_be:
-        return term("grade.cannot_be")
-    return term(_GRADES[finding.grade])
+        return "not confirmed: impossible size"
+    if finding.grade == "unconfirmed" and finding.held_out is None:
+        return NOT_TESTED
+    return _GRADES[finding.grade]
 
 
 def shape(finding: Finding) -> str:
@@ -269,8 +277,11 @@ def shape(finding: Finding) -> str:
         return ""
     p = probability(found.p_value)
     if finding.grade != "nearest":
-        return term("evidence.as_good", p=p)
-    return term("evidence.free_curve", nats=size(found.free_curve_gain), p=p)
+        return f"a free curve of the same variables is not clearly better ({p})"
+    return (
+        f"a free curve of the same variables at the same port gains {size(found.free_curve_gain)} "
+        f"nats ({p} if the name is right)"
+    )
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:
@@ -278,11 +289,30 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
     return tuple(a for a in finding.alternatives if not a.separable)
 
 
-def rivals(finding: Finding, most: int = 3) -> str:
-    """Return the names of the inseparable alternatives; empty if there are none."""
-    each = list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding)))
-    text = ", ".join(each[:most])
-    return term("number.and_more", first=text, count=len(each) - most) if len(each) > most else text
+def rivals(finding: Finding, *, sizes: bool = False) -> str:
+    """Return the names of the inseparable alternatives; empty if there are none.
+
+    Args:
+        finding: with its alternatives.
+        sizes: also return the fitted parameters of each alternative, as far as they are known.
+    """
+    each = [
+        f"{_rival(a, finding)} with {fitted_sizes(a)}" if sizes and fitted_sizes(a) else _rival(a, finding)
+        for a in inseparable(finding)
+    ]
+    return several(list(dict.fromkeys(each)), 3)
+
+
+def fitted_sizes(alternative: Alternative) -> str:
+    """Return the fitted parameters of an alternative; empty for a free curve, and if they are not known.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import EffectParameter
+        >>> drag = EffectParameter("drag", 0.00047, 0.0001, "1/m")
+        >>> fitted_sizes(Alternative("quadratic_drag", (), 0.4, False, parameters=(drag,)))
+        'drag (4.7 ± 1.0) × 10⁻⁴ 1/m'
+    """
+    return "" if is_curve(alternative.effect) else "; ".join(largest(p) for p in alternative.parameters)
 
 
 def _rival(alternative: Alternative, finding: Finding) -> str:
@@ -308,11 +338,13 @@ def role(candidate: CandidateScore, findings: Sequence[Finding]) -> str:
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):
         if own == (finding.effect, finding.drivers) and _at(candidate.port, finding):
-            return term("evidence.is_finding", number=i)
+            return f"finding {i}"
     for i, finding in enumerate(findings, 1):
         for a in finding.alternatives:
             if (*own, candidate.port) == (a.effect, a.drivers, a.port):
-                return term("evidence.distinguished" if a.separable else "evidence.not_distinguished", number=i)
+                return (
+                    "distinguished from finding {number}" if a.separable else "not distinguished from finding {number}"
+                ).format(number=i)
     return ""
 
 
@@ -338,5 +370,5 @@ def with_names(sentence: str, ids: Collection[str], kinds: Mapping[str, str] | N
 def driven_by(finding: Finding) -> str:
     """Return the driver and the tests of it."""
     if not finding.drivers:
-        return term("finding.no_driver")
+        return "no recorded column"
     return "; ".join([several(finding.drivers), *of_driver(finding.evidence)])

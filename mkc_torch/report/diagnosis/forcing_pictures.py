@@ -6,7 +6,6 @@ from typing import Any
 
 from mkc_torch._support.drawing import ORANGE, array, style
 from mkc_torch._support.unit_text import tidy
-from mkc_torch._words.terms import term
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate
 from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, named, short
 from mkc_torch.diagnosis.result import Diagnosis
@@ -30,14 +29,14 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
         for ax, curve in zip(curves, estimate.curves, strict=False):
             draw_curve(ax, curve, has_time)
             ax.set_ylabel(_quantity(estimate, curve.value_unit))
-            title(ax, term("picture.over", name=short(curve.driver)))
+            title(ax, f"Over {short(curve.driver)}")
         _same_height(curves)
-        return panels.markup(f"forcing{index + 1}", term("picture.about_disturbance"))
+        return panels.markup(f"forcing{index + 1}", "Disturbance over time, and its mean over each state and input")
 
 
 def _quantity(estimate: DisturbanceEstimate, unit: str) -> str:
     """The label of an axis: the disturbance, or the drifting output, and its unit."""
-    return named(term("picture.process_noise") if estimate.at_rate else estimate.place, tidy(unit))
+    return named("disturbance" if estimate.at_rate else estimate.place, tidy(unit))
 
 
 def _same_height(axes: list[Any]) -> None:
@@ -61,9 +60,11 @@ def of_shape(diagnosis: Diagnosis, index: int) -> str | None:
         draw_curve(ax, free, diagnosis.traces.has_time, most=2 * MOST_LETTERS)
         if form is not None:
             ax.plot(array(form.x), array(form.value), color=ORANGE, lw=1.6, ls=(0, (5, 2)))
-        ax.set_ylabel(named(term("finding.effect"), tidy(free.value_unit)))
-        title(ax, term("picture.free_curve" if form is not None else "picture.free_curve_alone"))
-        return panels.markup(f"shape{index + 1}", term("picture.about_shape", number=index + 1))
+        ax.set_ylabel(named("effect", tidy(free.value_unit)))
+        title(
+            ax, ("Free curve with its 95 % band, and the named shape" if form is not None else "Free curve, 95 % band")
+        )
+        return panels.markup(f"shape{index + 1}", f"Free curve and the shape of finding {index + 1}")
 
 
 def _comparable(free: Curve, form: Curve) -> bool:

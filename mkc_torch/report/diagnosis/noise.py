@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several
 from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
 from mkc_torch.report.diagnosis.numbers import measured
@@ -21,27 +20,23 @@ __all__ = [
 _CLEARLY = 0.99
 """Ratio of residuals below which the smaller is reported."""
 
-_KINDS = {"white": "noise.white", "ar": "noise.autoregressive", "random_walk": "noise.random_walk"}
+_KINDS = {"white": "white", "ar": "autoregressive", "random_walk": "random walk"}
 _NOISE = {
-    "drift": "noise.drift",
-    "drift_period": "noise.drift_cutoff",
+    "drift": "drift of the offset",
+    "drift_period": "cut-off of the drift",
 }
 _CHANNELS = {
-    "norm": "noise.norm",
-    "along": "noise.along",
-    "across_1": "noise.across",
+    "norm": "norm: measured length of the field minus the simulated length",
+    "along": "along: residual along the ambient field, which its length shows too",
+    "across_1": "across_1 and across_2: the two perpendicular residuals, which include errors of the attitude",
 }
 
 
 def noise_model(noise: NoiseSummary) -> str:
     """Return the noise model in words."""
-    kind = term(_KINDS[noise.model])
+    kind = _KINDS[noise.model]
     described = noise.description.strip()
-    return (
-        term("noise.described", kind=kind, description=plain(described))
-        if described
-        else term("noise.plain", kind=kind)
-    )
+    return f"{kind}: {plain(described)}" if described else f"{kind} noise"
 
 
 def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple[str, str]]:
@@ -53,16 +48,16 @@ def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple
             rows += _memory(value, channels)
         elif name in _NOISE:
             text = " ".join(measured(value, None, unit))
-            rows.append((term(_NOISE[name]), _drift_text(name, text)))
+            rows.append((_NOISE[name], _drift_text(name, text)))
         else:
             rows.append((plain(name), " ".join(measured(value, None, unit))))
     unit = f" {plain(noise.unit)}" if noise.unit else ""
     density = zip(noise.sigma, noise.d, noise.bound, strict=True)
     for i, (sigma, d, bound) in enumerate(density):
-        name = term("noise.density")
+        name = "density"
         if len(noise.sigma) > 1 and i < len(channels):
-            name = term("noise.of_channel", name=name, channel=plain(channels[i]))
-        within = term("where.near_zero", bound=f"{size(bound)}{unit}")
+            name = f"{name} of {plain(channels[i])}"
+        within = f"within ±{size(bound)}{unit}"
         tail = f"; {noise.tails[i]}" if i < len(noise.tails) else ""
         rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}{tail}"))
     return rows
@@ -70,8 +65,8 @@ def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple
 
 def _drift_text(name: str, text: str) -> str:
     if name == "drift":
-        return term("noise.drift_size", size=text)
-    return term("noise.drift_below", period=text)
+        return f"{text}, its standard deviation over the recording"
+    return f"period {text}"
 
 
 def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -79,30 +74,30 @@ def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]
     each = list(value) if isinstance(value, Sequence) else [value]
     for i, item in enumerate(each):
         if not isinstance(item, Sequence) or item:
-            name = term("noise.memory")
+            name = "autoregression"
             if len(each) > 1 and i < len(channels):
-                name = term("noise.of_channel", name=name, channel=plain(channels[i]))
+                name = f"{name} of {plain(channels[i])}"
             text = measured(item, None, "")[0].removeprefix("(").removesuffix(")")
-            yield name, term("noise.coefficients", coefficients=text)
+            yield name, f"coefficients {text}"
 
 
 def channel_notes(channels: Sequence[str]) -> str:
     """Return the meaning of a magnetometer's channels; empty for other simulations."""
-    return "; ".join(term(note) for name, note in _CHANNELS.items() if name in channels)
+    return "; ".join(note for name, note in _CHANNELS.items() if name in channels)
 
 
 def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
     """Return RMSE, log-likelihood, σ and d of each model on held-out blocks."""
-    rows = [(term("table.as_it_is"), diagnosis.baseline)]
+    rows = [("the simulation without findings", diagnosis.baseline)]
     if diagnosis.findings:
-        rows.append((term("table.with_findings"), diagnosis.corrected))
+        rows.append(("with the findings", diagnosis.corrected))
     if diagnosis.ceiling is not None and _shown(diagnosis):
-        rows.append((term("table.with_smooth"), diagnosis.ceiling))
+        rows.append(("with a smooth correction by all recorded columns", diagnosis.ceiling))
     return [
         (
             name,
             [
-                size(s.rmse) if _one_unit(diagnosis) else term("number.none"),
+                size(s.rmse) if _one_unit(diagnosis) else "–",
                 number(s.log_likelihood, 3),
                 several([bandwidth(v) for v in s.sigma]),
                 several([size(v) for v in s.d]),
@@ -118,9 +113,11 @@ def smooth_fit(diagnosis: Diagnosis) -> str:
     if d.ceiling is None or not d.ceiling.rmse < _CLEARLY * d.corrected.rmse or not _one_unit(d):
         return ""
     unit = plain(d.traces.unit)
-    smooth = term("noise.smooth_reaches", residual=f"{size(d.ceiling.rmse)} {unit}".rstrip())
+    smooth = f"a smooth correction by all recorded columns and by time reaches {size(d.ceiling.rmse)} {unit}".rstrip()
     residual = f"{size(d.corrected.rmse)} {unit}".rstrip()
-    return term("noise.smooth" if d.findings else "noise.smooth_alone", smooth=smooth, residual=residual)
+    return ("{smooth}; with the findings {residual}" if d.findings else "{smooth}; the residual is {residual}").format(
+        smooth=smooth, residual=residual
+    )
 
 
 def _shown(diagnosis: Diagnosis) -> bool:

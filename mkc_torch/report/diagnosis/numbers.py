@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, superscript
 from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
@@ -53,8 +52,8 @@ class TimeFormat:
             ('41.3 s', 'sample 812')
         """
         if self.has_time:
-            return term("where.moment", moment=number(value, self.places))
-        return term("where.moment_of_samples", moment=number(value, 0))
+            return f"{number(value, self.places)} s"
+        return f"sample {number(value, 0)}"
 
     def interval(self, start: float, end: float) -> str:
         """Format an interval.
@@ -64,8 +63,8 @@ class TimeFormat:
             ('12.0 to 18.4 s', 'sample 3 to 9')
         """
         if self.has_time:
-            return term("where.interval", start=number(start, self.places), end=number(end, self.places))
-        return term("where.interval_of_samples", start=number(start, 0), end=number(end, 0))
+            return f"{number(start, self.places)} to {number(end, self.places)} s"
+        return f"sample {number(start, 0)} to {number(end, 0)}"
 
 
 def clock_of(traces: Traces) -> TimeFormat:
@@ -95,11 +94,11 @@ def measured(value: Number, error: Number | None, unit: str) -> list[str]:
         rest = len(cells) - _MOST_NUMBERS
         text = ", ".join(cells[:_MOST_NUMBERS])
         if rest > 0:
-            text = term("number.more", first=text, count=rest)
+            text = f"{text}, … {rest} more"
         bare = isinstance(value, (int, float)) and not (digits.power and "±" in text)
         lines.append((text if bare else f"({text})") + digits.factor + (f" {plain(unit)}" if unit else ""))
     more = len(rows) - _MOST_NUMBERS
-    return [*lines, term("number.more_rows", count=more)] if more > 0 else lines
+    return [*lines, f"… {more} more rows"] if more > 0 else lines
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ class _Digits:
     def cell(self, value: float, error: float) -> str:
         """Format a number with its error, without the power of ten."""
         if not math.isfinite(value):
-            return term("number.not_known")
+            return "unknown"
         text, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
         return f"{text} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else text
 
@@ -156,7 +155,7 @@ def parameter_name(parameter: EffectParameter) -> str:
     """
     name = plain(parameter.name)
     curve = re.fullmatch(r"legendre_(\d+)", name)
-    return term("finding.amplitude", degree=_lowered(curve[1])) if curve else name.replace("_", " ")
+    return f"amplitude of P{_lowered(curve[1])}" if curve else name.replace("_", " ")
 
 
 def _lowered(digits: str) -> str:
@@ -179,9 +178,9 @@ def parameter_lines(parameter: EffectParameter, channels: Sequence[str]) -> list
     p = parameter
     if not p.components or tuple(p.components) == tuple(channels):
         lines = measured(p.value, p.standard_error, p.unit)
-        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, {term('number.no_error')}"]
+        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, standard error not estimated"]
     each = _listed(p)
-    return each if _known(p.standard_error) else [*each, term("number.no_error")]
+    return each if _known(p.standard_error) else [*each, "standard error not estimated"]
 
 
 def _listed(parameter: EffectParameter) -> list[str]:
@@ -220,7 +219,7 @@ def largest(parameter: EffectParameter) -> str:
     if len(p.components) < _LONG:
         return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
     (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
-    return term("finding.largest", parameter=parameter_name(p), largest=_listed(p)[sizes.index(max(sizes))])
+    return f"{parameter_name(p)} up to {_listed(p)[sizes.index(max(sizes))]}"
 
 
 def probability(value: float) -> str:
@@ -241,34 +240,31 @@ def evidence(value: float | None, surrogates: int) -> str:
         ('p = 0.005 (the minimum with 199 surrogates)', 'p = 0.02', 'unknown: no p-value was computed')
     """
     if value is None:
-        return term("evidence.no_p_value")
+        return "unknown: no p-value was computed"
     if not _least(value, surrogates):
         return probability(value)
-    return term("evidence.smallest", p=probability(value), surrogates=f"{surrogates:,}")
+    return f"{probability(value)} (the minimum with {surrogates:,} surrogates)"
 
 
 def _least(value: float, surrogates: int) -> bool:
     return surrogates > 0 and value <= (1.0 + 1e-9) / (1 + surrogates)
 
 
-def gain(held_out: HeldOut, *, short: bool = False) -> str:
+def gain(held_out: HeldOut) -> str:
     """Format the gain on held-out data with its interval, to the digits of the interval.
 
     Example:
-        >>> held_out = HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT")
-        >>> gain(held_out), gain(held_out, short=True)
-        ('+0.312 nats per sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
+        >>> gain(HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT"))
+        '+0.312 nats per sample (95 %: 0.281 to 0.350)'
     """
     value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
     text = number(value, places)
     signed = text if text.startswith("−") else f"+{text}"
-    if short:
-        return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
     if not known:
-        return term("evidence.gain_alone", gain=signed)
-    return term("evidence.gain", gain=signed, low=number(low, places), high=number(high, places))
+        return f"{signed} nats per sample (unknown interval)"
+    return f"{signed} nats per sample (95 %: {number(low, places)} to {number(high, places)})"
 
 
 def improvement(before: float, after: float, unit: str) -> str:
@@ -283,8 +279,8 @@ def improvement(before: float, after: float, unit: str) -> str:
         return sizes
     less = 1.0 - after / before
     if abs(less) < 5e-4:
-        return f"{sizes} ({term('evidence.no_change')})"
-    text = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
+        return f"{sizes} (no change)"
+    text = ("{change} less" if less > 0 else "{change} more").format(change=share(abs(less)))
     return f"{sizes} ({text})"
 
 
@@ -295,4 +291,4 @@ def behind(candidate: CandidateScore) -> str:
         >>> behind(CandidateScore("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
         '30.2'
     """
-    return size(candidate.behind) if math.isfinite(candidate.behind) else term("evidence.not_possible")
+    return size(candidate.behind) if math.isfinite(candidate.behind) else "not possible"

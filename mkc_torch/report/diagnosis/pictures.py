@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mkc_torch._support.drawing import DARK_ORANGE, array, style
-from mkc_torch._words.terms import term
 from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_curve, draw_map, named, of_time, units_of_outputs
 from mkc_torch.diagnosis.plot.residual import (
     MOMENTS,
@@ -53,13 +52,13 @@ def over_time(diagnosis: Diagnosis) -> str:
                 mark_findings(ax, findings)
                 mark_rejected(ax, diagnosis.rejected_intervals)
             draw_residuals(axes, t, array(t.time), row, unit_of_channel(t, diagnosis.environment, row))
-            for ax, moment in zip(axes, MOMENTS if findings else ("label.residual",), strict=True):
+            for ax, moment in zip(axes, MOMENTS if findings else ("residual",), strict=True):
                 draw_floor(ax, known.get(t.channels[row]))
                 ax.set_xlabel(of_time(t.has_time))
                 title(ax, of_channel(moment, t.channels[row]), above=above)
                 if above:
                     _number(ax, findings)
-        return panels.markup("time", term("picture.about_time"))
+        return panels.markup("time", "Residual over time before and after the findings were added to the simulation")
 
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
@@ -97,8 +96,8 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         if curve is not None:
             ax = alone.axes()
             draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if together else 2 * MOST_LETTERS)
-            title(ax, term("picture.curve"))
-        name, about = f"finding{index + 1}", term("picture.about_finding", number=index + 1)
+            title(ax, "Effect, 95 % band")
+        name, about = f"finding{index + 1}", f"Curve of finding {index + 1}, and the residual over its drivers"
         above = alone.markup(f"{name}-curve", about) if curve is not None and not together else ""
         return above + (panels.markup(name, about) if rows else "")
 
@@ -114,7 +113,7 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
         low, width = ax.get_position().y0, ax.get_position().x1
         bar = ax.figure.add_axes((width + 0.03, low, 0.025, ax.get_position().height))
         draw_map(ax, found, units_of_outputs(diagnosis.environment), bar)
-        return panels.markup(f"map{index + 1}", term("picture.about_map", number=index + 1))
+        return panels.markup(f"map{index + 1}", f"Gain of finding {index + 1} over the states")
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 
 __all__ = ["recording_called"]
@@ -15,5 +14,5 @@ def recording_called(number: int, name: str) -> str:
         >>> recording_called(2, "b.csv"), recording_called(2, "recording 2")
         ('recording 2 (b.csv)', 'recording 2')
     """
-    known = term("where.recording", number=number)
-    return known if name in ("", known) else term("where.recording_of_name", number=number, name=plain(name))
+    known = f"recording {number}"
+    return known if name in ("", known) else f"recording {number} ({plain(name)})"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
@@ -27,65 +26,66 @@ def summary(diagnosis: Diagnosis) -> list[Row]:
     """Return the rows of the summary."""
     d = diagnosis
     follows = output_lines(d)
-    rows = [_row("label.follows", *follows)] if follows else []
+    rows = [_row("fit", *follows)] if follows else []
     if d.verdict == "unfit":
-        return [*rows, *([_row("label.why", *reasons(d))] if d.environment.reasons else [])]
-    noise = _row("label.noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
+        return [*rows, *([_row("why", *reasons(d))] if d.environment.reasons else [])]
+    noise = _row("noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
     rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
     smooth = "" if d.findings else smooth_fit(d)
     if smooth:
-        rows.append(_row("label.for_comparison", f"{capital(smooth)}."))
+        rows.append(_row("for comparison", f"{capital(smooth)}."))
     return rows
 
 
-def _row(key: str, *lines: str) -> Row:
-    return capital(term(key)), lines
+def _row(label: str, *lines: str) -> Row:
+    return capital(label), lines
 
 
 def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
     d = diagnosis
     if not d.findings:
         if not d.environment.goodness_of_fit:
-            yield _row("label.residual", residual_alone(d))
-        yield _row("label.how_sure", *_process_noise_evidence(d), chance(d.p_value, d))
+            yield _row("residual", residual_alone(d))
+        yield _row("how sure", *_process_noise_evidence(d), chance(d.p_value, d))
         return
     if len(d.findings) > 1:
         for number, f in enumerate(d.findings, 1):
             yield f"{number} · {capital(finding_name(f))}", tuple(_in_short(f, d))
         together = residual_of_all(d)
         if together:
-            yield _row("label.together", *(term("evidence.on_unseen", change=change) for change in together))
-        yield _row("label.how_sure", chance(d.findings[0].p_value, d))
+            yield _row("together", *(f"On held-out data: {change}." for change in together))
+        yield _row("how sure", chance(d.findings[0].p_value, d))
         return
     (f,) = d.findings
     text = _sizes(f, 2)
     if text:
-        yield _row("label.how_large", f"{text}.")
-    yield _row("label.where", f"{_place(f, d)}.")
-    yield _row("label.how_sure", chance(f.p_value, d))
+        yield _row("how large", f"{text}.")
+    yield _row("where", f"{_place(f, d)}.")
+    yield _row("how sure", chance(f.p_value, d))
     if f.held_out is None:
-        yield _row("label.how_much_better", f"{capital(term('evidence.not_measured'))}: {_closed(f.held_out_note)}")
+        yield _row("how much better", f"Not measured: {_closed(f.held_out_note)}")
         return
     sure = f"{capital(better(f.held_out))}; {gain(f.held_out)}."
-    sizes = [term("evidence.on_unseen", change=residual) for residual in residuals(f.held_out, d.environment)]
-    yield _row("label.how_much_better", *sizes, sure, *filter(None, [diverged(f.held_out)]))
+    sizes = [f"On held-out data: {residual}." for residual in residuals(f.held_out, d.environment)]
+    yield _row("how much better", *sizes, sure, *filter(None, [diverged(f.held_out)]))
 
 
 def _process_noise_evidence(diagnosis: Diagnosis) -> Iterator[str]:
     """State the evidence for process noise, and that no physics is significant."""
     known = [process for process in diagnosis.environment.process_noise if math.isfinite(process.log_likelihood_gain)]
     if known:
-        yield term(
-            "environment.process_noise_gain", nats=size(known[0].log_likelihood_gain), place=plain(known[0].place)
+        yield (
+            f"A model without this noise of `{plain(known[0].place)}` is "
+            f"{size(known[0].log_likelihood_gain)} nats less likely."
         )
         if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
-            yield term("environment.no_physics")
+            yield "No physics is significant in addition to it."
 
 
 def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
     """Return grade, size, place and significance of one of several findings."""
     f = finding
-    rival = f"; {term('evidence.rivals', rivals=rivals(f))}" if inseparable(f) else ""
+    rival = f"; not distinguished from: {rivals(f)}" if inseparable(f) else ""
     yield f"{capital(grade(f))}{rival}."
     text = _sizes(f, 1)
     if text:
@@ -93,7 +93,7 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
     yield f"{_place(f, diagnosis)}."
     sure = evidence(None, 0) if f.p_value is None else probability(f.p_value)
     if f.held_out is None:
-        yield f"{sure}; {term('evidence.not_measured')}: {_closed(f.held_out_note)}"
+        yield f"{sure}; not measured: {_closed(f.held_out_note)}"
         return
     yield f"{sure}; {better(f.held_out)}: {'; '.join(residuals(f.held_out, diagnosis.environment))}."
 
@@ -115,7 +115,8 @@ def _place(finding: Finding, diagnosis: Diagnosis) -> str:
 def residual_alone(diagnosis: Diagnosis) -> str:
     """Return the residual of the simulation without findings."""
     d = diagnosis
-    return term("verdict.residual", residual=f"{size(d.baseline.rmse)} {plain(d.traces.unit)}".rstrip())
+    residual = f"{size(d.baseline.rmse)} {plain(d.traces.unit)}".rstrip()
+    return f"{residual}, root mean square on held-out data."
 
 
 def chance(p_value: float | None, diagnosis: Diagnosis) -> str:
@@ -123,9 +124,4 @@ def chance(p_value: float | None, diagnosis: Diagnosis) -> str:
     d = diagnosis
     if p_value is None:
         return f"{capital(evidence(None, 0))}."
-    return term(
-        "verdict.chance",
-        candidates=f"{d.candidates_tried:,}",
-        evidence=evidence(p_value, d.surrogates),
-        level=f"{d.level:g}",
-    )
+    return f"{evidence(p_value, d.surrogates)}, corrected for {d.candidates_tried:,} candidates (level {d.level:g})."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, vetoed
@@ -15,10 +14,10 @@ from mkc_torch.report.words.numbers import size
 __all__ = ["better", "diverged", "residual_of_all", "residuals"]
 
 _BETTER = {
-    "surely": "evidence.surely",
-    "probably": "evidence.probably",
-    "not shown": "evidence.not_shown",
-    "worse": "evidence.worse",
+    "surely": "surely better on held-out blocks",
+    "probably": "probably better on held-out blocks, not surely",
+    "not shown": "not shown to be better on held-out blocks",
+    "worse": "worse on held-out blocks",
 }
 _UNCHANGED = 5e-4
 """Share by which a residual must shrink for "surely better"."""
@@ -35,18 +34,25 @@ def better(held_out: HeldOut) -> str:
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
     text, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)
-    return term("evidence.because", better=term(text), reason=reason) if reason else term(text)
+    return f"{text}: {reason}" if reason else text
 
 
 def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
     """Return key and reason if the open-loop residual decides."""
     if vetoed(held_out):
         if kind in ("surely", "probably"):
-            return _BETTER["not shown"], term("evidence.free_run_farther")
+            return _BETTER[
+                "not shown"
+            ], "the open-loop residual is larger there, although one-step predictions are more likely"
         return _by_likelihood(held_out, kind)
     if kind == "surely":
         return _by_likelihood(held_out, kind)
-    return "evidence.not_against", term("evidence.free_run_closer") if kind == "worse" else ""
+    return (
+        "held-out blocks do not reject it",
+        "the open-loop residual is smaller there, although one-step predictions are less likely"
+        if kind == "worse"
+        else "",
+    )
 
 
 def _by_likelihood(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
@@ -55,10 +61,14 @@ def _by_likelihood(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
     if kind == "surely":
         if less >= _UNCHANGED:
             return _BETTER[kind], ""
-        return "evidence.surely_more_likely", term("evidence.in_the_tail")
+        return "surely more likely on held-out blocks", "the gain is in the tail of the residual, not in its centre"
     if less < SMALL:
         return _BETTER[kind], ""
-    why = term("evidence.tail_less_likely" if kind == "worse" else "evidence.blocks_differ")
+    why = (
+        "the loss is in the tail of the residual, not in its centre"
+        if kind == "worse"
+        else "the gain varies between blocks by more than its mean, so it may be chance"
+    )
     return _BETTER[kind], _within(_diverged(held_out)) or why
 
 
@@ -85,10 +95,20 @@ def _diverged(held_out: HeldOut) -> str:
     before, after = (sum(getattr(b, side) for b in held_out.diverged_blocks) for side in ("before", "after"))
     if not before and not after:
         return ""
-    key = "evidence.diverged_both" if before and after else "evidence.diverged_before"
+    key = (
+        (
+            "The open-loop simulation diverges in {before} of {blocks} blocks without the finding, in "
+            "{after} with it; no mean includes them."
+        )
+        if before and after
+        else (
+            "The open-loop simulation diverges in {before} of {blocks} blocks without the finding; no "
+            "mean includes them."
+        )
+    )
     if after and not before:
-        key = "evidence.diverged_after"
-    return term(key, before=before, after=after, blocks=held_out.blocks)
+        key = "The open-loop simulation diverges in {after} of {blocks} blocks with the finding; no mean includes them."
+    return key.format(before=before, after=after, blocks=held_out.blocks)
 
 
 def residuals(held_out: HeldOut, environment: NoiseEnvironment) -> list[str]:
@@ -103,7 +123,7 @@ def residuals(held_out: HeldOut, environment: NoiseEnvironment) -> list[str]:
     """
     if not held_out.outputs:
         text = improvement(held_out.rmse_before, held_out.rmse_after, held_out.unit)
-        return [term("evidence.of_residual", change=text)]
+        return [f"residual {text}"]
     return [_of_output(name, sizes, environment) for name, sizes in held_out.outputs.items()]
 
 
@@ -111,8 +131,8 @@ def _of_output(name: str, sizes: ResidualSizes, environment: NoiseEnvironment) -
     text = improvement(sizes.before, sizes.after, sizes.unit)
     floor = next((fit.noise_floor for fit in environment.goodness_of_fit if fit.output == name), math.nan)
     if math.isfinite(floor):
-        text = term("evidence.with_floor", change=text, floor=f"{size(floor)} {plain(sizes.unit)}".rstrip())
-    return term("evidence.output_size", output=plain(name), change=text)
+        text = f"{text}, noise floor {size(floor)} {plain(sizes.unit)}".rstrip()
+    return f"{plain(name)} {text}"
 
 
 def residual_of_all(diagnosis: Diagnosis) -> list[str]:
@@ -130,4 +150,4 @@ def residual_of_all(diagnosis: Diagnosis) -> list[str]:
     if len(d.traces.channels) > 1 and not d.traces.unit:
         return []
     text = improvement(d.baseline.rmse, d.corrected.rmse, d.traces.unit)
-    return [term("evidence.of_residual", change=text)]
+    return [f"residual {text}"]

@@ -8,13 +8,14 @@ import shlex
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
-from mkc_torch.diagnosis.result import Diagnosis, Finding, notices
-from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
-from mkc_torch.report.words.numbers import size
+from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
+from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
+from mkc_torch.report.diagnosis.unseen import residual_of_all
+from mkc_torch.report.words.numbers import share, size
 from mkc_torch.report.words.verdict import disturbed
 
 __all__ = [
@@ -51,15 +52,15 @@ class RunPaths(NamedTuple):
 
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit or unnamed
-structure.
+"""Style of a headline: nothing missing; named physics missing; nothing worth correcting; poor fit, unnamed
+structure, or another doubt.
 """
 
 
 def tone(diagnosis: Diagnosis) -> Tone:
     """Return the style of the headline."""
     d = diagnosis
-    if d.verdict in ("unfit", "unexplained"):
+    if d.verdict in ("unfit", "unexplained") or {"not_better", "much_rejected"} & set(diagnosis_doubts(d)):
         return "open"
     if any(worth_correcting(f) for f in d.findings):
         return "found"
@@ -69,18 +70,30 @@ def tone(diagnosis: Diagnosis) -> Tone:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences, the findings by grade; a disturbed measurement comes first."""
-    disturbance = disturbed(diagnosis.rejected_intervals)
-    return f"{disturbance} {_verdict(diagnosis)}" if disturbance else _verdict(diagnosis)
+    """Return the verdict in a few sentences, the findings by grade; a doubt and a disturbed measurement come first."""
+    first = (_doubtful(diagnosis), disturbed(diagnosis.rejected_intervals))
+    return " ".join(filter(None, [*first, _verdict(diagnosis)]))
+
+
+def _doubtful(diagnosis: Diagnosis) -> str:
+    """Return the reasons for doubt that the verdict does not state; empty if there are none."""
+    found = diagnosis_doubts(diagnosis)
+    reasons = []
+    if "not_better" in found:
+        sizes = "; ".join(residual_of_all(diagnosis))
+        reasons.append("the findings do not make the residual smaller" + (f" ({sizes})" if sizes else ""))
+    if "much_rejected" in found:
+        reasons.append(f"{share(rejected_share(diagnosis))} of the samples were rejected")
+    return f"Doubtful: {' and '.join(reasons)}." if reasons else ""
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.environment)):
-        return term("verdict.unfit")
+        return VERDICT_SENTENCES["unfit"]
     if nothing_shows(d):
         real = [f for f in d.findings if f.grade != "unconfirmed"]
-        return f"{term('verdict.not_worth')} {_found(real)}" if real else term("verdict.nothing")
+        return f"No missing physics is worth correcting. {_found(real)}" if real else VERDICT_SENTENCES["adequate"]
     sentences = [_found(d.findings), unexplained(d)]
     if not any(worth_correcting(f) for f in d.findings):
         sentences.reverse()  # state the unnamed structure before unconfirmed findings
@@ -89,22 +102,30 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 def _found(findings: Sequence[Finding]) -> str:
     sentences = []
-    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH, _CANNOT_BE):
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _NOT_TESTED, _UNCONFIRMED, _BOTH, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
-            sentences.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
+            names = "; ".join(_named(f, alone=len(findings) == 1) for f in of_it)
+            sentences.append(kind.format(findings=names))
     return " ".join(sentences)
 
 
-_LEFT_OUT, _NEAREST = "verdict.left_out", "verdict.nearest"
-_CANNOT_BE = "verdict.cannot_be"
-_SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.unconfirmed_and_small"
+_LEFT_OUT, _NEAREST = "Left out of the simulation: {findings}.", "Nearest in the catalogue: {findings}."
+_CANNOT_BE = "Found, but of an impossible size: {findings}."
+_NOT_TESTED = f"Found, but {NOT_TESTED}: {{findings}}."
+_SMALL, _UNCONFIRMED, _BOTH = (
+    "Real, but small compared with the noise: {findings}.",
+    "Found, but not confirmed on held-out blocks: {findings}.",
+    "Found, but not confirmed on held-out blocks and too small to be worth correcting: {findings}.",
+)
 
 
 def _kind(finding: Finding) -> str:
     """Return the key of the sentence that lists a finding."""
     if finding.grade == "unconfirmed" and finding.cannot_be:
         return _CANNOT_BE
+    if finding.grade == "unconfirmed" and finding.held_out is None:
+        return _NOT_TESTED
     if finding.grade == "unconfirmed":
         return _BOTH if small(finding) else _UNCONFIRMED
     return {"left_out": _LEFT_OUT, "small": _SMALL}.get(finding.grade, _NEAREST)
@@ -114,36 +135,54 @@ def _named(finding: Finding, *, alone: bool) -> str:
     name, others = finding_name(finding), inseparable(finding)
     if finding.grade == "nearest":
         gain = finding.shape.free_curve_gain if finding.shape is not None else math.nan
-        return term("verdict.nearest_finding", finding=name, nats=size(gain)) if math.isfinite(gain) else name
+        return f"{name} (a free curve of the same variables gains {size(gain)} nats)" if math.isfinite(gain) else name
     if not others:
         return name
     if not alone:
-        return term("verdict.or_a_rival", finding=name)
+        return f"{name}, or a rival"
     if len(others) == 1:
-        return term("verdict.or_rival", finding=name, rival=rivals(finding))
-    return term("verdict.or_many", finding=name, count=len(others))
+        return f"{name} or {rivals(finding)}, which this recording cannot distinguish"
+    return f"{name} or {len(others)} others, which this recording cannot distinguish"
 
 
 def unexplained(diagnosis: Diagnosis) -> str:
     """State the structure that no finding explains; empty if there is none."""
     d = diagnosis
     if d.stop is not None:
-        return term("verdict.unfinished")
+        return UNFINISHED
     found = any(worth_correcting(f) for f in d.findings)
     if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
-        pair = ("verdict.disturbed", "verdict.yet_disturbed") if rates else ("verdict.drift", "verdict.yet_drift")
-        return term(pair[int(found)], places=several(places))
+        pair = (
+            (
+                "Process noise acts on the rate of {places}, and no physics in the catalogue explains it.",
+                "Process noise remains on the rate of {places}.",
+            )
+            if rates
+            else (
+                ("{places} drift in addition to the sensor's noise, and no physics in the catalogue explains it."),
+                "A drift of {places} remains.",
+            )
+        )
+        return pair[int(found)].format(places=several(places))
     if d.remaining:
-        return term("verdict.yet_smooth" if found else "verdict.smooth", columns=several(d.remaining))
+        return (
+            "A smooth trend along {columns} remains that no effect in the catalogue explains."
+            if found
+            else "The residual has a smooth trend along {columns} that no effect in the catalogue explains."
+        ).format(columns=several(d.remaining))
     passed = d.p_value is not None and d.p_value <= d.level
     if not d.findings and passed and d.verdict == "adequate":
-        return term("verdict.unnamed")
+        return (
+            "The strongest candidate is significant, but no effect also predicts held-out blocks: no physics is named."
+        )
     if d.verdict != "unexplained":
         return ""
     if any(unrecorded(f) for f in d.findings):
-        return term("verdict.course_alone")
-    return term("verdict.yet_structure" if found else "verdict.structure")
+        return "Only its course over time is known."
+    if d.quick and d.findings:
+        return ""  # a finding may explain the structure, but a quick look does not test this
+    return "Structure remains that no effect in the catalogue explains." if found else VERDICT_SENTENCES["unexplained"]
 
 
 def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
@@ -160,11 +199,11 @@ def unexplained_place(diagnosis: Diagnosis) -> str:
     if not unexplained(d):
         return ""
     if d.stop is not None:
-        return term("environment.unfinished")
+        return "unknown; the search was stopped"
     if d.verdict == "unexplained" and d.environment.process_noise:
         rates, places = _driven(d)
-        return term("environment.rate_of", place=several(places)) if rates else several(places)
-    return several(d.remaining) if d.remaining else term("environment.structure")
+        return f"the rate of {several(places)}" if rates else several(places)
+    return several(d.remaining) if d.remaining else "unnamed structure"
 
 
 def reasons(diagnosis: Diagnosis) -> list[str]:

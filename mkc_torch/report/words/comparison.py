@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.differences import LEVEL, Difference, Differences
 from mkc_torch.report.words.numbers import decimals, in_power, number, power, share, size, with_errors
 
@@ -36,33 +35,36 @@ def difference_sentences(found: Differences) -> list[str]:
         ... )
         ('No significant difference: offset x differs most', ',', ' by +2.0 combined standard errors ...')
     """
+    length_max = f"{size(found.length_max)} {found.unit}".rstrip()
+    length_rms = f"{size(found.length_rms)} {found.unit}".rstrip()
+    # smaller differences are rounding errors
+    angle_max, angle_rms = (size(round(angle, _ROUNDING)) for angle in (found.angle_max, found.angle_rms))
     return [
         _verdict(found),
-        term(
-            "comparison.field",
-            samples=f"{found.samples:,}",
-            # smaller differences are rounding errors
-            angle_max=size(round(found.angle_max, _ROUNDING)),
-            angle_rms=size(round(found.angle_rms, _ROUNDING)),
-            length_max=f"{size(found.length_max)} {found.unit}".rstrip(),
-            length_rms=f"{size(found.length_rms)} {found.unit}".rstrip(),
-        ),
+        f"Over the directions of the {found.samples:,} samples in use, the corrected fields differ by at most "
+        f"{angle_max}° and {length_max}; {angle_rms}° and {length_rms} rms.",
     ]
 
 
 def _verdict(found: Differences) -> str:
     if not found.known:
-        return term("comparison.unknown")
+        return "The difference cannot be tested: a calibration has no standard errors."
     if not found.beyond:
         largest = max(found.known, key=lambda difference: abs(difference.in_errors))
-        return term("comparison.same", what=largest.name, errors=_signed(largest.in_errors), limit=f"{found.limit:.2f}")
+        return (
+            f"No significant difference: {largest.name} differs most, by {_signed(largest.in_errors)} "
+            f"combined standard errors (limit {found.limit:.2f})."
+        )
     named = [
-        term("comparison.number", what=difference.name, errors=_signed(difference.in_errors))
+        f"{difference.name} by {_signed(difference.in_errors)} combined standard errors"
         for difference in found.beyond[:_NAMED]
     ]
     if len(found.beyond) > _NAMED:
-        named.append(term("comparison.more", count=len(found.beyond) - _NAMED))
-    return term("comparison.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=share(LEVEL))
+        named.append(f"and {len(found.beyond) - _NAMED} more")
+    return (
+        f"Significant difference: {', '.join(named)}. In an unchanged sensor, a number exceeds "
+        f"{found.limit:.2f} in at most {share(LEVEL)} of cases."
+    )
 
 
 def _groups(numbers: Sequence[Difference]) -> list[list[Difference]]:
@@ -82,7 +84,7 @@ def _rows(group: Sequence[Difference]) -> list[tuple[str, str, str, str, str]]:
         unit = in_power(exponent, difference.unit)
         rows.append(
             (
-                term("table.with_unit", name=difference.name, unit=unit) if unit else difference.name,
+                f"{difference.name}, {unit}" if unit else difference.name,
                 number(difference.new / scale, places),
                 number(difference.old / scale, places),
                 with_errors([difference.new - difference.old], [difference.error], exponent)[0],

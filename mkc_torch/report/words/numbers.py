@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.result import Calibration, ResidualSpread, RestBias
 from mkc_torch.density.tails import percent_with_error
 from mkc_torch.recording.disturbance import RejectedInterval
@@ -151,13 +150,13 @@ def noise(calibration: Calibration) -> str:
     """
     c = calibration
     if c.tails is None:
-        kind = term("noise.bandwidth", sigma=bandwidth(c.sigma))
+        kind = f"σ = {bandwidth(c.sigma)}"
     elif c.tails.is_gaussian:
-        kind = term("noise.gaussian")
+        kind = "Gaussian"
     else:
         share = percent_with_error(c.tails.share_beyond, c.tails.share_error)
-        kind = term("noise.heavy_tailed", share=share)
-    return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
+        kind = f"heavy-tailed: {share} of the residuals beyond three times that (0.27 % if Gaussian)"
+    return f"{size(0.5 * c.radius * c.d)} {c.unit} along the field, {kind}"
 
 
 def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
@@ -174,42 +173,47 @@ def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
     rows = unit == "row"
     ends = [tuple(f"{end:.0f}" if rows else f"{end:.1f}" for end in interval) for interval in intervals]
     if len(intervals) == 1:
-        return term("where.between_rows" if rows else "where.between", start=ends[0][0], end=ends[0][1])
-    name = "where.interval_of_rows" if rows else "where.interval"
-    spans = [term(name, start=start, end=end) for start, end in ends]
-    each = [term("where.from", interval=span) for span in spans]
+        return ("between row {start} and row {end}" if rows else "between {start} s and {end} s").format(
+            start=ends[0][0], end=ends[0][1]
+        )
+    name = "row {start} to {end}" if rows else "{start} to {end} s"
+    spans = [name.format(start=start, end=end) for start, end in ends]
+    each = [f"from {span}" for span in spans]
     if len(intervals) > 3:
         longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
-        return term("where.in_intervals", count=len(each), longest=each[longest])
-    return term("number.and").join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
+        return f"in {len(each)} intervals, the longest {each[longest]}"
+    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def rejection(calibration: Calibration) -> str:
     """Return the share of rejected samples and their intervals."""
     c = calibration
     if c.rejected == 0:
-        return term("calibration.none_rejected", samples=f"{c.samples:,}")
-    key = "calibration.single_rejected" if c.rejected == 1 else "calibration.rejected"
-    text = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
+        return f"No sample of {c.samples:,} was rejected."
+    key = (
+        "{share} of the {samples} samples was rejected"
+        if c.rejected == 1
+        else "{share} of the {samples} samples were rejected"
+    )
+    text = key.format(share=share(c.rejected_share), samples=f"{c.samples:,}")
     if c.disturbed:
-        return term("calibration.mainly", rejected=text, when=when(c.disturbed, c.disturbed_unit))
-    return term("calibration.scattered", rejected=text)
+        return f"{text}, mainly {when(c.disturbed, c.disturbed_unit)}."
+    return f"{text}, scattered over the recording."
 
 
 def rest_bias(found: RestBias) -> str:
     """Format a gyroscope's bias from rest."""
-    return term(
-        "calibration.rest_bias",
-        bias=listed(found.value, found.standard_error),
-        errors=", ".join(size(error) for error in found.standard_error),
-        seconds=size(found.seconds),
+    return (
+        f"bias ({listed(found.value, found.standard_error)}) ± "
+        f"({', '.join(size(error) for error in found.standard_error)}) rad/s, from "
+        f"{size(found.seconds)} s of rest"
     )
 
 
 _RESPONSES = {
-    "offset": "aided.offset",
-    "offset and scale": "aided.offset_and_scale",
-    "full matrix": "aided.full_matrix",
+    "offset": "offset alone",
+    "offset and scale": "offset and scale",
+    "full matrix": "offset and full matrix",
 }
 """Keys of the responses of an aided calibration."""
 
@@ -220,20 +224,27 @@ def aided(calibration: Calibration) -> list[str]:
     if aid is None:
         return []
     rivals = [
-        term(
-            "aided.rival" if value <= 0.0 else "aided.hardly", response=term(_RESPONSES[name]), nats=f"{abs(value):.0f}"
-        )
+        (
+            "{response}: less likely by {nats} nats"
+            if value <= 0.0
+            else "{response}: more likely by {nats} nats, not significant"
+        ).format(response=_RESPONSES[name], nats=f"{abs(value):.0f}")
         for name, value in aid.evidence
         if name != aid.response
     ]
-    sentences = [term("aided.by", by=aid.by, response=term(_RESPONSES[aid.response]), rivals="; ".join(rivals))]
+    sentences = [f"By the {aid.by}: {_RESPONSES[aid.response]} ({'; '.join(rivals)})."]
     if math.isinf(aid.constant_error):
-        sentences.append(term("aided.turned", change=size(aid.heading_error)))
+        sentences.append(
+            f"Heading error: ± {size(aid.heading_error)}° variable, if the axes are the vehicle's. A "
+            "constant heading offset cannot be observed."
+        )
     else:
-        sentences.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
+        sentences.append(
+            f"Heading error: ± {size(aid.heading_error)}° variable, ± {size(aid.constant_error)}° constant."
+        )
     # the bias at rest is measured; that of the fit also absorbs errors of the turns, and would contradict it
     if calibration.rest_bias is None and aid.gyro_bias is not None and aid.gyro_bias_se is not None:
-        sentences.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
+        sentences.append(f"Gyroscope bias ({listed(aid.gyro_bias, aid.gyro_bias_se)}) rad/s.")
     return sentences
 
 
@@ -243,16 +254,13 @@ def headline(calibration: Calibration) -> list[str]:
     exponent = power(c.radius)
     unit = f"× {in_power(exponent, c.unit)}" if exponent else c.unit
     return [
-        term(
-            "calibration.result",
-            center=listed(c.center, c.center_se, exponent),
-            axes=listed(c.semi_axes, c.semi_axes_se, exponent),
-            unit=unit,
+        (
+            f"Offset ({listed(c.center, c.center_se, exponent)}) {unit}, semi-axes "
+            f"({listed(c.semi_axes, c.semi_axes_se, exponent)}) {unit}."
         ),
-        term(
-            "calibration.scatter",
-            after=f"{size(c.after.robust)} {c.unit}",
-            before=f"{size(c.before.robust)} {c.unit}",
+        (
+            f"The scatter of the field's length is {size(c.after.robust)} {c.unit}; before calibration "
+            f"{size(c.before.robust)} {c.unit}."
         ),
         rejection(c),
     ]

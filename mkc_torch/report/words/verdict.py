@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mkc_torch._words.terms import term
 from mkc_torch.calibration.quality import Doubt, disturbances, doubts
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.recording.disturbance import RejectedInterval
@@ -19,7 +18,7 @@ def calibration_verdict(calibration: Calibration) -> str:
     if reasons:
         first = f"Calibrated, but doubtful: {'; '.join(_reason(doubt, c) for doubt in reasons)}."
     else:
-        first = term("verdict.doubtful" if is_doubtful(c) else "verdict.calibrated")
+        first = "Calibrated, but read the warnings." if is_doubtful(c) else "Calibrated."
     return " ".join(filter(None, [first, disturbed(disturbances(c), c.disturbed_unit)]))
 
 

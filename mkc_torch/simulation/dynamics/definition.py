@@ -86,11 +86,11 @@ class Dynamics:
             "change of each state."
         )
 
-    def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:
         """Return the outputs by column name; default: the states."""
         return vars(x)
 
-    def actuator(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def actuator(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:
         """Return the inputs as they act on the system, by name; default: unchanged.
 
         Args:
@@ -101,7 +101,7 @@ class Dynamics:
         """
         return vars(u)
 
-    def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:
         """Return the outputs as the sensors measure them, by column name; default: unchanged.
 
         Args:

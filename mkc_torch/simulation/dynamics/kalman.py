@@ -383,12 +383,20 @@ def robust_likelihood(
     # log ratio of the outliers' density to the normal density at its mode
     odds = np.broadcast_to(tail, counts.shape)[used] + spread
     scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, 1e-300) if free else np.ones(B)
-    for _ in range(_SCALINGS if free else 0):
-        away = np.clip(odds + np.log(scale)[:, None] + 0.5 * square / scale[:, None] ** 2, None, _FAR)
-        inner = 1.0 / (1.0 + np.exp(away))
-        before, scale = scale, np.sqrt(np.maximum((inner * square).sum(-1) / inner.sum(-1), 1e-300))
-        if np.abs(scale / before - 1.0).max() < _SETTLED:
+    left = np.arange(B if free else 0)  # models whose scale has not converged
+    for _ in range(_SCALINGS):
+        if not len(left):
             break
+        own, before = square if len(left) == B else square[left], scale[left]
+        away = odds if len(left) == B else odds[left]
+        away = own * (0.5 / before**2)[:, None] + away
+        away += np.log(before)[:, None]
+        np.minimum(away, _FAR, out=away)
+        np.exp(away, out=away)
+        away += 1.0
+        inner = np.reciprocal(away, out=away)
+        scale[left] = np.sqrt(np.maximum(np.einsum("bn,bn->b", inner, own) / inner.sum(-1), 1e-300))
+        left = left[~(np.abs(scale[left] / before - 1.0) < _SETTLED)]
     scale = np.maximum(scale, least) if free else scale
     log = np.log(scale)[:, None]
     normal = -0.5 * square / scale[:, None] ** 2 - log - spread

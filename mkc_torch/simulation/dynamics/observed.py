@@ -96,7 +96,7 @@ class ObservedDynamics:
         """Number of parameters of single runs or recordings: offsets and initial states; they come last."""
         return len(self.parameter_names) - len(self.known) + len(self.own_offsets)
 
-    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:  # noqa: ARG002
+    def prior_given(self, settled: Collection[str]) -> GaussianPrior | None:
         """The prior, which no effect changes."""
         return self.prior
 

@@ -179,7 +179,7 @@ class PreparedDynamics(ObservedDynamics):
         )
         return places.ports()
 
-    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
         return self.observed(None)._start.clone()
 
     @property

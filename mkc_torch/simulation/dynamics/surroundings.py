@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -60,8 +61,12 @@ def _unit_of(system: Equations, name: str) -> str:
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
     """Whether the rate of a state depends on the states of its unit only by their difference to an input."""
     time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
-    # a parameter of 0 would hide what it multiplies
-    p = Names(**{parameter: torch.tensor(known[parameter].value or 1.0).double() for parameter in known})
+    # a parameter of 0 would hide what it multiplies; with a coefficient of 1 any input may look like the surroundings
+    values = {
+        parameter: (known[parameter].value or 1.0) * (1.0 + 0.01 * math.sqrt(number + 2.0))
+        for number, parameter in enumerate(known)
+    }
+    p = Names(**{parameter: torch.tensor(value).double() for parameter, value in values.items()})
 
     def rate(of_states: float, of_input: float) -> torch.Tensor:
         moved, driven = states.clone(), inputs.clone()

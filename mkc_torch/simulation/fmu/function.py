@@ -43,7 +43,7 @@ class _Values(torch.autograd.Function):
         return _tensor(evaluation.values(outputs, _moments(time, states, inputs, parameters)), states)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
         ctx.evaluation, ctx.outputs = inputs[:2]
         ctx.save_for_backward(*inputs[2:])
         ctx.save_for_forward(*inputs[2:])
@@ -91,11 +91,11 @@ class _Slopes(torch.autograd.Function):
         return _tensor(evaluation.slopes(outputs, _moments(time, states, inputs, parameters), group), states)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
         ctx.shape = output.shape
 
     @staticmethod
-    def backward(ctx: Any, *grads: Any) -> Any:  # noqa: ARG004
+    def backward(ctx: Any, *grads: Any) -> Any:  # noqa: ARG004 - signature of torch.autograd.Function
         raise RuntimeError("An FMU has first derivatives only; the second derivatives of its equations are not known.")
 
     @staticmethod

@@ -78,8 +78,8 @@ class View(ClosedForm):
     def signals(
         self,
         theta: Float[Tensor, " p"],
-        changes: Changes,  # noqa: ARG002
-        near: Nearby | None = None,  # noqa: ARG002
+        changes: Changes,
+        near: Nearby | None = None,
     ) -> Mapping[str, Float[Tensor, "N 3"]]:
         """At the port "sensor", the simulated measurement without the offset."""
         # not the measured field: its noise is also in the residual, and would look like a nonlinearity

@@ -30,7 +30,7 @@ def test_the_angle_is_the_command_times_its_scale(scene):
 
 
 def test_what_is_hidden_at_an_input_or_an_output_reaches_the_angle(scene):
-    def shifted(values, step, size):  # noqa: ARG001
+    def shifted(values, step, size):
         return values + size
 
     at_input = HiddenTerm("offset", "", (), 1.0, inputs=shifted)

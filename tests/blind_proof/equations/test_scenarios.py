@@ -96,7 +96,7 @@ def test_a_disturbance_makes_a_hidden_effect_harder_to_detect():
 
 
 def integrator():
-    return Plant("integrator", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)  # noqa: ARG005
+    return Plant("integrator", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -12,7 +12,7 @@ NONE = np.zeros((0, 1))
 
 def free():
     """A state that moves by its input alone."""
-    return Plant("free", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)  # noqa: ARG005
+    return Plant("free", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)
 
 
 def trial(force, begin=0.0, step=0.02):

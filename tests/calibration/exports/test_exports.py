@@ -103,6 +103,38 @@ def test_ros_parameters_give_what_apply_writes(fitted, data):
     assert np.abs(field - applied(calibration, readings)).max() < CLOSE
 
 
+def test_the_ros_file_has_the_messages_covariance_in_tesla_squared(fitted):
+    """Nine numbers, row by row, as sensor_msgs/MagneticField takes them: those of an undisturbed sample's message."""
+    yaml = pytest.importorskip("yaml")
+    values = yaml.safe_load(exported("ros-yaml", SensorCorrection.of(fitted)).text)["/**"]["ros__parameters"]
+    assert all(isinstance(v, float) for v in values["magnetic_field_covariance"])
+    found = np.array(values["magnetic_field_covariance"]).reshape(3, 3)
+    noise = 1e-6 * 0.5 * fitted.field_strength * fitted.d  # T, of a calibration in µT
+    offset = 1e-12 * np.array(fitted.matrix) @ np.diag(np.square(fitted.center_se)) @ np.array(fitted.matrix).T
+    assert found == pytest.approx(noise**2 * np.eye(3) + offset, rel=1e-9)
+    numbers = json.loads(exported("json", SensorCorrection.of(fitted)).text)
+    assert 1e-12 * numbers["covariance_xx"] == pytest.approx(found[0, 0], rel=1e-9)
+
+
+def test_a_correction_without_noise_has_no_covariance():
+    correction = SensorCorrection("a", "µT", (1.0, 2.0, 3.0), EYE, "µT")
+    assert "magnetic_field_covariance:" not in exported("ros-yaml", correction).text.partition("ros__parameters:")[2]
+    assert json.loads(exported("json", correction).text)["covariance_xy"] is None
+
+
+def test_imu_calib_corrects_an_accelerometer_as_apply_does(fitted):
+    """`corrected = SM raw - bias`, of accel_calib.cpp."""
+    yaml = pytest.importorskip("yaml")
+    matrix = ((1.1, 0.02, 0.0), (0.02, 0.9, 0.01), (0.0, 0.01, 1.0))
+    correction = SensorCorrection("imu", "m/s²", (0.01, -0.02, 0.03), matrix, "m/s²")
+    found = yaml.safe_load(exported("imu-calib", correction).text)
+    raw = np.random.default_rng(0).normal(size=(20, 3))
+    corrected = raw @ np.array(found["SM"]).reshape(3, 3).T - np.array(found["bias"])
+    assert corrected == pytest.approx((raw - correction.offset) @ np.array(correction.matrix).T, rel=1e-6, abs=1e-9)
+    with pytest.raises(ExportError, match="--quantity accel"):
+        exported("imu-calib", SensorCorrection.of(fitted))
+
+
 def test_pymavlink_reads_the_parameters_of_ardupilot(fitted, tmp_path, capsys):
     mavparm = pytest.importorskip("pymavlink.mavparm")
     text = exported("ardupilot", SensorCorrection.of(fitted)).text

@@ -10,11 +10,11 @@ from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.residual_noise import (
     density_checks,
-    density_warnings,
     kolmogorov,
     student_cdf,
     student_fit,
 )
+from mkc_torch.diagnosis.findings.evidence_warnings import density_warnings
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.timing import driver_shift_result, shifted
+from mkc_torch.diagnosis.evidence.timing import shifted
+from mkc_torch.diagnosis.findings.evidence_warnings import driver_shift_warnings
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
@@ -43,7 +44,7 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
 def warning(shift):
     effect = next(e for e in CATALOGUE if e.id == "current_field")
     column = Driver(("load",), "current", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return driver_shift_result(shift, Term(effect, column, {}), EvidenceSettings()).warnings
+    return driver_shift_warnings(shift, Term(effect, column, {}), EvidenceSettings())
 
 
 @pytest.mark.e2e
@@ -72,7 +73,7 @@ def test_where_there_is_nothing_to_shift_there_is_none():
 
 
 def test_few_copies_are_no_reason_for_a_warning():
-    assert warning(None) == warning(DriverShift(38, 3, 20.0)) == ()
+    assert warning(DriverShift(38, 3, 20.0)) == ()
     assert len(warning(DriverShift(38, 4, 20.0))) == 1
 
 

@@ -12,6 +12,7 @@ from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.run import precompute, results_of_tests
+from mkc_torch.diagnosis.findings.evidence_warnings import evidence_warnings
 from mkc_torch.diagnosis.io.diagnosis_json import _json, json_schema
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -21,6 +22,7 @@ from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
+from mkc_torch.report.diagnosis.evidence import rows, tables
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
 from tests.simulation.tumbling import tumbling
@@ -115,34 +117,31 @@ def test_what_is_said_is_json_under_names_that_the_schema_knows(answers):
 
 
 def test_texts_are_sentences_and_lines(answers):
-    for result in everything(answers):
-        assert all(
-            sentence[0].isupper() and sentence.endswith(".") for sentence in result.warnings if "_" not in sentence
-        )
-        assert all(row.label and row.text and not row.text.endswith(".") for row in result.rows)
-        if result.table is not None:
-            assert all(len(cells) == len(result.table.columns) for cells in result.table.rows)
-            assert not result.table.note or result.table.note.endswith(".")
+    assert all(w[0].isupper() and w.endswith(".") for w in evidence_warnings(answers) if "_" not in w)
+    assert all(label and text and not text.endswith(".") for label, text in rows(everything(answers)))
+    for table in tables(everything(answers)):
+        assert all(len(cells) == len(table.columns) for cells in table.rows)
+        assert not table.note or table.note.endswith(".")
 
 
-def test_warnings_are_in_the_order_of_the_tests(answers):
-    of_all, of_findings = iter(answers.of_all), [iter(said) for said in answers.of_findings]
-    expected = []
-    for test in TESTS:
-        for said in of_findings if test.each_finding else [of_all]:
-            expected += next(said).warnings
-    assert list(answers.warnings) == expected
+def test_results_and_warnings_are_in_the_order_of_the_tests(answers):
+    of_all, of_findings = iter(answers.of_all), [iter(results) for results in answers.of_findings]
+    expected = [next(each) for test in TESTS for each in (of_findings if test.each_finding else [of_all])]
+    assert [result for _, result in answers.results] == expected
+    assert list(evidence_warnings(answers)) == [
+        warning for pair in answers.results for warning in evidence_warnings(replace(answers, results=(pair,)))
+    ]
 
 
 def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
     before = [(tensor, tensor.clone()) for tensor in tensors((case, done), {})]
     random = torch.random.get_rng_state()
     again = results_of_tests(case, done)
-    assert [result.rows for result in everything(again)] == [result.rows for result in everything(answers)]
+    assert rows(everything(again)) == rows(everything(answers))
     assert [_json(result.keys) for result in everything(again)] == [
         _json(result.keys) for result in everything(answers)
     ]
-    assert again.warnings == answers.warnings
+    assert evidence_warnings(again) == evidence_warnings(answers)
     assert torch.equal(torch.random.get_rng_state(), random)
     assert before
     assert all(torch.equal(item, copy) for item, copy in before)
@@ -160,7 +159,7 @@ def test_the_order_of_the_parts_makes_no_difference(case, answers):
 def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
     def ahead(case):
         with pytest.raises(AssertionError):
-            case.final  # noqa: B018
+            case.final
         return case.seed, case.number
 
     def test(case):

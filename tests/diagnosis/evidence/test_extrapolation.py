@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.prediction import extrapolated, extrapolation_result
+from mkc_torch.diagnosis.evidence.prediction import extrapolated
+from mkc_torch.diagnosis.findings.evidence_warnings import extrapolation_warnings
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Driver, Term, find_drivers
@@ -50,7 +51,7 @@ def held_beyond(fits, seed=0):
 def warning(found):
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     load = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return extrapolation_result(found, Term(effect, load, {}), EvidenceSettings()).warnings
+    return () if found is None else extrapolation_warnings(found, Term(effect, load, {}), EvidenceSettings())
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.rejected import rejected_intervals, rejected_warning
+from mkc_torch.diagnosis.evidence.rejected import rejected_intervals
+from mkc_torch.diagnosis.findings.evidence_warnings import rejected_warnings
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -20,7 +21,7 @@ def weights(*stretches):
 
 def test_the_longest_stretches_are_named_in_order_of_time():
     stretches = weights((5.0, 6.0), (20.0, 23.0), (30.0, 30.8), (40.0, 42.0), (50.0, 50.2))
-    (sentence,) = rejected_warning(rejected_intervals(TIME, stretches, Settings()))
+    (sentence,) = rejected_warnings(rejected_intervals(TIME, stretches, Settings()))
     assert "from 5.0 to 6.0 s, from 20.0 to 23.0 s, from 40.0 to 42.0 s and in 1 shorter" in sentence
 
 
@@ -28,7 +29,7 @@ def test_the_longest_stretches_are_named_in_order_of_time():
 def test_short_stretches_are_not_reported(stretches):
     known = weights(*stretches) if stretches else torch.ones(3000, 1)
     assert rejected_intervals(TIME, known, Settings()) == ()
-    assert rejected_warning(()) == ()
+    assert rejected_warnings(()) == ()
 
 
 @pytest.mark.e2e

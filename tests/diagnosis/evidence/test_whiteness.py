@@ -10,6 +10,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.residual_noise import whiteness
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.report.diagnosis.evidence import rows
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
@@ -76,15 +77,14 @@ def test_a_diagnosis_reports_whiteness_without_a_warning():
         diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, sensor=sensor), effects=(), surrogates=19)
         for sensor in (0.0 * slow, slow)
     )
-    (row,) = (row for result in white.evidence for row in result.rows)
-    assert (row.label, row.text) == ("residual", "white")
-    (row,) = (row for result in coloured.evidence for row in result.rows)
-    assert row.text.startswith("correlated up to 0.")
-    assert row.text.endswith(" s")
+    assert rows(white.evidence) == [("residual", "white")]
+    ((_, text),) = rows(coloured.evidence)
+    assert text.startswith("correlated up to 0.")
+    assert text.endswith(" s")
     content = json.loads(diagnosis_to_json(coloured))["evidence"]["whiteness"]
     assert content["unit"] == "s"
     (channel,) = content["channels"]
     assert (channel["channel"], channel["white"]) == ("norm", False)
-    assert row.text == f"correlated up to {channel['lag']:.3g} s"
+    assert text == f"correlated up to {channel['lag']:.3g} s"
     assert channel["p_value"] < 0.005
     assert coloured.warnings == white.warnings

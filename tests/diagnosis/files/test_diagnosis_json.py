@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("jsonschema")
 
 from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import prediction, residual_noise, timing
 from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
@@ -23,11 +21,7 @@ from mkc_torch.diagnosis.result import (
     Region,
     Stop,
 )
-from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.factory import make_diagnosis, with_evidence
-
-BY_LOAD = Term(CATALOGUE[0], Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",)), {})
 
 
 def written(diagnosis):
@@ -56,7 +50,8 @@ def test_diagnoses_of_every_size_are_written(findings, channels):
 
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
-        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "goodness_of_fit", "reasons",
+        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "doubts", "goodness_of_fit",
+        "reasons",
         "noise",
         "search", "findings", "disturbance", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
         "notes", "rejected_intervals",
@@ -80,7 +75,7 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 def test_what_is_for_the_report_alone_is_not_written():
     diagnosis = with_finding(
         make_diagnosis(1),
-        prediction.extrapolation_result(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings()),
+        prediction.extrapolation_result(Extrapolation(0.2, (0.1, 0.3))),
     )
     assert written(diagnosis) == written(make_diagnosis(1))
 
@@ -96,11 +91,9 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
 
 
 def test_what_shifted_copies_of_a_driver_gain_is_written():
-    (finding,) = written(
-        with_finding(
-            make_diagnosis(1), timing.driver_shift_result(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings())
-        )
-    )["findings"]
+    (finding,) = written(with_finding(make_diagnosis(1), timing.driver_shift_result(DriverShift(38, 2, 22.5))))[
+        "findings"
+    ]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
 
@@ -130,9 +123,7 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     tails = (ChannelTails(31.5, 0.041, 0.006),)
     noise = dataclasses.replace(made.noise, units={"drift": "µT"}, unit="µT", tails=tails)
-    stored = written(
-        with_evidence(dataclasses.replace(made, noise=noise), residual_noise.as_result([check], EvidenceSettings()))
-    )["noise"]
+    stored = written(with_evidence(dataclasses.replace(made, noise=noise), residual_noise.as_result([check])))["noise"]
     assert (stored["unit"], stored["units"]) == ("µT", {"drift": "µT"})
     assert stored["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
     assert stored["density_check"] == [

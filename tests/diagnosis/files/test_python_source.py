@@ -17,9 +17,9 @@ from mkc_torch.simulation import Dynamics
 
 class Vessel(Dynamics):
     states = ("level",)
-    parameters = {"drain": 0.5}  # noqa: RUF012
+    parameters = {"drain": 0.5}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return (-p.drain * x.level,)
 
 
@@ -58,11 +58,11 @@ class Cart(Dynamics):
 
     states = ("height", "side", "speed", "drift")
     inputs = ("force",)
-    parameters = {"damping": 0.3}  # noqa: RUF012
-    units = {"height": "m", "side": "m", "speed": "m/s", "drift": "m/s", "force": "m/s²"}  # noqa: RUF012
+    parameters = {"damping": 0.3}
+    units = {"height": "m", "side": "m", "speed": "m/s", "drift": "m/s", "force": "m/s²"}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return [x.speed, x.drift, u.force - 4.0 * x.height - p.damping * x.speed, -3.0 * x.side - 0.2 * x.drift]
 
 
@@ -120,11 +120,11 @@ def test_the_corrected_class_simulates_what_the_model_does(names):
 
 class Heater(Dynamics):
     states, inputs = ("temp",), ("power", "outside")
-    parameters = {"loss": 0.1}  # noqa: RUF012
-    units = {"temp": "°C"}  # noqa: RUF012
+    parameters = {"loss": 0.1}
+    units = {"temp": "°C"}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"temp": u.power - p.loss * (x.temp - u.outside)}
 
 

@@ -22,10 +22,10 @@ TIME = torch.arange(200, dtype=torch.float64) / 10.0
 
 class Tank(Dynamics):
     states, inputs = ("level",), ("pump",)
-    parameters = {"drain": 0.3}  # noqa: RUF012
-    units = {"level": "cm", "pump": "V"}  # noqa: RUF012
+    parameters = {"drain": 0.3}
+    units = {"level": "cm", "pump": "V"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": u.pump - p.drain * x.level}
 
 

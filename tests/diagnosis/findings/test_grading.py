@@ -1,5 +1,7 @@
 """The grade of a finding."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -30,3 +32,11 @@ def test_what_has_no_size_is_not_confirmed_whatever_blocks_show(numbers, none):
     found = finding(*numbers)
     assert is_zero_within_error(found) is none
     assert grade_of(found) == ("unconfirmed" if none else "left_out")
+
+
+def test_a_size_with_a_flat_likelihood_is_not_zero():
+    """A second store ten times as large as the first, or thirty times: the data exclude only that there is none."""
+    found = dataclasses.replace(finding((8.4, 13.8), (45000.0, None)), clearly_better=True)
+    assert not is_zero_within_error(found)
+    assert grade_of(found) == "left_out"
+    assert grade_of(dataclasses.replace(found, clearly_better=False)) == "unconfirmed"

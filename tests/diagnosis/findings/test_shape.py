@@ -30,11 +30,11 @@ class Boat(Dynamics):
     states = ("speed",)
     inputs = ("thrust",)
     outputs = ("speed",)
-    units = {"speed": "m/s", "thrust": "m/s²"}  # noqa: RUF012
-    parameters = {"gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+    units = {"speed": "m/s", "thrust": "m/s²"}
+    parameters = {"gain": Parameter(1.0, lower=0.0)}
     input_hold = "held"
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.gain * u.thrust}
 
 

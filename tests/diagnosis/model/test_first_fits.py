@@ -22,12 +22,12 @@ class Motor(Dynamics):
     """A first-order motor; its state is measured in another unit, and the given friction has the wrong sign."""
 
     states, inputs, outputs = ("speed",), ("voltage",), ("rpm",)
-    parameters = {"friction": 30.0, "gain": 1.0}  # noqa: RUF012
+    parameters = {"friction": 30.0, "gain": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.friction * x.speed + p.gain * u.voltage}
 
-    def output(self, time, x, u, p):  # noqa: ARG002
+    def output(self, time, x, u, p):
         return {"rpm": 9.55 * x.speed}
 
 
@@ -35,19 +35,19 @@ class Room(Dynamics):
     """A heated room; its thermometer has another unit, and the given loss has the wrong sign."""
 
     states, inputs, outputs = ("air",), ("heat", "ambient"), ("indoor",)
-    parameters = {"loss": -3.0, "gain": 1.0}  # noqa: RUF012
+    parameters = {"loss": -3.0, "gain": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"air": p.loss * (u.ambient - x.air) + p.gain * u.heat}
 
-    def output(self, time, x, u, p):  # noqa: ARG002
+    def output(self, time, x, u, p):
         return {"indoor": 32.0 + 1.8 * x.air}
 
 
 class Decay(Dynamics):
     states, parameters = ("level",), {"rate": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 

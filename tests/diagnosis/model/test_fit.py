@@ -13,10 +13,10 @@ NOISE = 0.002
 
 class Decay(Dynamics):
     states = ("level",)
-    parameters = {"rate": Parameter(0.5, lower=0.0)}  # noqa: RUF012
+    parameters = {"rate": Parameter(0.5, lower=0.0)}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 

@@ -26,7 +26,7 @@ class Cubic(GainEffect):
     id = "cubic"
     port = "mixed"
 
-    def change(self, gamma, shape, context):  # noqa: ARG002
+    def change(self, gamma, shape, context):
         return gamma * context.signal.pow(3)
 
 
@@ -34,7 +34,7 @@ class Summed(GainEffect):
     id = "leak"
     port = "summed"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return context.time
 
 

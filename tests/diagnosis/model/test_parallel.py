@@ -28,9 +28,9 @@ class Along(GainEffect):
 
 class Decay(Dynamics):
     states = ("level",)
-    parameters = {"rate": 1.0}  # noqa: RUF012
+    parameters = {"rate": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 

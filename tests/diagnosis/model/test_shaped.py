@@ -23,10 +23,10 @@ class Lag(Dynamics):
 
     states = ("level",)
     inputs = ("drive",)
-    parameters = {"rate": Parameter(2.0, lower=0.0)}  # noqa: RUF012
+    parameters = {"rate": Parameter(2.0, lower=0.0)}
     step = 0.05
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": p.rate * (u.drive - x.level)}
 
 
@@ -171,5 +171,5 @@ def test_an_empty_range_raises(wrong):
     fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
     term = fit.model.terms[-1]
     effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()
-    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation .*limit, softness.* but got `\w+`"):
+    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation.*limit, softness.*got `\w+`"):
         reach_of(replace(term, effect=effect), fit.model.prepared)

@@ -24,9 +24,9 @@ EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "q
 class Sled(Dynamics):
     states = ("place", "speed")
     inputs = ("force",)
-    parameters = {"damping": 0.5}  # noqa: RUF012
+    parameters = {"damping": 0.5}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"place": x.speed, "speed": u.force - p.damping * x.speed}
 
 

@@ -26,11 +26,11 @@ class Bodies(Dynamics):
 
     states = ("left", "right")
     inputs = ("heat",)
-    parameters = {"loss": Parameter(0.5, lower=0.0), "gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
-    units = {"left": "K", "right": "K"}  # noqa: RUF012
+    parameters = {"loss": Parameter(0.5, lower=0.0), "gain": Parameter(1.0, lower=0.0)}
+    units = {"left": "K", "right": "K"}
     input_hold = "held"
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"left": p.gain * u.heat - p.loss * x.left, "right": 0.5 * p.gain * u.heat - p.loss * x.right}
 
 

@@ -22,16 +22,16 @@ from tests.simulation.tumbling import tumbling
 class Decay(Dynamics):
     states = ("level",)
     outputs = ("level",)
-    parameters = {"rate": 0.8}  # noqa: RUF012
+    parameters = {"rate": 0.8}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 
 class Line(Static):
     inputs, outputs, parameters = ("heat",), ("voltage",), {"slope": 1.0}
 
-    def output(self, time, u, p):  # noqa: ARG002
+    def output(self, time, u, p):
         return {"voltage": p.slope * u.heat}
 
 
@@ -83,9 +83,9 @@ def rounded_offsets(result):
 
 class Coast(Dynamics):
     states, inputs, parameters = ("speed",), ("force",), {"gain": 1.0}
-    units = {"speed": "m/s"}  # noqa: RUF012
+    units = {"speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.gain * u.force - 0.1 * x.speed}
 
 
@@ -120,6 +120,15 @@ def test_offsets_are_per_recording_and_findings_are_common():
     assert "recording 2 (b): " in shares
     assert "experiment" not in shares
     assert len(result.model.theta) == 4  # a gain and three first states
+    assert not any("the same in all recordings" in sentence for sentence in result.advice)
+
+
+def test_an_offset_that_all_recordings_share_is_stated():
+    result = diagnose(Decay(), [moved(decay(k, n, 1.0 + k), "level", 0.3) for k, n in enumerate("ab")], effects=())
+    (sentence,) = [s for s in result.advice if "the same in all recordings" in s]
+    assert sentence.startswith("The offset of `level` is the same in all recordings: 0.3 ± 0.0")
+    apart = diagnose(Decay(), [moved(decay(k, n, 1.0 + k), "level", 0.3 * k) for k, n in enumerate("ab")], effects=())
+    assert not any("the same in all recordings" in s for s in apart.advice)
 
 
 def test_an_offset_equivalent_to_an_initial_state_is_not_fitted():

@@ -22,9 +22,9 @@ class Cart(Dynamics):
 
     states = ("speed",)
     inputs = ("force",)
-    parameters = {"gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+    parameters = {"gain": Parameter(1.0, lower=0.0)}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.gain * u.force}
 
 
@@ -107,7 +107,7 @@ def test_fits_far_behind_are_dropped():
 def test_each_leading_effect_is_fitted_from_its_best_shapes(monkeypatch):
     tried = []
 
-    def fit_of(free, term, size):  # noqa: ARG001
+    def fit_of(free, term, size):
         tried.append(term)
         return free
 

@@ -74,6 +74,26 @@ def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
 
 
+def test_models_far_behind_without_and_with_every_candidate_are_left_out():
+    flow, y, _, _, columns = scene()
+    models = [WHITE, *(NoiseModel((0.5,), ((0, size, 1.0),), (False,)) for size in (0.5, 500.0))]
+    found = log_likelihoods(flow, models, series(y), columns)
+    values = np.concatenate([found.without[:, None], found.with_candidate], 1)
+    gap = (values.max(0) - values).min((1, 2))
+    assert gap[2] > gap[1] > 0.0 == gap[0]
+    between = 0.5 * (gap[1] + gap[2])
+    left = found.near_the_best(between)
+    assert left.models == tuple(models[:2])
+    for name in ("without", "with_candidate", "sizes", "scale"):
+        np.testing.assert_array_equal(getattr(left, name), getattr(found, name)[:2])
+    np.testing.assert_array_equal(left.rank, found.rank)
+    assert len(found.near_the_best(gap[2] + 1.0).models) == 3
+    # a candidate under which a model is best keeps the model
+    better = found.with_candidate.copy()
+    better[2, 1, 2] = better[:, 1, 2].max() + 1.0
+    assert replace(found, with_candidate=better).near_the_best(0.0).models == (models[0], models[2])
+
+
 def test_a_candidate_with_zero_tangents_gains_nothing():
     flow, y, own, candidates, _ = scene()
     columns = Columns(series(np.concatenate([own, 0.0 * candidates], 1)), 2, (1, 2), (False, False))

@@ -16,9 +16,9 @@ TIME = torch.arange(300, dtype=torch.float64) * 0.02
 
 class Swing(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": 9.0}  # noqa: RUF012
+    parameters = {"stiffness": 9.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
 
 

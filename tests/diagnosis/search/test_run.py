@@ -102,7 +102,7 @@ def test_a_joint_fit_at_a_wrong_onset_is_replaced_by_the_search(monkeypatch):
     terms = candidate_terms(prepared, (), (STEP,))
     late = max(terms, key=lambda term: term.shape["onset"])
 
-    def strongest(base, terms, prefer, settings, *, parts):  # noqa: ARG001
+    def strongest(base, terms, prefer, settings, *, parts):
         model = base.model.with_term(late)
         fit = fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)
         return [fit], tangents_of(base.model, base.parameters, NoiseSettings(), terms)

@@ -24,10 +24,10 @@ class Drive(Dynamics):
 
     states = ("speed",)
     inputs = ("torque",)
-    units = {"speed": "rad/s"}  # noqa: RUF012
-    parameters = {"inertia": Parameter(0.02, lower=1e-4), "damping": Parameter(0.01, lower=0.0)}  # noqa: RUF012
+    units = {"speed": "rad/s"}
+    parameters = {"inertia": Parameter(0.02, lower=1e-4), "damping": Parameter(0.01, lower=0.0)}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": (u.torque - p.damping * x.speed) / p.inertia}
 
 

@@ -24,14 +24,14 @@ class Offset(GainEffect):
     port = "mixed"
     gain = "offset"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return torch.ones_like(context.time)
 
 
 class Vertical(Offset):
     id = "vertical"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return torch.full_like(context.time, torch.nan)
 
 

@@ -262,42 +262,42 @@ def test_units_of_amplitudes(name, units):
 
 class Pendulum(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": 9.0}  # noqa: RUF012
-    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+    parameters = {"stiffness": 9.0}
+    units = {"angle": "rad", "speed": "rad/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
 
 
 class Motor(Pendulum):
     inputs = ("torque",)
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle)}
 
 
 class Fall(Dynamics):
     states = ("height", "speed")
-    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
 
 class Ball(Dynamics):
     states = ("x", "y", "vx", "vy")
-    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"x": x.vx, "y": x.vy, "vx": 0.0 * x.vx, "vy": -9.81 + 0.0 * x.vy}
 
 
 class Bodies(Dynamics):
     states = ("inner", "outer")
-    parameters = {"loss": 0.1}  # noqa: RUF012
-    units = {"inner": "°C", "outer": "°C"}  # noqa: RUF012
+    parameters = {"loss": 0.1}
+    units = {"inner": "°C", "outer": "°C"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"inner": -p.loss * (x.inner - 20.0), "outer": -p.loss * (x.outer - 20.0)}
 
 
@@ -352,9 +352,9 @@ class TestNeeds:
 
         class Sway(Fall):
             states = ("sway", "speed")
-            units = {"sway": "m", "speed": "m/s"}  # noqa: RUF012
+            units = {"sway": "m", "speed": "m/s"}
 
-            def derivative(self, time, x, u, p):  # noqa: ARG002
+            def derivative(self, time, x, u, p):
                 return {"sway": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
         places = tried(prepared(Sway, sway=torch.cos(TIME)))
@@ -371,23 +371,23 @@ class TestNeeds:
 
     def test_magnus_lift_is_not_tried_on_angles(self):
         class Joints(Ball):
-            units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}  # noqa: RUF012
+            units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}
 
         assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
 
     def test_losses_to_surroundings_are_tried_where_they_are_known(self):
         class Room(Dynamics):
             states, inputs = ("inner", "wall"), ("power", "outside")
-            parameters = {"loss": 0.1}  # noqa: RUF012
-            units = {"inner": "°C", "wall": "°C"}  # noqa: RUF012
+            parameters = {"loss": 0.1}
+            units = {"inner": "°C", "wall": "°C"}
 
-            def derivative(self, time, x, u, p):  # noqa: ARG002
+            def derivative(self, time, x, u, p):
                 away = x.wall - x.inner
                 return {"inner": u.power + away, "wall": p.loss * (u.outside - x.wall) - away}
 
         class Wind(Fall):
             inputs = ("wind", "drive")
-            units = {"height": "m", "speed": "m/s", "wind": "m/s"}  # noqa: RUF012
+            units = {"height": "m", "speed": "m/s", "wind": "m/s"}
 
         warm = {"inner": 30.0 + 0.0 * TIME, "wall": 20.0 + TIME, "power": TIME, "outside": 5.0 + 0.1 * TIME}
         room = prepared(Room, **warm)

@@ -15,10 +15,10 @@ OWN = UnknownNearEnds()
 
 class Hover(Dynamics):
     states, inputs = ("height", "climb"), ("thrust",)
-    parameters = {"mass": 1.1}  # noqa: RUF012
-    units = {"height": "m", "climb": "m/s"}  # noqa: RUF012
+    parameters = {"mass": 1.1}
+    units = {"height": "m", "climb": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"height": x.climb, "climb": u.thrust / p.mass - 9.81}
 
 

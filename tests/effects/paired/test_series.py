@@ -98,9 +98,9 @@ def test_models_are_restored_from_json(port):
 
 class Drive(Dynamics):
     states, inputs = ("speed",), ("volt",)
-    parameters = {"gain": 1.0}  # noqa: RUF012
+    parameters = {"gain": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.gain * u.volt - x.speed}
 
 

@@ -130,7 +130,7 @@ def main() -> None:
     """Compile every launch and print whether it has vector loads of four numbers."""
     launches: list[tuple[Any, ...]] = []
 
-    def launch(self: CachedKernel, grid: Any, *arguments: Any) -> None:  # noqa: ARG001
+    def launch(self: CachedKernel, grid: Any, *arguments: Any) -> None:
         launches.append((self.kernel, *arguments))
 
     CachedKernel.launch = launch  # type: ignore[method-assign]

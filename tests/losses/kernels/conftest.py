@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from tests.triton_interpreter import skip_without_interpreter
+
 
 @pytest.fixture(scope="session")
 def device():
@@ -14,4 +16,5 @@ def device():
 
     if not kernels_are_interpreted():
         pytest.skip("the kernels were imported before TRITON_INTERPRET=1 was set")
+    skip_without_interpreter()
     return torch.device("cpu")

@@ -219,7 +219,7 @@ def test_operators_are_well_formed(device, mode):
     torch.library.opcheck(operators.each_loss, (x, y, torch.rand(20, 3, device=device), 1, *own))
 
 
-def test_fake_cuda_tensors_go_through_the_operators(device):  # noqa: ARG001
+def test_fake_cuda_tensors_go_through_the_operators(device):
     loss = MKCLoss(3, impl="triton")
     with FakeTensorMode(allow_non_fake_inputs=True), torch.no_grad():
         own = {name: torch.empty_like(value, device="cuda") for name, value in loss.state_dict().items()}

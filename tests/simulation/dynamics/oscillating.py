@@ -18,12 +18,12 @@ STEP = 0.05
 class Oscillator(Dynamics):
     states = ("position", "speed")
     outputs = ("position",)
-    parameters = {  # noqa: RUF012
+    parameters = {
         "stiffness": Parameter(STIFFNESS, lower=0.0),
         "damping": Parameter(DAMPING, lower=0.0),
     }
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"position": x.speed, "speed": -p.stiffness * x.position - p.damping * x.speed}
 
 

@@ -24,10 +24,10 @@ FIRST = (1.2, 0.4)
 
 class Pendulum(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.5, lower=0.0, unit="1/s")}  # noqa: RUF012
-    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.5, lower=0.0, unit="1/s")}
+    units = {"angle": "rad", "speed": "rad/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
@@ -154,7 +154,7 @@ class TestFit:
         assert float(start[3]) == pytest.approx(FIRST[1], abs=0.2)
 
     def test_rates_may_be_a_list_in_the_order_of_the_states(self):
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             return [x.speed, -p.stiffness * torch.sin(x.angle) - p.damping * x.speed]
 
         recording = table(time=TIME, angle=TRUTH[0])
@@ -163,7 +163,7 @@ class TestFit:
 
     @pytest.mark.e2e
     def test_outputs_may_differ_from_the_states(self):
-        def output(self, time, x, u, p):  # noqa: ARG001
+        def output(self, time, x, u, p):
             return {"tip": p.length * torch.sin(x.angle)}
 
         parameters = {**Pendulum.parameters, "length": Parameter(1.0, lower=0.0)}
@@ -190,7 +190,7 @@ class TestFit:
         torch.testing.assert_close(used.residual(theta, {}), fresh.residual(theta, {}), rtol=0.0, atol=1e-8)
 
     def test_the_residual_is_nan_without_a_trajectory(self):
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             return {"level": p.rate * x.level.square()}
 
         exploding = type("Exploding", (Dynamics,), {"states": ("level",), "parameters": {"rate": 0.1}})
@@ -207,7 +207,7 @@ class TestFit:
 class Driven(Pendulum):
     inputs = ("torque",)
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
@@ -245,7 +245,7 @@ class TestInputs:
     def test_experiments_with_equal_times_do_not_share_inputs(self):
         """The polynomial at the end of a run must not use samples of the next run."""
 
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             return {"charge": p.gain * torch.exp(u.power) - p.loss * x.charge}
 
         time = np.linspace(0.0, 10.0, 101)
@@ -284,9 +284,9 @@ def lorenz(time):
 
 class Lorenz(Dynamics):
     states = ("x", "y", "z")
-    parameters = {"sigma": 9.0, "rho": 26.0, "beta": 3.0}  # noqa: RUF012
+    parameters = {"sigma": 9.0, "rho": 26.0, "beta": 3.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"x": p.sigma * (x.y - x.x), "y": x.x * (p.rho - x.z) - x.y, "z": x.x * x.y - p.beta * x.z}
 
 
@@ -332,10 +332,10 @@ class TestSegments:
 class Tanks(Dynamics):
     states = ("upper", "lower")
     inputs = ("pump",)
-    parameters = {"inflow": 1.0, "drain": Parameter(0.3, lower=0.0)}  # noqa: RUF012
-    units = {"upper": "m", "lower": "m", "pump": "V"}  # noqa: RUF012
+    parameters = {"inflow": 1.0, "drain": Parameter(0.3, lower=0.0)}
+    units = {"upper": "m", "lower": "m", "pump": "V"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"upper": p.inflow * u.pump - p.drain * x.upper, "lower": -p.drain * x.lower}
 
 
@@ -446,7 +446,7 @@ class TestPorts:
     def test_the_load_is_the_drive_minus_the_holding_forces(self):
         """A motor that is switched on has a braking torque by its back-EMF."""
 
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             braking = (p.damping + 2.0 * u.enabled) * x.speed
             return {"angle": x.speed, "speed": 5.0 * u.drive - braking - p.stiffness * x.angle}
 
@@ -520,10 +520,10 @@ class Block(Dynamics):
     states = ("place", "speed")
     inputs = ("pull",)
     outputs = ("place",)
-    parameters = {"friction": Parameter(20.0, lower=0.0)}  # noqa: RUF012
+    parameters = {"friction": Parameter(20.0, lower=0.0)}
     step = 0.02
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         spring = 200.0 * torch.clamp(u.pull - x.place, -0.3, 0.3)
         return {"place": x.speed, "speed": spring - x.speed - p.friction * torch.tanh(x.speed / 0.0005)}
 
@@ -568,10 +568,10 @@ class Oscillator(Dynamics):
     """A mass on a spring; the motion depends on their quotient only."""
 
     states = ("place", "speed")
-    parameters = {"mass": Parameter(2.0, lower=0.0), "spring": Parameter(15.0, lower=0.0), "damping": 0.1}  # noqa: RUF012
-    units = {"place": "m", "speed": "m/s"}  # noqa: RUF012
+    parameters = {"mass": Parameter(2.0, lower=0.0), "spring": Parameter(15.0, lower=0.0), "damping": 0.1}
+    units = {"place": "m", "speed": "m/s"}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"place": x.speed, "speed": -p.spring / p.mass * x.place - p.damping * x.speed}
 
 
@@ -606,7 +606,7 @@ class TestUndetermined:
     def test_an_undetermined_initial_state_gives_no_warning(self):
         """A state without influence on the outputs is not a fault of the recording."""
 
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             return {"place": x.speed, "speed": -p.rate * x.place, "heat": -0.1 * x.heat}
 
         system = type(
@@ -626,11 +626,11 @@ class TestActuatorsAndSensors:
     def test_actuator_and_sensor_receive_the_runs(self):
         seen = {}
 
-        def actuator(self, time, u, p, run):  # noqa: ARG001
+        def actuator(self, time, u, p, run):
             seen["run"] = run
             return {"torque": 2.0 * u.torque}
 
-        def sensor(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):
             assert run.tolist() == [0] * 50 + [1] * 50
             return {"angle": y["angle"] + 0.5}
 
@@ -652,7 +652,7 @@ class TestActuatorsAndSensors:
 
 
 def returning(value):
-    def derivative(self, time, x, u, p):  # noqa: ARG001
+    def derivative(self, time, x, u, p):
         return value(x, p)
 
     return derivative
@@ -783,7 +783,7 @@ def test_solving_starts_from_a_trajectory_nearby(monkeypatch):
 
 def test_an_unknown_name_raises_with_the_known_names():
     class Misspelt(Pendulum):
-        def derivative(self, time, x, u, p):  # noqa: ARG002
+        def derivative(self, time, x, u, p):
             return {"angle": x.sped, "speed": -x.angle}
 
     with pytest.raises(AttributeError, match="there is no `sped` here; there is angle, speed"):

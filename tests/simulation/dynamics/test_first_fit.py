@@ -17,9 +17,9 @@ ALONG = flow(400)
 
 class Pendulum(Dynamics):
     states = ("angle", "speed")
-    parameters = {"stiffness": Parameter(1.0, lower=0.0), "damping": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+    parameters = {"stiffness": Parameter(1.0, lower=0.0), "damping": Parameter(1.0, lower=0.0)}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
@@ -60,7 +60,7 @@ def test_bounds_are_kept(pendulum):
 
 
 def test_no_fit_where_no_rate_moves_an_output():
-    def output(self, time, x, u, p):  # noqa: ARG001
+    def output(self, time, x, u, p):
         return {"position": 0.0 * x.position + p.stiffness}
 
     prepared = oscillator(output=output).prepare(recorded(flow(30), position=np.sin(np.arange(30.0))))

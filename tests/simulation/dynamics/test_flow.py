@@ -56,10 +56,10 @@ def test_the_flow_has_the_open_loop_residual_and_the_mask_of_outliers():
 
 
 def test_transitions_of_a_nonlinear_system_are_derivatives_of_its_open_loop():
-    def derivative(self, time, x, u, p):  # noqa: ARG001
+    def derivative(self, time, x, u, p):
         return {"position": x.speed, "speed": -p.stiffness * torch.sin(x.position) - p.damping * x.speed}
 
-    def output(self, time, x, u, p):  # noqa: ARG001
+    def output(self, time, x, u, p):
         return {"position": torch.sin(x.position) + 0.1 * x.speed**2}
 
     prepared, theta, _ = disturbed_oscillator(20, derivative=derivative, output=output)
@@ -102,7 +102,7 @@ def test_state_errors_scale_with_the_output_errors():
 
 
 def test_no_flow_without_a_trajectory():
-    def derivative(self, time, x, u, p):  # noqa: ARG001
+    def derivative(self, time, x, u, p):
         return {"position": p.stiffness * x.position**2}
 
     prepared, theta, _ = disturbed_oscillator(60, derivative=derivative, states=("position",))

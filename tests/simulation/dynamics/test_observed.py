@@ -22,7 +22,7 @@ DISTURBANCES = (
 )
 
 
-def driven(self, time, x, u, p):  # noqa: ARG001
+def driven(self, time, x, u, p):
     return {"position": x.speed, "speed": u.force - p.stiffness * x.position - p.damping * x.speed}
 
 
@@ -122,7 +122,7 @@ class TestObserved:
     def test_effects_act_with_an_observer(self):
         """A force that an effect adds has the same residual as the same force in the equations."""
 
-        def without(self, time, x, u, p):  # noqa: ARG001
+        def without(self, time, x, u, p):
             return {"position": x.speed, "speed": 0.0 * u.force - p.stiffness * x.position - p.damping * x.speed}
 
         prepared, theta = forced_oscillator()
@@ -164,7 +164,7 @@ class TestObserverInterface:
         prepared, _ = forced_oscillator()
         assert prepared.disturbable == ("speed",)
 
-        def derivative(self, time, x, u, p):  # noqa: ARG001
+        def derivative(self, time, x, u, p):
             return {"position": x.speed - p.damping * x.position, "speed": u.force - p.stiffness * x.position}
 
         assert forced_oscillator(derivative=derivative)[0].disturbable == ("position", "speed")
@@ -177,7 +177,7 @@ class TestObserverInterface:
         assert torch.equal(prepared.output_disturbance(states), torch.zeros(5, 1).double())
 
     def test_the_sensor_s_contribution_is_subtracted_from_the_recording(self):
-        def sensor(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):
             return {"position": y["position"] + 0.2 * time + 0.1 * y["position"] ** 2}
 
         prepared, theta = forced_oscillator(sensor=sensor)
@@ -193,7 +193,7 @@ class TestObserverInterface:
     def test_sensor_errors_do_not_correct_the_states(self):
         """Corrections compare the recording with the states as the sensor would measure them."""
 
-        def sensor(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):
             return {"position": y["position"] + 3.0 * torch.sin(time)}
 
         prepared, theta = forced_oscillator()

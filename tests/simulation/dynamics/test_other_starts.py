@@ -10,12 +10,12 @@ from mkc_torch.simulation.dynamics.other_starts import other_starts
 class Growing(Dynamics):
     states = ("speed",)
     outputs = ("rpm",)
-    parameters = {"a": 80.0, "b": 1.0}  # noqa: RUF012
+    parameters = {"a": 80.0, "b": 1.0}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"speed": p.a * x.speed + p.b}
 
-    def output(self, time, x, u, p):  # noqa: ARG002
+    def output(self, time, x, u, p):
         return {"rpm": 9.5 * x.speed}
 
 

@@ -23,7 +23,7 @@ LEAST = STEP / 12.0**0.5
 class House(Dynamics):
     states, parameters = ("indoor",), {"rate": 0.02}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"indoor": -p.rate * x.indoor}
 
 

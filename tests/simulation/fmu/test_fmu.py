@@ -22,9 +22,9 @@ class Pendulum(Dynamics):
     states = ("angle", "speed")
     inputs = ("torque",)
     outputs = ("angle",)
-    parameters = {"stiffness": 9.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}  # noqa: RUF012
+    parameters = {"stiffness": 9.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 

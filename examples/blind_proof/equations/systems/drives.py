@@ -9,10 +9,20 @@ from dataclasses import replace
 import numpy as np
 from torch import Generator
 
-from examples.blind_proof.draws import happens, uniform, whole
+from examples.blind_proof.draws import happens, uniform
 from examples.blind_proof.equations import forces, hidden, transducers
 from examples.blind_proof.equations.integrate import SystemScene
-from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, excitation, moments, runs_of
+from examples.blind_proof.equations.plant import (
+    Array,
+    HiddenTerm,
+    Plant,
+    RunSet,
+    Setting,
+    excitation,
+    moments,
+    runs_of,
+    setting,
+)
 
 MOTOR_STEP = 0.02
 """s."""
@@ -41,11 +51,10 @@ def motor_draw(g: Generator) -> Setting:
         motor_rate,
         fine=10,
     )
-    runs = whole(g, 1, 2)
-    return Setting(plant, motor_trial(g, plant, runs, 320 // runs), motor_trial(g, plant, 1, 200))
+    return setting(g, plant, motor_trial, most_runs=2, samples=320, later=200)
 
 
-def motor_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:  # noqa: ARG001 - one signature for all
+def motor_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Draw voltages of both signs; the motor starts at standstill or in motion."""
     time = moments(MOTOR_STEP, samples)
     voltages = [uniform(g, 6.0, 12.0) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)]
@@ -105,7 +114,7 @@ SERVO_PLANNED = 0.08
 SERVO_AT = ("angle",)
 
 
-def servo_rate(x: Array, u: Array, p: Array) -> Array:  # noqa: ARG001 - one signature for all
+def servo_rate(x: Array, u: Array, p: Array) -> Array:
     """Of no states."""
     return x
 
@@ -126,7 +135,7 @@ def servo_draw(g: Generator) -> Setting:
     return Setting(plant, servo_trial(g, plant, 1, 320), servo_trial(g, plant, 1, 200))
 
 
-def servo_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:  # noqa: ARG001 - one signature for all
+def servo_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Draw commands of both signs in rad, without jumps, as from a planner."""
     time = moments(SERVO_STEP, samples)
     wanted = runs_of([uniform(g, 0.7, 1.4) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)])
@@ -142,19 +151,19 @@ def late(g: Generator, scene: SystemScene) -> HiddenTerm:
     return HiddenTerm("delay", form, SERVO_AT, 0.03 * scene.length, outputs=change, twins=("input_delay",))
 
 
-def worn(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+def worn(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Backlash of the gear; at the command and at the angle it is the same here."""
     large = 0.3 * scene.largest_input("command")
     return HiddenTerm("backlash", "uneven teeth", (*SERVO_AT, "input command"), large, outputs=transducers.worn_gear)
 
 
-def wrong_zero(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+def wrong_zero(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A horn mounted a tooth off, on an eccentric shaft."""
     change = transducers.wrong_zero(uniform(g, 0.0, 0.1), uniform(g, 0.0, 2.0 * math.pi))
     return HiddenTerm("offset", "zero of an eccentric shaft", SERVO_AT, 0.2, outputs=change)
 
 
-def load(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+def load(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A load that deflects the loop."""
     change = transducers.sagging(uniform(g, -0.5, 0.5))
     return HiddenTerm("gravity_sag", "weight on a soft joint", SERVO_AT, 0.3, outputs=change)

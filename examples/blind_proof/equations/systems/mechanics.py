@@ -5,10 +5,20 @@ from __future__ import annotations
 import numpy as np
 from torch import Generator
 
-from examples.blind_proof.draws import choose, log_uniform, uniform, whole
+from examples.blind_proof.draws import choose, log_uniform, uniform
 from examples.blind_proof.equations import forces, hidden
 from examples.blind_proof.equations.integrate import SystemScene
-from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, excitation, moments, runs_of
+from examples.blind_proof.equations.plant import (
+    Array,
+    HiddenTerm,
+    Plant,
+    RunSet,
+    Setting,
+    excitation,
+    moments,
+    runs_of,
+    setting,
+)
 
 PENDULUM_STEP = 0.05
 """s."""
@@ -31,8 +41,7 @@ def pendulum_draw(g: Generator) -> Setting:
         pendulum_rate,
         fine=12,
     )
-    runs = whole(g, 1, 3)
-    return Setting(plant, pendulum_trial(g, plant, runs, 360 // runs), pendulum_trial(g, plant, 1, 200))
+    return setting(g, plant, pendulum_trial, most_runs=3, samples=360, later=200)
 
 
 def pendulum_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
@@ -99,8 +108,7 @@ def cart_pole_draw(g: Generator) -> Setting:
         cart_pole_rate,
         fine=12,
     )
-    runs = whole(g, 1, 2)
-    return Setting(plant, cart_pole_trial(g, plant, runs, 300 // runs), cart_pole_trial(g, plant, 1, 180))
+    return setting(g, plant, cart_pole_trial, most_runs=2, samples=300, later=180)
 
 
 def cart_pole_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
@@ -143,7 +151,7 @@ PROJECTILE_STEP = 0.02
 THROWS, THROW_SAMPLES = 3, 110
 
 
-def projectile_rate(x: Array, u: Array, p: Array) -> Array:  # noqa: ARG001
+def projectile_rate(x: Array, u: Array, p: Array) -> Array:
     _, _, speed, climb = x
     return np.array([speed, climb, np.zeros_like(speed), np.full_like(climb, -GRAVITY)])
 
@@ -167,7 +175,7 @@ def projectile_draw(g: Generator) -> Setting:
     )
 
 
-def projectile_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:  # noqa: ARG001 - one signature for all
+def projectile_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Draw throws at 20 to 75 degrees, in both directions."""
     begin = []
     for _ in range(runs):
@@ -186,16 +194,16 @@ def air(g: Generator, scene: SystemScene) -> HiddenTerm:
     return HiddenTerm("quadratic_drag", "drag of a sphere along its velocity", THROW_PORTS, 0.5, form)
 
 
-def syrup(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+def syrup(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Viscous drag along the velocity."""
     typical = float(np.median(np.hypot(scene.state("speed"), scene.state("climb"))))
     return HiddenTerm("linear_drag", "Oseen's drag", THROW_PORTS, 0.5, forces.creeping_drag((2, 3), typical))
 
 
-def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:
     """The camera is tilted: both axes turn, and gravity has a component along the first."""
 
-    def turned(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    def turned(values: Array, step: float, size: float) -> Array:
         item, other = values
         return np.array([np.cos(size) * item + np.sin(size) * other, np.cos(size) * other - np.sin(size) * item])
 

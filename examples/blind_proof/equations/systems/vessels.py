@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from torch import Generator
 
-from examples.blind_proof.draws import choose, uniform, whole
+from examples.blind_proof.draws import choose, uniform
 from examples.blind_proof.equations import flows, forces, hidden
 from examples.blind_proof.equations.integrate import SystemScene
-from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, excitation, moments
+from examples.blind_proof.equations.plant import Array, HiddenTerm, Plant, RunSet, Setting, excitation, moments, setting
 
 TANKS_STEP = 2.0
 """s."""
@@ -41,11 +41,10 @@ def tanks_draw(g: Generator) -> Setting:
         tanks_rate,
         fine=4,
     )
-    runs = whole(g, 1, 2)
-    return Setting(plant, tanks_trial(g, plant, runs, 320 // runs), tanks_trial(g, plant, 1, 200))
+    return setting(g, plant, tanks_trial, most_runs=2, samples=320, later=200)
 
 
-def tanks_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:  # noqa: ARG001 - one signature for all
+def tanks_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Draw pump voltages between 0.5 and 9.5 V, and initial levels of 0.1 to 0.7 m."""
     time = moments(TANKS_STEP, samples)
     pumps = [
@@ -65,12 +64,10 @@ def pipe_between(g: Generator, scene: SystemScene) -> HiddenTerm:
     return HiddenTerm("coupling", "Darcy and Forchheimer's pipe", places, scene.pace("level_1") / typical, form)
 
 
-def dripping_tap(level: str) -> hidden.Draw:
-    def draw_tap(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = flows.tap(scene.plant.row(level), uniform(g, 3.0, 8.0) * scene.largest(level))
-        return HiddenTerm("constant_force", "tap on a main", (hidden.rate_of(level),), scene.pace(level), form)
-
-    return draw_tap
+@hidden.drawn_for
+def dripping_tap(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
+    form = flows.tap(scene.plant.row(level), uniform(g, 3.0, 8.0) * scene.largest(level))
+    return HiddenTerm("constant_force", "tap on a main", (hidden.rate_of(level),), scene.pace(level), form)
 
 
 def gravel(g: Generator, typical: float) -> Callable[[Array], Array]:
@@ -79,12 +76,10 @@ def gravel(g: Generator, typical: float) -> Callable[[Array], Array]:
     return lambda head: flows.forchheimer(head, bend)
 
 
-def crack(level: str) -> hidden.Draw:
-    def draw_crack(g: Generator, scene: SystemScene) -> HiddenTerm:
-        form = flows.slot(scene.plant.row(level), scene.largest(level), choose(g, (1.5, 2.5)), uniform(g, 0.0, 0.1))
-        return HiddenTerm("power_law", "slot in the wall", (hidden.rate_of(level),), 3.0 * scene.pace(level), form)
-
-    return draw_crack
+@hidden.drawn_for
+def crack(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
+    form = flows.slot(scene.plant.row(level), scene.largest(level), choose(g, (1.5, 2.5)), uniform(g, 0.0, 0.1))
+    return HiddenTerm("power_law", "slot in the wall", (hidden.rate_of(level),), 3.0 * scene.pace(level), form)
 
 
 def wavy_inflow(g: Generator, scene: SystemScene) -> HiddenTerm:
@@ -144,11 +139,10 @@ def thermal_draw(g: Generator) -> Setting:
         thermal_rate,
         fine=4,
     )
-    runs = whole(g, 1, 2)
-    return Setting(plant, thermal_trial(g, plant, runs, 320 // runs), thermal_trial(g, plant, 1, 200))
+    return setting(g, plant, thermal_trial, most_runs=2, samples=320, later=200)
 
 
-def thermal_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:  # noqa: ARG001 - one signature for all
+def thermal_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Draw heater powers between 0 and 100 W, for warm or cold bodies."""
     time = moments(THERMAL_STEP, samples)
     heaters = [
@@ -159,15 +153,13 @@ def thermal_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet
     return RunSet(THERMAL_STEP, np.stack([np.stack(heater, -1) for heater in heaters]), begin)
 
 
-def glow(state: str) -> hidden.Draw:
-    def draw_glow(g: Generator, scene: SystemScene) -> HiddenTerm:
-        row = scene.plant.row(state)
-        form = flows.radiation(row, scene.plant.parameters["room"], uniform(g, 0.0, 1e-3))
-        return HiddenTerm(
-            "thermal_loss", "radiation to the walls", (hidden.rate_of(state),), scene.pace(state) / 50.0, form
-        )
-
-    return draw_glow
+@hidden.drawn_for
+def glow(g: Generator, scene: SystemScene, state: str) -> HiddenTerm:
+    row = scene.plant.row(state)
+    form = flows.radiation(row, scene.plant.parameters["room"], uniform(g, 0.0, 1e-3))
+    return HiddenTerm(
+        "thermal_loss", "radiation to the walls", (hidden.rate_of(state),), scene.pace(state) / 50.0, form
+    )
 
 
 def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:
@@ -179,26 +171,20 @@ def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:
     return HiddenTerm("coupling", "convection", places, scene.pace("temperature_1") / typical, form)
 
 
-def damp(state: str) -> hidden.Draw:
+@hidden.drawn_for
+def damp(g: Generator, scene: SystemScene, state: str) -> HiddenTerm:
     """Water that evaporates from a wet body."""
-
-    def draw_damp(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
-        room = scene.plant.parameters["room"]
-        form = flows.evaporation(scene.plant.row(state), room, scene.largest(state))
-        return HiddenTerm("power_law", "evaporation", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
-
-    return draw_damp
+    room = scene.plant.parameters["room"]
+    form = flows.evaporation(scene.plant.row(state), room, scene.largest(state))
+    return HiddenTerm("power_law", "evaporation", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
 
 
-def rising_air(state: str) -> hidden.Draw:
+@hidden.drawn_for
+def rising_air(g: Generator, scene: SystemScene, state: str) -> HiddenTerm:
     """Natural convection along a plate, laminar or turbulent."""
-
-    def draw_air(g: Generator, scene: SystemScene) -> HiddenTerm:
-        room, power = scene.plant.parameters["room"], uniform(g, 1.25, 1.4)
-        form = flows.natural_convection(scene.plant.row(state), room, scene.largest(state), power)
-        return HiddenTerm("power_law", "natural convection", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
-
-    return draw_air
+    room, power = scene.plant.parameters["room"], uniform(g, 1.25, 1.4)
+    form = flows.natural_convection(scene.plant.row(state), room, scene.largest(state), power)
+    return HiddenTerm("power_law", "natural convection", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
 
 
 def plaster(g: Generator, typical: float) -> Callable[[Array], Array]:

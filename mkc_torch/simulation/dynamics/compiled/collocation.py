@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.compiled.affine import Affine, inverted, multiplied
@@ -24,14 +25,17 @@ from mkc_torch.simulation.dynamics.settings import (
 
 __all__ = [
     "ArrayGrid",
+    "Collocation",
     "CollocationSolution",
     "Factor",
     "Functions",
     "JumpFunctions",
     "LinearisedCollocation",
+    "ParameterSources",
     "linearised",
     "marched",
     "solved",
+    "solved_to",
 ]
 
 
@@ -123,6 +127,40 @@ class CollocationSolution:
     factor: Factor
 
 
+@dataclass(frozen=True)
+class ParameterSources:
+    """Sources of the states' derivatives by some parameters in the linearised equations.
+
+    Attributes:
+        parameters: indices of the K parameters.
+        source: (w, K, G), of the recurrence ``factor.affine``.
+        factor: the linearised equations.
+    """
+
+    parameters: list[int]
+    source: Array
+    factor: Factor
+
+
+class Collocation(Protocol):
+    """The collocation equations at given parameters."""
+
+    def solved(self, guess: Array, factor: Factor | None = None) -> CollocationSolution | None:
+        """Solve for the trajectories near a guess (w, G), with its initial states; None where none is found.
+
+        The factor of a trajectory nearby is used as long as it converges quickly.
+        """
+        ...
+
+    def solved_to(self, states: Array, inside: NDArray[np.bool_]) -> tuple[Array | None, bool]:
+        """Solve roughly at the grid times inside; None where it diverges. The second value is whether it converged."""
+        ...
+
+    def sources(self, states: Array) -> ParameterSources:
+        """The sources of all parameters of the rates and of the observer, at solved states (w, G)."""
+        ...
+
+
 class _Iterate:
     """An iterate: states, defects, the scale of each state, and the mean square of the scaled defects."""
 
@@ -201,14 +239,14 @@ def solved(
     return None
 
 
-def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = HORIZON) -> Array | None:
+def marched(collocation: Collocation, grid: ArrayGrid, guess: Array, stride: int = HORIZON) -> Array | None:
     """Improve a poor guess by solving roughly over a growing horizon; None where the iteration diverges.
 
     As :func:`mkc_torch.simulation.dynamics.trajectory.marched`, but the stride doubles after each success, and is
     divided by 4 after each failure.
 
     Args:
-        functions: the differential equation.
+        collocation: the collocation equations.
         grid: the grid times.
         guess: (w, G), of all states; the initial states of the trajectories are kept.
         stride: grid times by which the horizon grows at least.
@@ -220,7 +258,7 @@ def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = H
         check_deadline()
         # beyond the horizon the last solved state is held
         held = states[:, np.minimum(index, first + horizon)]
-        tried, settled = _solved_to(functions, grid, held, place <= horizon + growth)
+        tried, settled = collocation.solved_to(held, place <= horizon + growth)
         if not settled and growth > stride:
             growth = max(stride, growth // 4)
             continue
@@ -231,8 +269,8 @@ def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = H
     return states
 
 
-def _solved_to(
-    functions: Functions, grid: ArrayGrid, states: Array, inside: np.ndarray[tuple[int], np.dtype[np.bool_]]
+def solved_to(
+    functions: Functions, grid: ArrayGrid, states: Array, inside: NDArray[np.bool_]
 ) -> tuple[Array | None, bool]:
     """States solved roughly at the grid times inside, None where they diverge; and whether they converged."""
     for _ in range(MOST_STEPS):

@@ -41,12 +41,17 @@ class Derivatives:
             for leaf in sorted(expressions.leaves(node) & columns.keys())
         }
         self.places = [place for place, slope in slopes.items() if slope != nothing]
+        self.nodes = [slopes[place] for place in self.places]
         self.shape = (len(nodes), len(leaves))
-        self.tape = Tape(expressions, [slopes[place] for place in self.places], arranged)
+        self._expressions, self._arranged = expressions, arranged
+
+    @cached_property
+    def _tape(self) -> Tape:
+        return Tape(self._expressions, self.nodes, self._arranged)
 
     def at(self, parameters: Sequence[float]) -> Callable[[Array], Array]:
         """The derivatives (nodes, leaves, *) as a function of the states (w, *)."""
-        evaluated = self.tape.at(parameters)
+        evaluated = self._tape.at(parameters)
         return lambda states: dense(evaluated(states), self.places, (*self.shape, *states.shape[1:]))
 
 

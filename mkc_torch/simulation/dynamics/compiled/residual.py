@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,17 +13,16 @@ from torch import Tensor
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
+from mkc_torch.simulation.dynamics.compiled.arrays import ArraySystem
 from mkc_torch.simulation.dynamics.compiled.collocation import (
     ArrayGrid,
+    Collocation,
     Factor,
-    Functions,
-    LinearisedCollocation,
-    linearised,
+    ParameterSources,
     marched,
-    solved,
 )
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
-from mkc_torch.simulation.dynamics.compiled.functions import CompiledObserverJump
+from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
 from mkc_torch.simulation.dynamics.trajectory import Jump, Rate, Trajectory, linearised_later
@@ -67,13 +65,13 @@ class CompiledDynamics:
         known = near if isinstance(near, Trajectory) else None
         values = parameters.tolist()
         with np.errstate(all="ignore"):
-            functions, first = self._functions(values), self._first(values)
-            found = None if known is None else solved(functions, self._grid, *self._guess_nearby(known, first))
+            equations, first = self._collocation(values), self._first(values)
+            found = None if known is None else equations.solved(*self._guess_nearby(known, first))
             if found is None:
                 guess = self._with_first_states(self._system.guess, first)
-                found = solved(functions, self._grid, guess)
-                nearer = marched(functions, self._grid, guess) if found is None and known is None else None
-                found = found if nearer is None else solved(functions, self._grid, nearer)
+                found = equations.solved(guess)
+                nearer = marched(equations, self._grid, guess) if found is None and known is None else None
+                found = found if nearer is None else equations.solved(nearer)
             if found is None:
                 return Answer(torch.full_like(self._system.measured, torch.nan))
             outputs = self._outputs(parameters, found.states[:, self._rows])
@@ -88,7 +86,7 @@ class CompiledDynamics:
         values = parameters.tolist()
         with np.errstate(all="ignore"):
             begun = self._with_first_states(guess, self._first(values))
-            found = marched(self._functions(values), self._grid, begun, stride)
+            found = marched(self._collocation(values), self._grid, begun, stride)
         return None if found is None else torch.from_numpy(np.ascontiguousarray(found.T))
 
     def _guess_nearby(self, known: Trajectory, first: Array) -> tuple[Array, Factor | None]:
@@ -108,11 +106,10 @@ class CompiledDynamics:
             return None
         states, values = np.ascontiguousarray(near.states.detach().numpy().T), parameters.tolist()
         with np.errstate(all="ignore"):
-            functions = self._functions(values)
-            linear = linearised(functions, self._grid, states)
-            rows = self._whitened(-self._output_tangents(parameters, states, functions, linear))
+            known = self._collocation(values).sources(states)
+            rows = self._whitened(-self._output_tangents(parameters, states, known))
         tangents = torch.from_numpy(np.ascontiguousarray(np.moveaxis(rows, 0, -1)))
-        return ResidualTangents(tangents, self._nearby(parameters, states, linear.factor))
+        return ResidualTangents(tangents, self._nearby(parameters, states, known.factor))
 
     def _outputs(self, parameters: Tensor, states: Array) -> Array:
         """The outputs, (m, N), from the states at the samples."""
@@ -124,12 +121,10 @@ class CompiledDynamics:
         """The outputs, (N, m), from the states at the samples (N, w)."""
         return self._system.outputs_by_states(*self._meaning(parameters), states)
 
-    def _output_tangents(
-        self, parameters: Tensor, states: Array, functions: Functions, linear: LinearisedCollocation
-    ) -> Array:
+    def _output_tangents(self, parameters: Tensor, states: Array, known: ParameterSources) -> Array:
         """Derivatives of the outputs by all parameters, (m, p, N)."""
         values = parameters.tolist()
-        moved, at = self._state_tangents(values, states, functions, linear), states[:, self._rows]
+        moved, at = self._state_tangents(values, known), states[:, self._rows]
         outputs = self._traced.outputs
         if outputs is not None:
             rows = multiplied(outputs.by_states.at(values)(at), moved)
@@ -145,19 +140,16 @@ class CompiledDynamics:
         found = torch.func.vmap(tangent, in_dims=(0, 1))(*along)
         return np.ascontiguousarray(found.numpy().transpose(2, 0, 1))
 
-    def _state_tangents(
-        self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
-    ) -> Array:
+    def _state_tangents(self, values: Sequence[float], known: ParameterSources) -> Array:
         """Derivatives of the states at the samples by all parameters, (w, p, N)."""
-        own = self._defect_tangents(values, states, functions, linear)
-        w, G = states.shape
-        source = np.zeros((w, len(own.parameters) + w, G))
-        source[:, : len(own.parameters), 1:] = -multiplied(linear.factor.inverse, own.defects)
-        source[np.arange(w), len(own.parameters) + np.arange(w)] = self._grid.begins
-        moved = linear.factor.affine.solved(source)[..., self._rows]
+        w, K, G = known.source.shape
+        source = np.zeros((w, K + w, G))
+        source[:, :K] = known.source
+        source[np.arange(w), K + np.arange(w)] = self._grid.begins
+        moved = known.factor.affine.solved(source)[..., self._rows]
         rows = np.zeros((w, self._size, moved.shape[2]))
-        rows[:, own.parameters] = moved[:, : len(own.parameters)]
-        by_first = moved[:, len(own.parameters) :]
+        rows[:, known.parameters] = moved[:, :K]
+        by_first = moved[:, K:]
         first = self._traced.first
         slope = first.by_parameters.at(values)(np.empty(0)).reshape(-1, w, len(first.moving))
         for run, state, k in zip(*slope.nonzero(), strict=True):
@@ -165,41 +157,13 @@ class CompiledDynamics:
             rows[:, first.moving[k], inside] += slope[run, state, k] * by_first[:, state, inside]
         return rows
 
-    def _defect_tangents(
-        self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
-    ) -> _DefectTangents:
-        """Derivatives of the defects by the parameters, at fixed states."""
-        ends, middle, new = self._traced.ends, self._traced.middle, self._traced.new
-        h, rated = self._grid.step, ends.moving
-        seen = [] if new is None else [k for k in new.moving if k not in rated]
-        parameters = [*rated, *seen]
-        defects = np.zeros((len(states), len(parameters), len(h)))
-        by_ends = ends.by_parameters.at(values)(linear.ends)
-        left, right = by_ends[:, :, 0], by_ends[:, :, 1]
-        moved = multiplied(linear.middle_slope, 0.125 * h * (left - right))
-        by_middle = middle.by_parameters.at(values)(linear.middle)
-        defects[:, : len(rated)] = -h / 6.0 * (left + 4.0 * (by_middle + moved) + right)
-        if new is not None and new.moving:
-            assert isinstance(functions.jump, CompiledObserverJump)
-            by_new = new.by_parameters.at(values)(states[:, self._rows])
-            after = functions.jump.by_parameters(states, by_new)[..., :-1]
-            places = [parameters.index(k) for k in new.moving]
-            defects[:, places] += np.where(h > 0, multiplied(linear.behind, after), 0.0)
-        return _DefectTangents(parameters, defects)
+    def _collocation(self, values: Sequence[float]) -> Collocation:
+        return self._equations.at(values)
 
-    def _functions(self, values: Sequence[float]) -> Functions:
-        known, jump = self._traced, None
-        if known.new is not None:
-            gain, limit = self._observed
-            new, new_slope = known.new.values(values), known.new.by_states.at(values)
-            jump = CompiledObserverJump(self._rows, known.places, gain, limit, new, new_slope)
-        return Functions(
-            known.ends.values(values),
-            known.middle.values(values),
-            known.ends.by_states.at(values),
-            known.middle.by_states.at(values),
-            jump,
-        )
+    @cached_property
+    def _equations(self) -> MachineSystem | ArraySystem:
+        parts = self._traced, self._grid, self._rows, self._observed
+        return machine_system(*parts) or ArraySystem(*parts)
 
     def _first(self, values: Sequence[float]) -> Array:
         """The initial states, (w, K)."""
@@ -226,10 +190,11 @@ class CompiledDynamics:
         return [slice(a, b) for a, b in zip(first, [*first[1:], len(self._rows)], strict=True)]
 
     @cached_property
-    def _observed(self) -> tuple[Array, Array]:
+    def _observed(self) -> tuple[Array, Array] | None:
         """The observer's gain (k, m, N) and the clipping limit of the innovations (m, N)."""
         observer = self._system.observer
-        assert observer is not None
+        if observer is None:
+            return None
         gain = np.ascontiguousarray(np.moveaxis(observer.gain.numpy(), 0, -1))
         return gain, np.ascontiguousarray(CLIP * observer.spread.numpy().T)
 
@@ -237,11 +202,3 @@ class CompiledDynamics:
     def _white(self) -> Array | None:
         observer = self._system.observer
         return None if observer is None else np.ascontiguousarray(np.moveaxis(observer.white.numpy(), 0, -1))
-
-
-@dataclass(frozen=True)
-class _DefectTangents:
-    """Derivatives of the defects, (w, K, G-1), by the K parameters with these indices."""
-
-    parameters: list[int]
-    defects: Array

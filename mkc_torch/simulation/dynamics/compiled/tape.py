@@ -9,7 +9,7 @@ import numpy as np
 
 from mkc_torch.simulation.dynamics.compiled.expressions import CONSTANT, FUNCTIONS, PARAMETER, STATE, Array, Expressions
 
-__all__ = ["Evaluation", "Tape"]
+__all__ = ["Evaluation", "Tape", "needed_nodes"]
 
 _Step = tuple[Callable[..., Any], int, tuple[int, ...]]
 
@@ -33,7 +33,7 @@ class Tape:
     """
 
     def __init__(self, expressions: Expressions, outputs: Sequence[int], arranged: Callable[[Array], Array]) -> None:
-        needed = _needed(expressions, outputs)
+        needed = needed_nodes(expressions, outputs)
         place = {node: k for k, node in enumerate(needed)}
         self.outputs = [place[node] for node in outputs]
         self._fixed: list[Any] = [None] * len(needed)
@@ -78,7 +78,7 @@ Evaluation = Callable[[Array], list[Any]]
 """A function from the states, (w, *), to the values of nodes: arrays of shape (*), or numbers."""
 
 
-def _needed(expressions: Expressions, outputs: Sequence[int]) -> list[int]:
+def needed_nodes(expressions: Expressions, outputs: Sequence[int]) -> list[int]:
     """The nodes that outputs depend on, each after its arguments."""
     found: set[int] = set()
     waiting = list(outputs)

@@ -31,8 +31,8 @@ class Driven(Dynamics):
     states = ("angle", "speed", "warmth")
     inputs = ("torque",)
     outputs = ("angle", "warmth")
-    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
-    parameters = {"stiffness": 4.0, "damping": Parameter(0.2, lower=0.0), "gain": 1.0, "loss": 0.3}  # noqa: RUF012
+    units = {"angle": "rad", "speed": "rad/s"}
+    parameters = {"stiffness": 4.0, "damping": Parameter(0.2, lower=0.0), "gain": 1.0, "loss": 0.3}
 
     def derivative(self, time, x, u, p):
         torque = torch.where(u.torque > 0, p.gain * u.torque, 0.5 * p.gain * torch.tanh(u.torque))
@@ -42,30 +42,30 @@ class Driven(Dynamics):
             "warmth": p.damping * x.speed**2 - p.loss * x.warmth.clamp(min=-1.0) + 0.1 * torch.exp(-time),
         }
 
-    def output(self, time, x, u, p):  # noqa: ARG002
+    def output(self, time, x, u, p):
         return {"angle": x.angle + 0.05 * p.gain * u.torque, "warmth": x.warmth}
 
 
 class Turned(Driven):
     """The same, with an actuator and a sensor."""
 
-    def actuator(self, time, u, p, run):  # noqa: ARG002
+    def actuator(self, time, u, p, run):
         return {"torque": p.gain * u.torque}
 
-    def sensor(self, time, y, p, run):  # noqa: ARG002
+    def sensor(self, time, y, p, run):
         return {**y, "warmth": p.loss * y["warmth"]}
 
 
 class Single(Dynamics):
     states = ("level",)
-    parameters = {"rate": 0.7}  # noqa: RUF012
+    parameters = {"rate": 0.7}
 
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level}
 
 
 class Branching(Single):
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * x.level if p.rate > 0.0 else 0.0 * x.level}
 
 
@@ -83,16 +83,16 @@ class OwnSlope(torch.autograd.Function):
         pass
 
     @staticmethod
-    def backward(ctx, grad):  # noqa: ARG004
+    def backward(ctx, grad):
         return 3.0 * grad
 
     @staticmethod
-    def jvp(ctx, tangent):  # noqa: ARG004
+    def jvp(ctx, tangent):
         return 3.0 * tangent
 
 
 class Declared(Single):
-    def derivative(self, time, x, u, p):  # noqa: ARG002
+    def derivative(self, time, x, u, p):
         return {"level": -p.rate * OwnSlope.apply(x.level)}
 
 
@@ -186,10 +186,10 @@ class Quadratic(Effect):
     port = "output"
     follows_signal = True
 
-    def quantities(self, shape, context):  # noqa: ARG002
+    def quantities(self, shape, context):
         return (Quantity("curvature", 1, ""),)
 
-    def change(self, gamma, shape, context):  # noqa: ARG002
+    def change(self, gamma, shape, context):
         return gamma * context.signal.square()
 
 
@@ -199,7 +199,7 @@ class Warming(GainEffect):
     id = "warming"
     port = "output"
 
-    def waveform(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):
         return 0.1 * context.time
 
 
@@ -280,7 +280,7 @@ def test_growing_horizons_of_numpy_and_torch_end_near_the_trajectory():
     compiled = prepared.compiled(lambda p: (p, {}), len(theta))
     far = torch.where(prepared.grid.begins.unsqueeze(-1), prepared.guess, -2.0 * prepared.guess + 1.0)
     theirs = torch_marched(prepared.rate(theta, {}), prepared.grid, prepared.first_states(theta, {})[0], far)
-    ours = marched(compiled._functions(theta.tolist()), compiled._grid, far.numpy().T)
+    ours = marched(compiled._collocation(theta.tolist()), compiled._grid, far.numpy().T)
     solved = compiled.answer(theta).nearby.states
     assert_close(torch.from_numpy(ours.T.copy()), solved, 1e-3)
     assert_close(theirs, solved, 1e-3)
@@ -298,7 +298,7 @@ def test_a_growing_horizon_finds_a_trajectory_from_a_bad_guess():
 
 def test_the_residual_is_nan_without_a_trajectory():
     class Exploding(Single):
-        def derivative(self, time, x, u, p):  # noqa: ARG002
+        def derivative(self, time, x, u, p):
             return {"level": p.rate * torch.exp(x.level * x.level)}
 
     prepared = Exploding().prepare(recorded())

@@ -1,0 +1,60 @@
+"""A doubtful diagnosis is reported in the headline, in diagnosis.json and by the exit code."""
+
+import dataclasses
+import json
+
+import pytest
+
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
+from mkc_torch.report.diagnosis.verdict import headline, tone
+from tests.diagnosis.factory import make_diagnosis
+
+
+def test_a_good_result_has_no_doubt():
+    for findings in (0, 1, 2):
+        found = make_diagnosis(findings)
+        assert diagnosis_doubts(found) == ()
+        assert "Doubtful" not in headline(found)
+
+
+@pytest.mark.parametrize(("verdict", "doubt"), [("unfit", "unfit"), ("unexplained", "unexplained")])
+def test_a_verdict_that_explains_nothing_is_a_doubt(verdict, doubt):
+    assert diagnosis_doubts(make_diagnosis(0, verdict=verdict)) == (doubt,)
+
+
+def test_findings_that_do_not_help_are_a_doubt_in_the_headline():
+    found = make_diagnosis(1)
+    worse = dataclasses.replace(found, corrected=dataclasses.replace(found.corrected, rmse=1.2 * found.baseline.rmse))
+    assert diagnosis_doubts(worse) == ("not_better",)
+    assert headline(worse).startswith("Doubtful: the findings do not make the residual smaller (")
+    assert tone(worse) == "open"
+    assert json.loads(diagnosis_to_json(worse))["doubts"] == ["not_better"]
+
+
+def test_a_third_of_rejected_samples_is_a_doubt_in_the_headline():
+    found = make_diagnosis(1)
+    weight = found.traces.weight.clone()
+    weight[: int(0.4 * len(weight))] = 0.1
+    much = dataclasses.replace(found, traces=dataclasses.replace(found.traces, weight=weight))
+    assert rejected_share(much) >= 0.4
+    assert diagnosis_doubts(much) == ("much_rejected",)
+    assert headline(much).startswith("Doubtful: 4")
+    assert "of the samples were rejected." in headline(much)
+
+
+def test_unconfirmed_findings_alone_are_a_doubt():
+    found = make_diagnosis(1)
+    unconfirmed = dataclasses.replace(found, findings=(dataclasses.replace(found.findings[0], grade="unconfirmed"),))
+    assert "unconfirmed" in diagnosis_doubts(unconfirmed)
+
+
+def test_the_headline_of_a_quick_look_names_what_was_not_tested():
+    found = make_diagnosis(1)
+    untested = dataclasses.replace(found.findings[0], grade="unconfirmed", evidence=())
+    quick = dataclasses.replace(found, quick=True, verdict="unexplained", p_value=None, findings=(untested,))
+    assert headline(quick).startswith("Found, but not tested on held-out blocks:")
+    assert "no effect in the catalogue" not in headline(quick)
+    assert advice_of(quick) == ("Confirm it by a full diagnosis.",)
+    assert {"unexplained", "unconfirmed"} <= set(diagnosis_doubts(quick))

@@ -1,0 +1,65 @@
+"""A candidate without any gain in open loop gives way to a rival that clearly improves the open loop."""
+
+import functools
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.fit import fitted_with_effect
+from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop, with_open_loop_gain
+from mkc_torch.diagnosis.search.ranking import Ranked
+from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
+
+AHEAD = 20.0
+"""Nats by which the most likely candidate is ahead of its rival."""
+
+
+@functools.cache
+def free():
+    return free_fit(DRAG)
+
+
+@functools.cache
+def with_effect(name):
+    """Return the number and the joint fit of an effect."""
+    terms = all_terms(free())
+    number = next(n for n, term in enumerate(terms) if term.effect.id == name)
+    model = free().model.with_term(terms[number])
+    start = torch.cat([free().parameters, torch.zeros(model.size - free().model.size).double()])
+    return number, fitted_with_effect(free(), model, start, graduate=False)
+
+
+def leading(first, second):
+    """Return the result for two effects of this order."""
+    terms = all_terms(free())
+    (one, leader), (two, rival) = with_effect(first), with_effect(second)
+    ranking = (Ranked(one, 50.0, 0.0), Ranked(two, 30.0, AHEAD))
+    best, moved = with_open_loop_gain(leader, ranking, [leader, rival], free(), {}, terms)
+    return best.model.terms[-1].effect.id, [(terms[place.number].effect.id, place.gap) for place in moved]
+
+
+def test_drag_goes_before_a_delay_that_explains_nothing():
+    name, ranking = leading("input_saturation", "quadratic_drag")
+    assert name == "quadratic_drag"
+    assert ranking[0] == ("quadratic_drag", 0.0)
+    assert ranking[1] == ("input_saturation", AHEAD)
+
+
+def test_a_candidate_that_improves_the_open_loop_stays_first():
+    name, ranking = leading("quadratic_drag", "input_saturation")
+    assert name == "quadratic_drag"
+    assert ranking == [("quadratic_drag", 0.0), ("input_saturation", AHEAD)]
+
+
+def test_without_a_better_rival_the_most_likely_candidate_stays():
+    name, ranking = leading("input_saturation", "dead_zone")
+    assert name == "input_saturation"
+    assert [gap for _, gap in ranking] == [0.0, AHEAD]
+
+
+def test_an_effect_that_halves_the_open_loop_residual_is_needed():
+    drag, none = with_effect("quadratic_drag")[1], with_effect("input_saturation")[1]
+    assert float(drag.residual.std()) < 0.3 * float(free().residual.std())
+    assert float(none.residual.std()) == pytest.approx(float(free().residual.std()), rel=0.05)
+    assert improves_open_loop(drag, free())
+    assert not improves_open_loop(none, free())
