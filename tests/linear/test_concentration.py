@@ -16,8 +16,9 @@ from mkc_torch.linear._problem import LinearProblem, linear_problem, solve_gram
 from mkc_torch.linear._scale_search import ScaleSearch, elemental_starts
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale
 from mkc_torch.linear.s_regression import MScale
+from tests.triton_interpreter import skip_without_interpreter
 
-pytest.importorskip("triton")
+skip_without_interpreter()
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
