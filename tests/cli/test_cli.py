@@ -492,7 +492,9 @@ def test_real_process_in_a_pipe(good, tmp_path):
     assert "\x1b" not in done.stdout + done.stderr
     assert "\r" not in done.stdout + done.stderr
     assert "offset" in done.stdout
-    assert done.stderr.splitlines()[0] == f"mkc: {absent}: there is no such file."
+    # a busy machine reports progress too
+    failures = [line for line in done.stderr.splitlines() if not line.startswith("mkc: after ")]
+    assert failures[0] == f"mkc: {absent}: there is no such file."
 
 
 @pytest.mark.process

@@ -117,6 +117,7 @@ def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
 
 
 def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypatch):
+    monkeypatch.setattr(console, "_FIRST_LINE_S", 0.02)
     monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2, lines=True) as step:
         step("calibrating log.bin, sensor MAG (1 of 3)")
@@ -131,6 +132,7 @@ def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypat
 
 
 def test_in_a_pipe_nothing_is_written_without_lines(capfd, monkeypatch):
+    monkeypatch.setattr(console, "_FIRST_LINE_S", 0.02)
     monkeypatch.setattr(console, "_LINE_S", 0.02)
     with progress(2) as step:
         step("diagnosing log.bin")
