@@ -64,7 +64,7 @@ def test_experiments_are_counted_while_copies_work(tmp_path):
     path = table(tmp_path / "runs.csv", points, time=time, experiment=run)
     command = ("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path / "out", "--surrogates", 19)
     code, seen = on_a_terminal(*command)
-    assert code == 0, seen
+    assert code in (0, 3), seen  # 3 where a run of noise gets a finding that is not confirmed
     for number, label in ((1, 0), (2, 1)):
         assert f"diagnosing runs.csv, run {label} ({number} of 2)" in seen
     assert len(set(re.findall("[⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏]", seen))) > 3
@@ -72,7 +72,7 @@ def test_experiments_are_counted_while_copies_work(tmp_path):
         [sys.executable, "-m", "mkc_torch.cli", *map(str, command), "--force"],
         capture_output=True, text=True, encoding="utf-8", check=False,
     )  # fmt: skip
-    assert done.returncode == 0
+    assert done.returncode == code
     assert all(line.startswith("mkc: after ") for line in done.stderr.splitlines())
 
 
