@@ -91,18 +91,21 @@ def vetoed(held_out: HeldOut) -> bool:
 def is_zero_within_error(finding: Finding) -> bool:
     """Whether all parameters are within a standard error of 0; False without standard errors.
 
-    False as well if the open-loop fit without the finding is clearly less likely. Far from 0 the likelihood can be
-    flat, as for the capacity of a large second store, and the standard error larger than the size (Hauck & Donner,
-    Journal of the American Statistical Association 72 (1977), 851).
+    A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without the
+    finding is clearly less likely. Far from 0 the likelihood can be flat, as for the capacity of a large second store,
+    and the standard error larger than the size (Hauck & Donner, Journal of the American Statistical Association 72
+    (1977), 851).
     """
-    if finding.clearly_better:
-        return False
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
         if parameter.standard_error is not None
     ]
-    return bool(known) and all(bool((value.abs() < error).all()) for value, error in known)
+    if known and not any(bool(value.any()) for value, _ in known):
+        return True
+    return (
+        bool(known) and not finding.clearly_better and all(bool((value.abs() < error).all()) for value, error in known)
+    )
 
 
 def change(held_out: HeldOut) -> float:

@@ -40,3 +40,11 @@ def test_a_size_with_a_flat_likelihood_is_not_zero():
     assert not is_zero_within_error(found)
     assert grade_of(found) == "left_out"
     assert grade_of(dataclasses.replace(found, clearly_better=False)) == "unconfirmed"
+
+
+def test_a_size_that_ended_at_its_bound_of_zero_is_not_confirmed():
+    """A conditional estimate at a bound has no standard error, and the noise model alone made the difference."""
+    found = dataclasses.replace(finding((0.0, 0.0), (10.0, None)), clearly_better=True)
+    assert is_zero_within_error(found)
+    assert grade_of(found) == "unconfirmed"
+    assert not is_zero_within_error(finding((0.0, 0.0), (2.0, 0.1)))
