@@ -92,9 +92,9 @@ def is_zero_within_error(finding: Finding) -> bool:
     """Whether all parameters are within a standard error of 0; False without standard errors.
 
     A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without
-    the finding is clearly less likely. Far from 0 the likelihood can be flat, as for the capacity of a large second store,
-    and the standard error larger than the size (Hauck & Donner, Journal of the American Statistical Association 72
-    (1977), 851).
+    the finding is clearly less likely. Far from 0 the likelihood can be flat, as for the capacity of a large second
+    store, and the standard error larger than the size (Hauck & Donner, Journal of the American Statistical Association
+    72 (1977), 851).
     """
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
