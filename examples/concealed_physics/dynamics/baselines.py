@@ -22,7 +22,7 @@ from held_out import DATA, finding_text, prove
 from library import PHYSICS, Physics
 from neural import neural_ode
 from problem import Outcome, plain, problem_of, shortened
-from sparse import sindy
+from sparse_regression import sindy
 from systems import Case, balls, heaters, servo, silverbox
 
 METHODS = ("PySINDy", "neural ODE")
