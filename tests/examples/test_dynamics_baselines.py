@@ -17,7 +17,7 @@ DRAG = 0.02
 @pytest.fixture
 def load(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
-    for name in ("baselines", "free_run", "held_out", "library", "neural", "problem", "sparse", "systems"):
+    for name in ("baselines", "free_run", "held_out", "library", "neural", "problem", "sparse_regression", "systems"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module
 
@@ -109,7 +109,7 @@ def test_inputs_between_samples(load, between):
 
 def test_simple_choices_and_words(load):
     baselines = load("baselines")
-    assert load("sparse").simplest([2.0, 1.0, 1.04, 1.02], [1, 5, 3, 3]) == 3
+    assert load("sparse_regression").simplest([2.0, 1.0, 1.04, 1.02], [1, 5, 3, 3]) == 3
     assert baselines.mean_of([1.0, math.inf, 3.0]) == (2.0, 1)
     assert baselines.counted(["drag", "nothing", "drag"]) == "drag (2), nothing (1)"
     physics = baselines.PHYSICS["Silverbox"]
@@ -151,7 +151,7 @@ def test_the_neural_ode_learns_the_air_of_a_drop(load, problem, monkeypatch):
 
 def test_pysindy_names_the_air_of_a_drop(load, problem, monkeypatch):
     pytest.importorskip("pysindy", reason="PySINDy is not installed", exc_type=ImportError)
-    sparse = load("sparse")
+    sparse = load("sparse_regression")
     monkeypatch.setattr(sparse, "THRESHOLDS", (0.03, 0.2))
     outcome = sparse.sindy(problem, problem)
     assert outcome.name == "speed' = simulation + *v|v|*"
