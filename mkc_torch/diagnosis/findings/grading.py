@@ -82,20 +82,27 @@ def vetoed(held_out: HeldOut) -> bool:
         >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.0, "m")), vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 2.2, "m"))
         (False, True)
     """
-    ratios = [_ratio(*pair) for pair in _sizes(held_out)]
-    less = 1.0 - math.exp(sum(map(math.log, ratios)) / len(ratios))
+    less = 1.0 - _mean_ratio(held_out)
     worse = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval) == "worse"
     return less < -SMALL or (worse and less < SMALL)
+
+
+def _mean_ratio(held_out: HeldOut) -> float:
+    """Return the geometric mean over the outputs of the ratio of residuals with and without the finding."""
+    ratios = [_ratio(*pair) for pair in _sizes(held_out)]
+    return math.exp(sum(map(math.log, ratios)) / len(ratios))
 
 
 def is_zero_within_error(finding: Finding) -> bool:
     """Whether all parameters are within a standard error of 0; False without standard errors.
 
     A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without
-    the finding is clearly less likely. Far from 0 the likelihood can be flat, as for the capacity of a large second
-    store, and the standard error larger than the size (Hauck & Donner, Journal of the American Statistical Association
-    72 (1977), 851).
+    the finding is clearly less likely, and the residual on held-out blocks is not larger with it. Far from 0 the
+    likelihood can be flat, as for the capacity of a large second store, and the standard error larger than the size
+    (Hauck & Donner, Journal of the American Statistical Association 72 (1977), 851).
     """
+    held = finding.held_out
+    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0)
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
@@ -103,9 +110,7 @@ def is_zero_within_error(finding: Finding) -> bool:
     ]
     if known and not any(bool(value.any()) for value, _ in known):
         return True
-    return (
-        bool(known) and not finding.clearly_better and all(bool((value.abs() < error).all()) for value, error in known)
-    )
+    return bool(known) and not better and all(bool((value.abs() < error).all()) for value, error in known)
 
 
 def change(held_out: HeldOut) -> float:

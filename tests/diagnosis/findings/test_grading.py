@@ -48,3 +48,11 @@ def test_a_size_that_ended_at_its_bound_of_zero_is_not_confirmed():
     assert is_zero_within_error(found)
     assert grade_of(found) == "unconfirmed"
     assert not is_zero_within_error(finding((0.0, 0.0), (2.0, 0.1)))
+
+
+def test_a_finding_that_enlarges_the_residual_is_not_clearly_better():
+    """The likelihood with the residual's correlation can rise for a residual that grows slowly."""
+    larger = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 0.17, 0.8, "rad"), "")),)
+    found = dataclasses.replace(finding((1.3, 5.5), (0.04, None)), clearly_better=True)
+    assert grade_of(found) == "left_out"
+    assert grade_of(dataclasses.replace(found, evidence=larger)) == "unconfirmed"
