@@ -146,6 +146,7 @@ def reads_of(estimator: LinearEstimator, X: Tensor, y: Tensor) -> int:
 def test_the_host_reads_every_fourth_step_and_no_more_for_more_problems(estimator: LinearEstimator):
     few, many = reads_of(estimator, *sample(2)), reads_of(estimator, *sample(60))
     steps = int(torch.as_tensor(getattr(estimator, "n_iter_", 0)).max())
+    # each pseudo-inverse reads whether Cholesky's factor is enough, in place of hundreds of operations;
     # least median of squares counts its refits, each with exchanges of its own
     constant = 70 if isinstance(estimator, LeastMedianOfSquares) else 36
     assert many <= 0.25 * steps + constant
