@@ -53,7 +53,8 @@ def write_with_columns(
     table = topics[topic].table
     of_text, as_text = (file.suffix.lower() in CSV.endings for file in (source, path))
     written: dict[str, Any] = {}
-    for name, series in zip(table.names, table.series, strict=True):
+    copied = table.with_units if as_text and table.with_units is not None else table.series
+    for name, series in zip(table.names, copied, strict=True):
         while not name and name in written:
             name += " "  # blanks make empty names unique and are stripped on reading
         written[name] = _texts(series) if as_text else _typed(series) if of_text else series

@@ -6,7 +6,7 @@ import io
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("polars")
@@ -128,6 +128,8 @@ first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";
 
 
 @settings(max_examples=40)
+@example(rows=[("", "0A")])  # a unit stays in its cell
+@example(rows=[("a", "b 0")])  # a blank separates no cells here
 @given(rows=st.lists(st.tuples(first, cell), min_size=1, max_size=6))
 def test_every_cell_of_a_csv_is_written_as_it_stands(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("cells")

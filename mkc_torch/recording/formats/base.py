@@ -48,12 +48,14 @@ class Table(NamedTuple):
         series: polars series, a column each.
         lines: for each row, its line or row number in the file.
         line: the word for that number in messages: "line", "row" or "message".
+        with_units: the columns with the units in their cells, as to be copied; ``series`` if None.
     """
 
     names: list[str]
     series: list[Any]
     lines: Sequence[int]
     line: str = "line"
+    with_units: list[Any] | None = None
 
 
 class Topic(NamedTuple):

@@ -57,12 +57,12 @@ def topic(path: Path) -> Topic:
     series, changes = _with_points(path, names, grouped, numbers)
     changes = [Note("Thousands separators were removed from the numbers."), *changes] if thousands else changes
     bare = [without_units(column) for column in series]
-    series = [column for column, _ in bare]
     units = {name: unit for name, (_, unit) in zip(names, bare, strict=True) if unit}
     units |= {
         name: unit.strip(" []()") for name, unit in zip(names, layout.units, strict=False) if unit.strip(" -[]()")
     }
-    return Topic("", Table(names, series, numbers), units, (*warnings, *layout.warnings, *changes), layout.restarts)
+    table = Table(names, [column for column, _ in bare], numbers, with_units=series)
+    return Topic("", table, units, (*warnings, *layout.warnings, *changes), layout.restarts)
 
 
 def _plainly_quoted(lines: list[Line]) -> tuple[list[Line], list[str]]:

@@ -31,6 +31,9 @@ _ORDER = ("\t", ";", "|", ",", WHITE)
 _BLANKS = 0.9
 """Score factor of blanks as separators; a stamp of date and time contains a blank."""
 
+_WITHOUT_NAMES = 0.6
+"""Score factor of a separator that splits no line of words into as many cells as the rows, as it does a header."""
+
 _LOOKED_AT = 120
 """Number of lines at the beginning, and in the middle, from which the separator is detected."""
 
@@ -100,7 +103,8 @@ def separator_of(lines: Sequence[str]) -> tuple[str, int]:
     seen = [*lines[:_LOOKED_AT], *lines[max(_LOOKED_AT, half) : max(_LOOKED_AT, half) + _LOOKED_AT]]
     best, found = 0.0, None
     for separator in _ORDER:
-        rows = [cells for cells in (cells_of(line, separator) for line in seen) if any(map(is_value, cells))]
+        split = [cells_of(line, separator) for line in seen]
+        rows = [cells for cells in split if any(map(is_value, cells))]
         if not rows:
             continue
         (count, _), *_ = Counter(map(len, rows)).most_common(1)
@@ -109,6 +113,8 @@ def separator_of(lines: Sequence[str]) -> tuple[str, int]:
         rows = [cells for cells in rows if len(cells) == count]
         filled = sum(any(cells[i].strip() for cells in rows) for i in range(count))
         score = sum(sum(map(is_value, cells)) / filled for cells in rows) * (_BLANKS if separator == WHITE else 1.0)
+        if not any(len(cells) == count and not any(map(is_value, cells)) for cells in split):
+            score *= _WITHOUT_NAMES
         if score > best:
             best, found = score, (separator, count)
     if found is not None:
