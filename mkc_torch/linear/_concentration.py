@@ -27,7 +27,7 @@ _MOST_COLUMNS = 12
 _MOST_SAMPLES = 4096
 """Most samples, all of which a program holds in registers."""
 
-_VALUES = 96
+_VALUES = 72
 """Most values of X of a thread, which registers hold in part; a program of one warp needs no barriers."""
 
 _OWN_VALUES = 6

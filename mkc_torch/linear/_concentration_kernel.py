@@ -14,26 +14,46 @@ _NUMBERS = (
 
 
 @triton.jit
-def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
-    """The least of the sizes >= 0 whose cumulated weight reaches ``target``, by bisection of its bits."""
-    bits = sizes.to(tl.int64, bitcast=True)
-    low = tl.min(tl.where(valid, bits, 0x7FFFFFFFFFFFFFFF), 0) - 1
-    high = tl.max(tl.where(valid, bits, 0), 0)
+def _least_reaching(keys, weight, among, target, HAS_WEIGHT: tl.constexpr):
+    """The least of the keys, 32-bit integers, whose cumulated weight reaches ``target``, by bisection."""
+    low = tl.min(tl.where(among, keys, 0x7FFFFFFF), 0).to(tl.int64) - 1
+    high = tl.max(tl.where(among, keys, -0x80000000), 0).to(tl.int64)
     while high - low > 1:
         middle = low + ((high - low) >> 1)
-        below = valid & (bits <= middle)
+        below = among & (keys <= middle.to(tl.int32))
         if HAS_WEIGHT:
             reached = tl.sum(tl.where(below, weight, 0.0), 0)
         else:
             reached = tl.sum(below.to(tl.int32), 0).to(tl.float64)
         if reached >= target:
-            # no size lies between the largest of these and the middle
-            high = tl.max(tl.where(below, bits, 0), 0)
+            # no key lies between the largest of these and the middle
+            high = tl.max(tl.where(below, keys, -0x80000000), 0).to(tl.int64)
             if not HAS_WEIGHT:
                 low = tl.where(reached == target, high - 1, low)
         else:
             low = middle
-    return high.to(tl.float64, bitcast=True)
+    return high.to(tl.int32)
+
+
+@triton.jit
+def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
+    """The least of the sizes >= 0 whose cumulated weight reaches ``target``.
+
+    The upper and the lower halves of the bits are searched one after the other: few sizes have the same upper half.
+    """
+    bits = sizes.to(tl.int64, bitcast=True)
+    upper = (bits >> 32).to(tl.int32)
+    found = _least_reaching(upper, weight, valid, target, HAS_WEIGHT)
+    before = valid & (upper < found)
+    if HAS_WEIGHT:
+        reached = tl.sum(tl.where(before, weight, 0.0), 0)
+    else:
+        reached = tl.sum(before.to(tl.int32), 0).to(tl.float64)
+    # signed integers in the order of the unsigned halves
+    lower = (bits ^ 0x80000000).to(tl.int32)
+    rest = _least_reaching(lower, weight, valid & (upper == found), target - reached, HAS_WEIGHT)
+    joined = (found.to(tl.int64) << 32) | ((rest.to(tl.int64) & 0xFFFFFFFF) ^ 0x80000000)
+    return joined.to(tl.float64, bitcast=True)
 
 
 @triton.jit

@@ -38,12 +38,12 @@ def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " 
 
 
 def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShapes:
-    """The rows at ``index`` in float64 on the CPU, as a problem."""
+    """The rows at ``index``, where they are and in their type."""
     weight, index = values.sample_weight, index.to(values.Y.device)
     return CanonicalShapes(
-        values.X.index_select(-3, index).cpu().double(),
-        values.Y.index_select(-2, index).cpu().double(),
-        None if weight is None else weight.index_select(-2, index).cpu().double(),
+        values.X.index_select(-3, index),
+        values.Y.index_select(-2, index),
+        None if weight is None else weight.index_select(-2, index),
         values.batch,
         values.single_channel,
     )
@@ -67,8 +67,9 @@ def pilot_problem(values: CanonicalShapes, seed: int) -> tuple[LinearProblem, bo
 
 def _problem(values: CanonicalShapes, index: Int[Tensor, " k"]) -> LinearProblem | None:
     some = rows_at(values, index)
+    weight = None if some.sample_weight is None else some.sample_weight.cpu().double()
     try:
-        problem = linear_problem(some.X, some.Y, some.sample_weight)
+        problem = linear_problem(some.X.cpu().double(), some.Y.cpu().double(), weight)
     except (RankDeficientError, ValueError):
         return None
     return problem if _spans(problem) else None
