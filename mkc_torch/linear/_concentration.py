@@ -119,13 +119,14 @@ def _kernels() -> tuple[CachedKernel, CachedKernel]:
 
 
 @lru_cache(maxsize=64)
-def _on_device(values: tuple[float, ...], device: torch.device) -> Float[Tensor, " 6"]:
+def on_device(values: tuple[float, ...], device: torch.device) -> Float[Tensor, " k"]:
+    """Numbers as a tensor, copied to the device once."""
     # the cached tensor outlives an inference mode in which it was created
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float64, device=device)
 
 
-class _Data(NamedTuple):
+class KernelData(NamedTuple):
     """A problem as the kernels take it: columns, targets and sample weights with their numbers, and constants."""
 
     tensors: tuple[Tensor, Tensor, Tensor]
@@ -136,15 +137,15 @@ class _Data(NamedTuple):
     weighted: bool
 
 
-def _data(problem: SmallProblem) -> _Data:
-    kept: _Data | None = problem.__dict__.get("_kept_data")
+def kernel_data(problem: SmallProblem) -> KernelData:
+    kept: KernelData | None = problem.__dict__.get("_kept_data")
     if kept is not None:
         return kept
     columns = problem.basis.detach()[:, :, 0].mT.contiguous()
     y = problem.Y.detach().contiguous()
     weight = y if problem.sample_weight is None else problem.sample_weight.detach().contiguous()
     block = 1 << max(problem.num_samples - 1, 31).bit_length()
-    kept = _Data(
+    kept = KernelData(
         (columns, y, weight),
         (problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(), weight[0].numel()),
         max(1 << (problem.num_coefficients - 1).bit_length(), 2),
@@ -184,7 +185,7 @@ def concentrate(
         keeps: whether the scale before a step is the first guess after it.
     """
     count, starts, n = beta.shape
-    given = _data(problem)
+    given = kernel_data(problem)
     beta, near = beta.detach().contiguous(), None if near is None else near.detach().contiguous()
     found, scale = torch.empty_like(beta), beta.new_empty(count, starts, 1)
     steps = torch.empty(count, starts, dtype=torch.int32, device=beta.device)
@@ -193,7 +194,7 @@ def concentrate(
     _kernels()[0].launch(
         (count * starts, 1, 1),
         (
-            *given.tensors, beta, scale if near is None else near, _on_device(values, beta.device), found, scale, steps,
+            *given.tensors, beta, scale if near is None else near, on_device(values, beta.device), found, scale, steps,
         ),
         (
             starts, *given.numbers, max_iter,
@@ -209,7 +210,7 @@ def concentrate(
 def weighted_fits(problem: SmallProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:
     """Weighted least-squares coefficients in the basis; the coefficient of a direction without weight is 0."""
     count, sets = weight.shape[:2]
-    given, n = _data(problem), problem.num_coefficients
+    given, n = kernel_data(problem), problem.num_coefficients
     found = weight.new_empty(count, sets, n)
     _kernels()[1].launch(
         (count * sets, 1, 1),

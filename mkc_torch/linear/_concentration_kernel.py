@@ -5,12 +5,18 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-__all__ = ["concentration_kernel", "weighted_fit_kernel"]
+__all__ = ["concentration_kernel", "weighted_fit", "weighted_fit_kernel"]
 
 _NUMBERS = (
     "starts", "sets", "samples", "x_batch", "w_batch", "max_iter", "has_near", "keeps", "newton_steps", "is_exact",
 )  # fmt: skip
 """Numbers of which the compiled form does not depend: with many columns it takes seconds to compile."""
+
+
+@triton.jit
+def _weight_of(among, weight, HAS_WEIGHT: tl.constexpr):
+    """The total weight of some samples; without weights their number, which is summed in integers."""
+    return tl.sum(tl.where(among, weight, 0.0), 0) if HAS_WEIGHT else tl.sum(among.to(tl.int32), 0).to(tl.float64)
 
 
 @triton.jit
@@ -21,10 +27,7 @@ def _least_reaching(keys, weight, among, target, HAS_WEIGHT: tl.constexpr):
     while high - low > 1:
         middle = low + ((high - low) >> 1)
         below = among & (keys <= middle.to(tl.int32))
-        if HAS_WEIGHT:
-            reached = tl.sum(tl.where(below, weight, 0.0), 0)
-        else:
-            reached = tl.sum(below.to(tl.int32), 0).to(tl.float64)
+        reached = _weight_of(below, weight, HAS_WEIGHT)
         if reached >= target:
             # no key lies between the largest of these and the middle
             high = tl.max(tl.where(below, keys, -0x80000000), 0).to(tl.int64)
@@ -44,20 +47,16 @@ def _order_statistic(sizes, weight, valid, target, HAS_WEIGHT: tl.constexpr):
     bits = sizes.to(tl.int64, bitcast=True)
     upper = (bits >> 32).to(tl.int32)
     found = _least_reaching(upper, weight, valid, target, HAS_WEIGHT)
-    before = valid & (upper < found)
-    if HAS_WEIGHT:
-        reached = tl.sum(tl.where(before, weight, 0.0), 0)
-    else:
-        reached = tl.sum(before.to(tl.int32), 0).to(tl.float64)
     # signed integers in the order of the unsigned halves
     lower = (bits ^ 0x80000000).to(tl.int32)
-    rest = _least_reaching(lower, weight, valid & (upper == found), target - reached, HAS_WEIGHT)
+    left = target - _weight_of(valid & (upper < found), weight, HAS_WEIGHT)
+    rest = _least_reaching(lower, weight, valid & (upper == found), left, HAS_WEIGHT)
     joined = (found.to(tl.int64) << 32) | ((rest.to(tl.int64) & 0xFFFFFFFF) ^ 0x80000000)
     return joined.to(tl.float64, bitcast=True)
 
 
 @triton.jit
-def _weighted_fit(x, target_y, weight, valid, samples, N: tl.constexpr, COLUMNS: tl.constexpr):
+def weighted_fit(x, target_y, weight, valid, samples, N: tl.constexpr, COLUMNS: tl.constexpr):
     """Weighted least-squares coefficients; ``x`` points to the samples of the first column."""
     column = tl.arange(0, COLUMNS)
     gram = tl.zeros((COLUMNS, COLUMNS), tl.float64)
@@ -169,7 +168,7 @@ def concentration_kernel(
         objective = tl.minimum(objective, before)
         going = falling & (step < max_iter) & (RULE > 0)
         if going:
-            beta = _weighted_fit(x, target_y, weight, valid, samples, N, COLUMNS)
+            beta = weighted_fit(x, target_y, weight, valid, samples, N, COLUMNS)
             step += 1
     tl.store(beta_out + program * N + column, beta, mask=column < N)
     tl.store(scale_out + program, scale)
@@ -193,5 +192,5 @@ def weighted_fit_kernel(
     weight = tl.load(weights + program * samples + lane, mask=valid, other=0.0).to(tl.float64)
     if HAS_WEIGHT:
         weight *= tl.load(w + problem * w_batch + lane, mask=valid, other=0.0).to(tl.float64)
-    beta = _weighted_fit(x + problem * x_batch + lane, target_y, weight, valid, samples, N, COLUMNS)
+    beta = weighted_fit(x + problem * x_batch + lane, target_y, weight, valid, samples, N, COLUMNS)
     tl.store(beta_out + program * N + column, beta, mask=column < N)

@@ -12,6 +12,8 @@ from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 from mkc_torch.density.em import gaussian_state, normalised, replace_problems, weighted_rms
 from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
+from mkc_torch.linear._alternation import alternated
+from mkc_torch.linear._concentration import runs_kernel
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start, small_sample_factor
@@ -41,6 +43,9 @@ def _alternate(
     problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
 ) -> LikelihoodMaximum:
     """Alternate E-steps and M-steps; a problem leaves the batch after ``patience`` of them without progress."""
+    if runs_kernel(problem):
+        found = alternated(problem, beta, state, max_iter=max_iter, tol=tol, patience=patience)
+        return LikelihoodMaximum(found.beta, found.state, found.history[-1], found.ended, found.history)
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
     out_beta, out_state = beta.clone(), state

@@ -1,5 +1,7 @@
 """Concentration steps as one Triton kernel: those of plain operations, on a GPU if there is one, else interpreted."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -8,8 +10,11 @@ from mkc_torch.linear import (
     LeastTrimmedSquares,
     MKCRegression,
     SRegression,
+    _alternation,
     _concentration,
+    _maximum,
     _problem,
+    _robust_start,
     _scale_search,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem, solve_gram
@@ -45,6 +50,13 @@ def weighted_problem(kind: str, n: int, dtype: torch.dtype = torch.float64) -> L
     number = torch.arange(y.shape[-1], device=DEVICE)
     weight = {"weights": 0.2 + number.to(dtype) % 3, "some left out": (number % 3 > 0).to(dtype)}.get(kind)
     return linear_problem(X, y, weight)
+
+
+def plain_alternation(problem: LinearProblem, *args: Any, **options: Any) -> _maximum.LikelihoodMaximum:
+    """The alternation in separate operations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_maximum, "runs_kernel", lambda _: False)
+        return _maximum._alternate(problem, *args, **options)
 
 
 KINDS = ("plain", "shared X", "weights", "some left out")
@@ -170,3 +182,26 @@ def test_large_problems_and_several_channels_take_plain_operations():
     assert _concentration.suits_kernel(linear_problem(X, y))
     assert not _concentration.suits_kernel(linear_problem(X.unsqueeze(2).expand(-1, -1, 2, -1), y.unsqueeze(-1) + X))
     assert not _concentration.suits_kernel(linear_problem(X.repeat(1, 200, 1), y.repeat(1, 200)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("given", ["learned", "known width", "known scale"])
+def test_the_alternation_is_that_of_plain_operations(kind, given):
+    problem = weighted_problem(kind, n=3)
+    begin = _robust_start.robust_start(problem)
+    sigma, d = {"known width": (2.0, None), "known scale": (None, 1.2)}.get(given, (None, None))
+    known = _maximum.FixedParameters(sigma, d, None, "lts")
+    d_min, bound = _maximum.least_d(problem, begin), 60.0 * torch.ones_like(begin.scale)
+    start = known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
+    for steps, ends in ((1, False), (100, True)):
+        plain = plain_alternation(problem, begin.beta, start, max_iter=steps, tol=1e-10)
+        found = _alternation.alternated(problem, begin.beta, start, max_iter=steps, tol=1e-10, patience=2)
+        assert bool(found.ended.all()) == ends
+        # rounding of second derivatives is a part of the steps, and of the last gain
+        assert abs(len(found.history) - len(plain.history)) <= 2
+        for value, expected in zip(found.history, plain.history, strict=False):
+            torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found.history[-1], plain.history[-1], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(found.beta, plain.beta, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found.state.kappa, plain.state.kappa, rtol=1e-5, atol=1e-9)
+        torch.testing.assert_close(found.state.log_d, plain.state.log_d, rtol=1e-6, atol=1e-6)

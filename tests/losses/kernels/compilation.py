@@ -19,6 +19,8 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
+from mkc_torch.density.likelihood import DensityState
+from mkc_torch.linear._alternation import alternated
 from mkc_torch.linear._blocks import Density
 from mkc_torch.linear._concentration import concentrate, weighted_fits
 from mkc_torch.linear._fused_pass import fused_pass
@@ -117,6 +119,15 @@ def training_steps() -> Iterator[str]:
         weighted_fits(linear_problem(X, y, y), torch.ones(1, 3, samples, 1, dtype=torch.float64))
         return f"fits, {name}"
 
+    def alternations(name: str, samples: int, columns: int, *, weighted: bool = False) -> str:
+        X, y = torch.eye(samples, columns, dtype=torch.float64) + 1.0, torch.ones(samples, dtype=torch.float64)
+        problem, one = linear_problem(X, y, y if weighted else None), torch.ones(1, 1, dtype=torch.float64)
+        state = DensityState(one, one, one, one, one, one)
+        alternated(problem, torch.ones(1, columns, dtype=torch.float64), state, max_iter=20, tol=1e-10, patience=2)
+        return f"alternations, {name}"
+
+    yield alternations("two columns", 100, 2)
+    yield alternations("nine columns, weighted", 500, 9, weighted=True)
     yield fits("six columns, weighted", 300, 6)
     yield starts("two columns, M-scale", 100, 2, MScale(30))
     yield starts("six columns, trimmed", 300, 6, TrimmedScale(0.5))
