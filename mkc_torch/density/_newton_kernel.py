@@ -40,10 +40,20 @@ def _head(kappa, length, nodes, weights, TOLERANCE: tl.constexpr):
 
 
 @triton.jit
+def _integral(values, tail, length, share):
+    """As :func:`mkc_torch.density.head.integrate`.
+
+    The condition is always true. Without it the compiler may fuse a lane's product with the sum of the other lanes, so
+    that lanes differ in the last digit and leave a loop at different steps.
+    """
+    return 2.0 * length * tail + tl.sum(tl.where(share > 0, share * (values - tail), 0.0), 0)
+
+
+@triton.jit
 def _log_partition(kappa, length, nodes, weights, TOLERANCE: tl.constexpr):
     u, share, tail = _head(kappa, length, nodes, weights, TOLERANCE)
     _, e, _, _ = _energy_terms(0.5 * u * u, kappa)
-    return tl.log(2.0 * length * tail + tl.sum(share * (tl.exp(-e) - tail), 0))
+    return tl.log(_integral(tl.exp(-e), tail, length, share))
 
 
 @triton.jit
@@ -72,10 +82,9 @@ def newton_step(
     tail_1, tail_2 = tail / (k * k), tail * (1.0 - 2.0 * k) / (k * k * k * k)
     _, head_e, head_1, head_2 = _energy_terms(0.5 * u * u, kappa)
     p = tl.exp(-head_e)
-    partition = 2.0 * length * tail + tl.sum(share * (p - tail), 0)
-    z_k = (2.0 * length * tail_1 + tl.sum(share * (head_1 * p - tail_1), 0)) / partition
-    curved = (head_1 * head_1 - head_2) * p
-    z_kk = (2.0 * length * tail_2 + tl.sum(share * (curved - tail_2), 0)) / partition
+    partition = _integral(p, tail, length, share)
+    z_k = _integral(head_1 * p, tail_1, length, share) / partition
+    z_kk = _integral((head_1 * head_1 - head_2) * p, tail_2, length, share) / partition
     w_end, e_end, first_end, _ = _energy_terms(tl.minimum(0.5 * length * length, 1e100), kappa)
     edge = 2.0 * tl.exp(-e_end) / partition
     l_1 = length * edge

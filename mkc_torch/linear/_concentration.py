@@ -30,6 +30,13 @@ _MOST_SAMPLES = 4096
 _VALUES = 72
 """Most values of X of a thread, which registers hold in part; a program of one warp needs no barriers."""
 
+_LEAST_BLOCK = 64
+"""Samples of a program, at least: two for each lane of a warp.
+
+A lane's only product would be fused with the sum of the other lanes, so that lanes differ in the last digit and leave a
+loop at different steps.
+"""
+
 _OWN_VALUES = 6
 """Values of a sample that a thread holds in addition to those of X."""
 
@@ -144,7 +151,7 @@ def kernel_data(problem: SmallProblem) -> KernelData:
     columns = problem.basis.detach()[:, :, 0].mT.contiguous()
     y = problem.Y.detach().contiguous()
     weight = y if problem.sample_weight is None else problem.sample_weight.detach().contiguous()
-    block = 1 << max(problem.num_samples - 1, 31).bit_length()
+    block = 1 << max(problem.num_samples - 1, _LEAST_BLOCK - 1).bit_length()
     kept = KernelData(
         (columns, y, weight),
         (problem.num_samples, 0 if columns.shape[0] == 1 else columns[0].numel(), weight[0].numel()),

@@ -9,6 +9,7 @@ compiled with the dtypes, alignments and flags that it has.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -55,6 +56,20 @@ def compiled(kernel: Any, tensors: Any, numbers: Any, constants: Any, warps: int
             attributes[(place,)] = [["tt.divisibility", 16]]
     source = ASTSource(kernel, signature, constant, attributes)
     return triton.compile(source, target=TARGET, options={"num_warps": warps})
+
+
+def fuses_lanes(ptx: str) -> bool:
+    """Whether a lane's product is fused with a value of another lane: a sum then differs between lanes."""
+    shuffled: set[str] = set()
+    for line in ptx.splitlines():
+        if found := re.search(r"shfl\.sync\.\w+\.b32\s+(%r\d+)", line):
+            shuffled.add(found[1])
+        elif found := re.search(r"(?:cvt\.u64\.u32|shl\.b64|or\.b64|mov\.b\d+)\s+(%\w+),(.*);", line):
+            if shuffled & set(re.findall(r"%\w+", found[2])):
+                shuffled.add(found[1])
+        elif (found := re.search(r"fma\.rn\.f\d+\s+%\w+, %\w+, %\w+, (%\w+);", line)) and found[1] in shuffled:
+            return True
+    return False
 
 
 def training_steps() -> Iterator[str]:
@@ -127,9 +142,11 @@ def training_steps() -> Iterator[str]:
         return f"alternations, {name}"
 
     yield alternations("two columns", 100, 2)
+    yield alternations("two columns, few samples", 25, 2)
     yield alternations("nine columns, weighted", 500, 9, weighted=True)
     yield fits("six columns, weighted", 300, 6)
     yield starts("two columns, M-scale", 100, 2, MScale(30))
+    yield starts("two columns, few samples, M-scale", 25, 2, MScale(30))
     yield starts("six columns, trimmed", 300, 6, TrimmedScale(0.5))
     yield starts("twelve columns, many weighted samples", 1500, 12, MScale(2), weighted=True)
     yield rows("float32, nine columns", torch.float32, 9, curvature=False)
@@ -138,7 +155,7 @@ def training_steps() -> Iterator[str]:
 
 
 def main() -> None:
-    """Compile every launch and print whether it has vector loads of four numbers."""
+    """Compile every launch and print whether it has vector loads of four numbers, and whether lanes agree on sums."""
     launches: list[tuple[Any, ...]] = []
 
     def launch(self: CachedKernel, grid: Any, *arguments: Any) -> None:
@@ -149,7 +166,8 @@ def main() -> None:
         for kernel, *arguments in launches:
             found = compiled(kernel, *arguments)
             loads = "ld.global.v4" if ".v4.b32" in found.asm["ptx"] else "narrow loads"
-            print(f"{name}: {kernel.__name__}, {loads}", flush=True)
+            lanes = "lanes may differ" if fuses_lanes(found.asm["ptx"]) else "lanes agree"
+            print(f"{name}: {kernel.__name__}, {loads}, {lanes}", flush=True)
         launches.clear()
 
 
