@@ -24,7 +24,7 @@ from mkc_torch.linear._scale_search import ScaleSearch, minimise_scale, relative
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 
 def stacked(weight: Tensor | None) -> Tensor | None:
@@ -321,7 +321,7 @@ def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Te
 def _exchange(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -> Float[Tensor, "B n"]:
     """Exchange a used sample for an unused one while the sum of squares after the refit falls."""
     N = problem.num_samples
-    parts = torch.arange(beta.shape[0], device=beta.device).split(at_once(beta, N * N, _CHUNK))
+    parts = torch.arange(beta.shape[0], device=beta.device).split(at_once(beta, h * (N - h), _CHUNK))
     return torch.cat([_exchange_part(problem.select(part), beta[part], h) for part in parts])
 
 
@@ -348,19 +348,28 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         beta[active] = some.weighted_fit(counts)
         error = some.residual(beta[active])[..., 0]
         inverse = symmetric_pinv(gram)
-        mine = rows if rows.shape[0] == 1 else rows[active]
-        leverage = torch.matmul(torch.matmul(mine, inverse), mine.mT)
-        own = leverage.diagonal(dim1=-2, dim2=-1)
-        out, into = (1.0 - own).clamp(min=0.0).unsqueeze(-1), (1.0 + own).unsqueeze(-2)
-        change = error.square().unsqueeze(-2) * out - error.square().unsqueeze(-1) * into
-        change = change + 2.0 * error.unsqueeze(-1) * error.unsqueeze(-2) * leverage
+        order = keep[active].to(torch.uint8).argsort(dim=-1, descending=True, stable=True)
+        used, unused = order[:, :h], order[:, h:]
+        mine = (rows if rows.shape[0] == 1 else rows[active]).expand(len(active), -1, -1)
+        projected = torch.matmul(mine, inverse)
+        own = (projected * mine).sum(-1)
+        leverage = torch.matmul(_taken(projected, used), _taken(mine, unused).mT)
+        lost, gained = error.gather(1, used).unsqueeze(-1), error.gather(1, unused).unsqueeze(-2)
+        out = (1.0 - own.gather(1, used)).clamp(min=0.0).unsqueeze(-1)
+        into = (1.0 + own.gather(1, unused)).unsqueeze(-2)
+        change = gained.square() * out - lost.square() * into + 2.0 * lost * gained * leverage
         # a sample of leverage 1 cannot be removed
         change = change / (out * into + leverage.square()).clamp(min=eps)
-        allowed = keep[active].unsqueeze(-1) & ~keep[active].unsqueeze(-2)
-        gain, pair = torch.where(allowed, change, torch.inf).flatten(-2).min(-1)
+        gain, pair = change.flatten(-2).min(-1)
         total = (counts[..., 0] * error.square()).sum(-1)
         falls = falls & (gain < -(1e3 * eps * total + eps * eps * magnitude[active]))
-        out_of, into_it = (pair // N).unsqueeze(-1), (pair % N).unsqueeze(-1)
+        out_of = used.gather(1, (pair // (N - h)).unsqueeze(-1))
+        into_it = unused.gather(1, (pair % (N - h)).unsqueeze(-1))
         mask = keep[active].scatter(-1, out_of, False).scatter(-1, into_it, True)
         keep[active] = torch.where(falls.unsqueeze(-1), mask, keep[active])
     return beta
+
+
+def _taken(rows: Float[Tensor, "B N n"], index: Int[Tensor, "B k"]) -> Float[Tensor, "B k n"]:
+    """The rows of each problem at its indices."""
+    return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
