@@ -23,8 +23,6 @@ from mkc_torch._parallel.deadline import check_deadline, is_limited
 from mkc_torch._parallel.processes import cores
 from mkc_torch._parallel.progress import count, counted, silently
 
-__all__ = ["Serializer", "allow_copies", "shared"]
-
 T = TypeVar("T")
 
 _PARENT_DEATH = 1

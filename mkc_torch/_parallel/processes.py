@@ -17,8 +17,6 @@ from typing import Protocol, TypeVar
 
 import torch
 
-__all__ = ["cores", "in_processes", "keep_memory", "keep_modules", "one_thread"]
-
 T = TypeVar("T")
 R = TypeVar("R")
 

@@ -19,26 +19,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "DIVERGED",
-    "as_numbers",
-    "checked_number",
-    "checked_whole",
-    "first_of",
-    "format_value",
-    "refuse_bad_batch",
-    "refuse_bad_weight",
-    "refuse_complex",
-    "refuse_no_tensor",
-    "refuse_not_finite",
-    "refuse_not_real",
-    "refuse_other_shapes",
-    "refuse_other_type",
-    "refuse_out_of_range",
-    "refuse_text",
-    "seems_finite",
-]
-
 
 DIVERGED = "The network has diverged, or what it was given holds NaN: lower the learning rate, or look at its inputs"
 """The remedy for predictions that are not finite."""

@@ -13,8 +13,6 @@ from torch import distributed as dist
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Ranks", "RanksError"]
-
 T = TypeVar("T")
 
 

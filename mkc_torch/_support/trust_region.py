@@ -15,8 +15,6 @@ from mkc_torch._support.small_factors import symmetric_eigen
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Minima", "Quadratic", "minimise"]
-
 _NEGATIVE = 1e-6
 """Negative curvature, relative to the largest curvature, up to which a stationary point counts as a minimum."""
 

@@ -16,8 +16,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["FROZEN", "without_frozen"]
-
 FROZEN = "samples of a frozen sensor"
 
 _LEAST = 20

@@ -14,8 +14,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["apart", "in_each_run", "run_ends", "run_slices"]
-
 _EXPERIMENT = "experiment"
 
 _FARTHEST = 1.1447 * 1078.0 ** (1.0 / 3.0)

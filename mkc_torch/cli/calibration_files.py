@@ -21,9 +21,6 @@ from mkc_torch.cli.exported import exports_of, stale_exports
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
 
-__all__ = ["CalibrationOutcome", "CalibrationRequest", "calibrations_of", "read_calibration"]
-
-
 ACCELEROMETER = "accel"
 """The quantity of an accelerometer; that of a magnetometer is ``mag``."""
 

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 
 from mkc_torch._words.typesetting import plain
 
-__all__ = ["NOTE", "note_rows", "warning_rows"]
-
 NOTE = "note"
 """Label of a note."""
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from numpy import ndarray
 
-__all__ = ["KAPPA_OFFSET", "LEAST_KAPPA_SHARE", "LONGEST_STEP", "Channel", "channel_step", "is_short"]
-
 KAPPA_OFFSET = 0.02
 """Offset of κ in relative steps, Δκ / (κ + offset): near a Gaussian small absolute changes matter."""
 

@@ -16,8 +16,6 @@ from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Domain", "Residuals", "channel_values", "checked_domain", "checked_residuals", "checked_weight"]
-
 
 class Residuals(NamedTuple):
     """Residuals with their weights and robust scales.

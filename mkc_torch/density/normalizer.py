@@ -19,8 +19,6 @@ from mkc_torch.density.head_table import look_up, reaches_beyond_head
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["log_partition"]
-
 _RULE = (head_rule_constants()[0].numpy(), head_rule_constants()[1].numpy())
 """Nodes and weights of the head's quadrature as NumPy arrays."""
 

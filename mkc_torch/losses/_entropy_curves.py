@@ -15,8 +15,6 @@ from mkc_torch.losses._curves import Curves
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["EntropyCurves"]
-
 _REACH = 6.0
 """Half-width of a picture, in robust scales."""
 

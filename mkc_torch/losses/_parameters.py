@@ -15,8 +15,6 @@ from mkc_torch.losses.bandwidth_schedule import UNLIMITED
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ChannelState", "ChannelTable", "annealed_kappa", "channel_table", "logistic", "scale_ratio", "to_d"]
-
 _LEAST_LOGIT = -80.0
 """Lower limit of the logistic function's argument: below it exp overflows float32, and the value is below 1e-34."""
 

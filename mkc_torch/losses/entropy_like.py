@@ -40,8 +40,6 @@ from mkc_torch.losses._entropy_curves import EntropyCurves
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["EntropyLikeMinima", "LELoss", "entropy_like", "least_entropy_like", "orthogonal_starts"]
-
 LEAST_TOTAL = 1.001
 """Total weight of several residuals, at least: log N is a divisor, and weights normalised to 1 are refused."""
 

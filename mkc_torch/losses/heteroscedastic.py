@@ -28,8 +28,6 @@ from mkc_torch.losses._parameters import logistic
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["HeteroscedasticMKCLoss", "MKCConvHead", "MKCHead", "MKCHeadOutput"]
-
 KAPPA_MIN = 1e-6
 """Smallest ``1 / sigma²`` of a head; below it the gradients of σ leave the range of float32."""
 

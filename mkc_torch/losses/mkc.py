@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.density.tails import Tails
 
-__all__ = ["MKCLoss", "checked_loss"]
-
 
 class MKCLoss(ChannelCurves, ChannelDensity):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.

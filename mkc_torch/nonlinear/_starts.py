@@ -18,8 +18,6 @@ from mkc_torch.nonlinear._quadratic import prior_value
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Ends", "draw_starts", "most_likely", "repeat_problem"]
-
 AGREE = 0.01
 """Difference of log-likelihoods of all residuals, in nats, up to which two results count as the same minimum."""
 

@@ -33,8 +33,6 @@ from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["REQUIRED_COLUMNS", "LoadedTable", "load_table", "read_file"]
-
 REQUIRED_COLUMNS = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Required columns: text in any of them is an error."""
 

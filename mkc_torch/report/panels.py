@@ -9,8 +9,6 @@ from matplotlib.figure import Figure
 
 from mkc_torch.report.drawing import svg
 
-__all__ = ["Margins", "Panels", "title"]
-
 _WIDTHS = {1: 6.4, 2: 4.9, 3: 3.25}
 """Width of a panel in inches by the number of panels in a row; 99 pixels of a wide page each."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.protocol import Simulation
 
-__all__ = ["SimulationFileError", "base_class", "file_of", "load_simulation", "raised_in"]
-
 _PREFIX = "_simulation_"
 """Prefix of the names of modules that are loaded from files."""
 

@@ -22,8 +22,6 @@ from mkc_torch.simulation.runs import successive_runs
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Paired", "PairedCorrection", "PreparedPaired"]
-
 RATE = 5e-5
 """Prior standard deviation of the relative rate of two clocks: 50 ppm, of free-running quartz oscillators."""
 

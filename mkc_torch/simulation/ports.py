@@ -12,8 +12,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Answer", "Change", "Changes", "FreeChange", "Nearby", "Port", "SignalSizes", "SignalTimes"]
-
 Change = Callable[[Tensor], Tensor]
 """The change at a port, (N, c), as a function of the signal there.
 

@@ -24,8 +24,6 @@ from mkc_torch.simulation.undetermined import undetermined
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["PreparedStatic", "Static", "StaticCorrection"]
-
 MOST_PARAMETERS = 200
 """Largest number of parameters of a module; a larger module can fit anything, and so lacks no effect."""
 

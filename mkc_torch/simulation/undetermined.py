@@ -11,8 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["undetermined"]
-
 _TINY = 1e-6
 """Relative singular value up to which a direction is undetermined."""
 

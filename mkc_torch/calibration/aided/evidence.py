@@ -16,8 +16,6 @@ from mkc_torch.nonlinear import fit as nonlinear_fit
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedResponse", "judged"]
-
 _LEAST_INFLATION = 1.0
 """Smallest inflation of the samples' errors by autocorrelation."""
 

@@ -15,8 +15,6 @@ from mkc_torch.calibration.result import Calibration
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording, RecordingError
 
-__all__ = ["with_aid"]
-
 _GROUND = 0.01
 """Standard deviation of the local anomaly by rock and buildings: of the field, as a share, and of its inclination, in
 rad."""

@@ -12,8 +12,6 @@ from mkc_torch.calibration.aided.turns import Turns
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["offset_by_turns"]
-
 _ABSOLUTE = 15
 """Iterations of least absolute distances."""
 

@@ -26,8 +26,6 @@ from mkc_torch.calibration.exports.base import (
 from mkc_torch.calibration.exports.numbers import one_line, single, symmetric
 from mkc_torch.calibration.exports.units import Converted, converted
 
-__all__ = ["ARDUPILOT"]
-
 _INSTANCES = 3
 _SCALE = (1.0 / 1.5, 1.5)
 """``COMPASS_MIN_SCALE_FACTOR`` and ``COMPASS_MAX_SCALE_FACTOR`` (``AP_Compass_config.h``)."""

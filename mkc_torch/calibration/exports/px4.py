@@ -26,8 +26,6 @@ from mkc_torch.calibration.exports.base import (
 from mkc_torch.calibration.exports.numbers import one_line, single, symmetric
 from mkc_torch.calibration.exports.units import converted
 
-__all__ = ["PX4"]
-
 _REAL32, _INT32 = 9, 6  # MAV_PARAM_TYPE
 _INSTANCES = 4
 _LARGEST_ID = 2**31 - 1

@@ -15,8 +15,6 @@ from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["NUMBERS", "UnknownNearEnds", "curve_within"]
-
 DEGREE = 3
 """Degree of the polynomial."""
 

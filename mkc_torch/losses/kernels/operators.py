@@ -24,8 +24,6 @@ from mkc_torch.losses.kernels.launch import (
 )
 from mkc_torch.losses.kernels.loss import KernelRequest, gradients_of_each, options_of, request_of, updated_table
 
-__all__ = ["operator_loss"]
-
 _STATE = ("recent", "position", "batches", "log_scale", "half_range", "floor", "steps", "log_bandwidth", "share")
 
 

@@ -20,8 +20,6 @@ from mkc_torch.losses.kernels.sample_loss import (
     without_gaps,
 )
 
-__all__ = ["operator_sample_loss"]
-
 
 @torch.library.custom_op("mkc_torch::sample_loss", mutates_args=())
 def reduced_sample_loss(

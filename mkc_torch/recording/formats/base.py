@@ -9,18 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "FileFormat",
-    "MissingColumnError",
-    "RecordingError",
-    "Table",
-    "Topic",
-    "counted",
-    "is_number",
-    "listed",
-    "polars",
-]
-
 MISSING_WORDS = [
     "na", "n/a", "null", "none", "nil", "<na>", "#n/a", "#na", "#value!", "#num!", "#div/0!", "1.#qnan", "-1.#ind",
     "1.#ind",

@@ -21,8 +21,6 @@ from mkc_torch.recording.formats.base import (
     polars,
 )
 
-__all__ = ["as_numbers", "missing_warning", "numbered", "renamed", "text_error"]
-
 
 def renamed(
     table: Table, columns: Mapping[str, str], path: Path | str, what: str = "file"

@@ -12,9 +12,6 @@ from mkc_torch.recording.formats.hdf5_objects import hdf5_group
 from mkc_torch.recording.formats.magic_numbers import wrong_format_error
 from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
-__all__ = ["HDF5", "h5py", "hdf5_root"]
-
-
 _TRIAL = Path(__file__).with_name("hdf5_objects.py").read_text(encoding="utf-8")
 """Source that a process of its own runs first: a damaged file can end the process that reads it."""
 

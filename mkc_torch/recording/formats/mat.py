@@ -14,8 +14,6 @@ from mkc_torch.recording.formats.groups import Group, group_topics
 from mkc_torch.recording.formats.hdf5 import h5py, hdf5_root
 from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 
-__all__ = ["MAT"]
-
 _TABLES = (
     "tables, timetables, timeseries and other objects of MATLAB are not read: save `table2struct(T, 'ToScalar', true)` "
     "or plain arrays instead"

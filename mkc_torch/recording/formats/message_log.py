@@ -9,8 +9,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic, counted
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE, Cell, MessageRows
 
-__all__ = ["MessageLog"]
-
 LOG_TIME = "log_time"
 _PUBLISH_TIME = "publish_time"
 _STAMP = "header.stamp"

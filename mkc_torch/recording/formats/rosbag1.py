@@ -21,8 +21,6 @@ from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.ros_messages import RosReader, parsed_definitions, type_name
 
-__all__ = ["ROSBAG1"]
-
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CONNECTION = b"\x02", b"\x03", b"\x05", b"\x07"
 _LENGTH = struct.Struct("<I")

@@ -23,8 +23,6 @@ from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE
 from mkc_torch.recording.formats.ros_messages import RosReader, known_definitions, parsed_definitions, type_name
 
-__all__ = ["ROSBAG2"]
-
 _MAGIC = b"SQLite format 3\0"
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _METADATA = "metadata.yaml"

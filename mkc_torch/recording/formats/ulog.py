@@ -20,8 +20,6 @@ from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.px4_units import px4_units
 from mkc_torch.recording.formats.topics import topic_of
 
-__all__ = ["ULOG"]
-
 _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
 _MOST_FIELDS = 65536

@@ -13,18 +13,6 @@ from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
-__all__ = [
-    "explained",
-    "goodness_of_fit_table",
-    "input_hold_sentence",
-    "noise_lines",
-    "offset_sentences",
-    "output_lines",
-    "process_noise_sentence",
-    "process_noise_table",
-    "remainder",
-]
-
 _MOST_OUTPUTS = 6
 _STILL = 2.0
 """Variation, in noise floors, up to which an output hardly varies."""

@@ -15,26 +15,6 @@ from mkc_torch.report.diagnosis.numbers import TimeFormat, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
-__all__ = [
-    "acts_on",
-    "driven_by",
-    "finding_name",
-    "fitted_sizes",
-    "grade",
-    "inseparable",
-    "label_name",
-    "references_of",
-    "region",
-    "rivals",
-    "role",
-    "shape",
-    "shares_of_runs",
-    "unrecorded",
-    "where",
-    "with_drivers",
-    "with_names",
-]
-
 _MOST_RUNS = 6
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "acts on {channels}, the sensor's axes",

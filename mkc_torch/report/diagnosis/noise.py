@@ -9,14 +9,6 @@ from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
 
-__all__ = [
-    "channel_notes",
-    "held_out_rows",
-    "noise_model",
-    "noise_parameters",
-    "smooth_fit",
-]
-
 _CLEARLY = 0.99
 """Ratio of residuals below which the smaller is reported."""
 

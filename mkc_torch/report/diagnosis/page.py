@@ -29,8 +29,6 @@ from mkc_torch.report.drawing import themed
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 
-__all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
-
 _MOST_SHOWN = 12
 _MOST_FORCINGS = 3
 _FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, orthogonal

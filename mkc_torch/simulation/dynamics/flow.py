@@ -18,9 +18,6 @@ from mkc_torch.simulation.ports import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-
-__all__ = ["flow_along", "flow_of", "plausible_sizes"]
-
 _LEAST_STATE_ERROR = 0.1
 """Smallest assumed error of a state, as a share of its standard deviation."""
 

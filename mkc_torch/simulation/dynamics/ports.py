@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["RATES", "PortContext", "common_unit", "memory_at"]
-
 _MEMORIES: Mapping[str, Mapping[str, bool]] = {
     "hysteretic rate": {"memory_of": False},
     "lagged rate": {"lagged": True},

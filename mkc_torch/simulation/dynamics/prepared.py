@@ -40,8 +40,6 @@ from mkc_torch.simulation.undetermined import undetermined
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["PreparedDynamics"]
-
 _PATIENT = 2
 """Stride of the growing horizon, in grid times, for trajectories that are hard to solve."""
 

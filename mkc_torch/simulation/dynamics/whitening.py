@@ -22,8 +22,6 @@ from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FilterGains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
-
 _CELLS = 24_000_000
 """Numbers of whitened series held in memory at once: 192 MB."""
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Binary"]
-
 _WARNING = 1
 """Status of a warning; with a higher status there is no value."""
 

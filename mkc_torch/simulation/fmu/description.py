@@ -14,8 +14,6 @@ from typing import Any
 from mkc_torch.simulation.fmu.units import unit_of
 from mkc_torch.simulation.parameter import Parameter
 
-__all__ = ["Description", "FmuError", "FmuVariable", "read_description", "the_library"]
-
 _REAL = ("Real", "Float64")
 _EXTRA = 'FMUs are read by FMPy, which is not installed; install it with `pip install "mkc-torch[fmu]"`.'
 

@@ -25,8 +25,6 @@ from mkc_torch.simulation.ports import Changes, Nearby, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["AttitudeView", "with_attitude"]
-
 _MISFIT = 0.3
 """Median error, as a share of the field, from which the attitude is checked."""
 

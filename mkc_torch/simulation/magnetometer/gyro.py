@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Changes, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["GyroView"]
-
 WINDOW = 2.0
 """Length in s of the windows within which a gyroscope is integrated; each has its own unknown field direction."""
 

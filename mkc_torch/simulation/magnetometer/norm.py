@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Changes, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["NormView"]
-
 
 class NormView(View):
     """Field strength: one channel, the first-order distance from the ellipsoid, in the measurement's unit.

@@ -17,8 +17,6 @@ from mkc_torch.linear import LeastTrimmedSquares, RankDeficientError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Surface", "ellipsoid_of_a_part", "sphere_of_all"]
-
 INFORMATION = 0.02
 """Smallest information of a part's directions, as a share of even coverage: below it, noise shrinks the ellipsoid to a
 third, and the coverage is overestimated."""

@@ -23,8 +23,6 @@ from mkc_torch.simulation.protocol import ClosedForm
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["ACCEL", "AXES", "GYRO", "INDEPENDENT", "QUATERNION", "VECTOR", "View", "length_of", "thinned"]
-
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
 ACCEL = ("accel_x", "accel_y", "accel_z")

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FUNCTIONS", "Array", "Expressions", "Node"]
-
 Array = NDArray[np.float64]
 
 CONSTANT, PARAMETER, STATE = 0, 1, 2

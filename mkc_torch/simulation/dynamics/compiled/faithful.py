@@ -16,8 +16,6 @@ from mkc_torch.simulation.dynamics.compiled.traced import Traceable, traced
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["is_faithful"]
-
 _FAITHFUL = 1e-9
 """Largest relative difference between traced functions and torch."""
 

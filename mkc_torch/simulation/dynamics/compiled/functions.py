@@ -14,8 +14,6 @@ from mkc_torch.simulation.dynamics.compiled.collocation import dense
 from mkc_torch.simulation.dynamics.compiled.expressions import Array, Expressions
 from mkc_torch.simulation.dynamics.compiled.tape import Evaluation, Tape
 
-__all__ = ["CompiledBlock", "CompiledObserverJump", "Derivatives"]
-
 
 class Derivatives:
     """Sparse derivatives of several nodes by several leaves.

@@ -26,8 +26,6 @@ from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 if TYPE_CHECKING:
     from mkc_torch.simulation.dynamics.compiled.traced import Traced
 
-__all__ = ["MachineCollocation", "MachineSystem", "machine_system"]
-
 
 def machine_system(
     traced: Traced, grid: ArrayGrid, rows: NDArray[np.int64], observed: tuple[Array, Array] | None

@@ -12,8 +12,6 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 from mkc_torch.simulation.dynamics.compiled.shapes import SHAPES
 from mkc_torch.simulation.dynamics.compiled.symbol import Nodes, Symbol, UntraceableError, as_nodes
 
-__all__ = ["OPERATIONS"]
-
 
 def _pointwise(build: Callable[..., int], values: Sequence[Any], dtype: torch.dtype | None = None) -> Symbol:
     """Apply an operation to each element, with torch's broadcasting."""

@@ -31,8 +31,6 @@ from mkc_torch.simulation.ports import Answer, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["CompiledDynamics", "compiled_dynamics"]
-
 
 def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> CompiledDynamics | None:
     """Compile the residual of a prepared system; None where its functions cannot be traced.

@@ -19,8 +19,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["BLOCK", "CODES", "jitable", "loaded", "registers", "run"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 jitable = cast(Callable[[F], F], register_jitable)
