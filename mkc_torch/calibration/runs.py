@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -69,8 +69,3 @@ def apart(
         parts += [points[run], points[run][-1:].expand(far, 3)]
         shares += [taken[run], taken.new_zeros(far)]
     return torch.cat(parts[:-1]), torch.cat(shares[:-1])
-
-
-def run_ends(recording: Recording) -> Iterator[int]:
-    """Yield the first row of each run except the first."""
-    yield from (run.start for run in run_slices(recording)[1:])

@@ -122,11 +122,8 @@ class DensityState:
 def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
     """Mean negative log-density of the residuals of each channel."""
     z = error * torch.exp(-state.log_d).unsqueeze(-2)
-    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
-
-
-def _log_z(state: DensityState) -> Tensor:
-    return log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
+    log_z = log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
+    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + log_z
 
 
 def initial_state(

@@ -137,7 +137,7 @@ def _take(record: _Record, log: MessageLog) -> None:
 
 
 def _open(record: _Record, log: MessageLog) -> None:
-    fields = _header_of_connection(record.data)
+    fields = _header(_LENGTH.pack(4) + b"op=\0" + record.data) or {}
     topic = record.header.get(b"topic", b"").decode("utf-8", "replace")
     kind = fields.get(b"type", b"").decode("utf-8", "replace")
     text = fields.get(b"message_definition", b"").decode("utf-8", "replace")
@@ -148,10 +148,6 @@ def _open(record: _Record, log: MessageLog) -> None:
         log.leave_out(topic, f"its messages, of {kind or 'no type'}, cannot be read ({lines[0][:100]})")
     else:
         log.open(record.header.get(b"conn"), topic, kind, reader.read, reader.units)
-
-
-def _header_of_connection(data: bytes) -> dict[bytes, bytes]:
-    return _header(_LENGTH.pack(4) + b"op=\0" + data) or {}
 
 
 ROSBAG1 = FileFormat((".bag",), read)

@@ -297,13 +297,8 @@ def fitted_sizes(alternative: Alternative) -> str:
 
 def _rival(alternative: Alternative, finding: Finding) -> str:
     """Return the name of an alternative; at the finding's port, the name depends on the kind of quantity."""
-    at = _elsewhere(alternative, finding)
+    at = "" if _at(alternative.port, finding) else alternative.port
     return with_drivers(alternative.effect, alternative.drivers, at, "" if at else finding.kind)
-
-
-def _elsewhere(alternative: Alternative, finding: Finding) -> str:
-    """Return the port of an alternative if it differs from the finding's."""
-    return "" if _at(alternative.port, finding) else alternative.port
 
 
 def _at(place: str, finding: Finding) -> bool:

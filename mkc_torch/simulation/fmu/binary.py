@@ -94,7 +94,8 @@ class Binary:
     def first_states(self) -> Array:
         """The initial states, (n,)."""
         states = np.zeros(len(self.description.states))
-        _call(self._get_states, self.model.component, states.ctypes.data, len(states))
+        if self._get_states(self.model.component, states.ctypes.data, len(states)) > _WARNING:
+            raise SimulationError("The FMU does not return its states; export it again.")
         return states
 
     def values(self, outputs: bool, time: Array, states: Array, inputs: Array) -> Array:
@@ -333,11 +334,6 @@ def _addresses(rows: Array) -> range:
     """The address of each row of a contiguous table."""
     start, step = rows.ctypes.data, 8 * max(1, rows[0].size) if len(rows) else 8
     return range(start, start + step * len(rows), step)
-
-
-def _call(function: Any, *arguments: Any) -> None:
-    if function(*arguments) > _WARNING:
-        raise SimulationError("The FMU does not return its states; export it again.")
 
 
 def _platform(version: int) -> str:

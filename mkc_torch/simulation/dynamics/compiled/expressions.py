@@ -254,10 +254,7 @@ _RULES: dict[str, tuple[_Rule, ...]] = {
     "sub": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(-1.0))),
     "mul": (_of(lambda _e, _n, _a, b: b), _of(lambda _e, _n, a, _b: a)),
     "div": (_of(lambda e, _n, _a, b: _inverse(e, b)), _of(lambda e, n, _a, b: _negative(e, _ratio(e, n, b)))),
-    "pow": (
-        _of(lambda e, _n, a, b: _power(e, a, b)),
-        _of(lambda e, n, a, _b: _logarithmic(e, n, a)),
-    ),
+    "pow": (_of(lambda e, _n, a, b: _power(e, a, b)), _of(lambda e, n, a, _b: _logarithmic(e, n, a))),
     "neg": (_of(lambda e, _n, _a: e.number(-1.0)),),
     "abs": (_of(lambda e, _n, a: e.apply("sign", a)),),
     "sqrt": (_of(lambda e, n, _a: _ratio(e, e.number(0.5), n)),),

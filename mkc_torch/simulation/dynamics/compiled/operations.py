@@ -124,14 +124,6 @@ def _copied(values: Symbol, *, dtype: torch.dtype | None = None, **_: Any) -> Sy
     return _operation("double")(values)
 
 
-def _logical_not(values: Any) -> Symbol:
-    return _operation("logical_not", torch.bool)(values)
-
-
-def _boolean(name: str) -> Callable[..., Symbol]:
-    return _operation(name, torch.bool)
-
-
 _SAME = (
     *("neg", "abs", "sign", "sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("atan2", "sinh", "cosh", "tanh", "sigmoid", "hypot", "maximum", "minimum", "relu", "floor", "ceil", "trunc"),
@@ -143,7 +135,7 @@ OPERATIONS: Mapping[str, Callable[..., Any]] = {
     **SHAPES,
     **{name: _operation(name) for name in _SAME},
     **{
-        name: _boolean(name)
+        name: _operation(name, torch.bool)
         for name in ("gt", "ge", "lt", "le", "eq", "ne", "logical_and", "logical_or", "logical_not")
     },
     "add": _scaled("add"),
