@@ -157,9 +157,8 @@ def thermal_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet
 def glow(g: Generator, scene: SystemScene, state: str) -> HiddenTerm:
     row = scene.plant.row(state)
     form = flows.radiation(row, scene.plant.parameters["room"], uniform(g, 0.0, 1e-3))
-    return HiddenTerm(
-        "thermal_loss", "radiation to the walls", (hidden.rate_of(state),), scene.pace(state) / 50.0, form
-    )
+    large = scene.pace(state) / 50.0
+    return HiddenTerm("thermal_loss", "radiation to the walls", (hidden.rate_of(state),), large, form)
 
 
 def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:
