@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
-DIVERGED = "The network has diverged, or what it was given holds NaN: lower the learning rate, or look at its inputs"
+DIVERGED = "The network has diverged, or its inputs hold NaN: lower the learning rate, or check the inputs"
 """The remedy for predictions that are not finite."""
 
 
@@ -219,7 +219,7 @@ def refuse_bad_weight(weight: object, name: str = "weight") -> None:
     wrong = ~((weight >= 0) & (weight < math.inf))
     raise ValueError(
         f"Expected argument `{name}` to be >= 0 and finite but got {first_of(weight, wrong)} ({int(wrong.sum())} such "
-        "values); what is not to count has the weight 0 or False."
+        "values); give samples that do not count the weight 0 or False."
     )
 
 

@@ -50,7 +50,7 @@ class Minima:
 
 @dataclass(frozen=True)
 class _Step:
-    """Steps (K, n), their lengths, the predicted gains of them and of the full Newton steps, and convexity."""
+    """Steps (K, n), their lengths, predicted gains of the steps and of the full Newton steps, and convexity."""
 
     step: Float[Tensor, "K n"]
     length: Float[Tensor, " K"]
@@ -106,7 +106,8 @@ def minimise(
         tol: predicted gain of Newton's step below which a descent ends with that step, relative to the absolute value
             of the function or 1 if larger; default 64 times the rounding error of the dtype.
         max_iter: maximum number of steps tried.
-        retract: maps points to equivalent points, where a function is constant along some curves.
+        retract: maps points to others with the same value, for functions that are constant along curves; None keeps
+            the points.
 
     Raises:
         ValueError: a function, its gradient or its Hessian is not finite at a start.

@@ -136,7 +136,7 @@ def _refuse_for_one(path: Path, request: CalibrationRequest, names: list[str]) -
         if given is not None:
             raise ValueError(
                 f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is for one "
-                f"sensor; add `--sensor {names[0]}`, and calibrate each of the others in a call of its own."
+                f"sensor; add `--sensor {names[0]}`, and calibrate the others in separate calls."
             )
 
 

@@ -18,7 +18,7 @@ def warning_rows(warnings: Sequence[str], file: str, most: int = MOST_LINES) -> 
     """Yield a label and a text for each warning; the first is always shown.
 
     Args:
-        warnings: the weightiest first.
+        warnings: most important first.
         file: the file that lists all of them.
         most: most rows.
 

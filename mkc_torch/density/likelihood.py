@@ -257,7 +257,7 @@ class Maximum(NamedTuple):
 
 
 def maximise(error: Tensor, weight: Tensor | None, state: DensityState, *, max_iter: int, tol: float) -> Maximum:
-    """Maximise the likelihood of each channel by Newton steps, until two steps gain less than ``tol`` and rounding.
+    """Maximise the likelihood of each channel by Newton steps, until two in a row gain less than ``tol`` plus rounding.
 
     Args:
         error: residuals, (*, N, m).

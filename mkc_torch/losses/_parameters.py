@@ -83,7 +83,7 @@ def to_d(raw: Tensor | None, state: ChannelState, *, follows: bool) -> Float[Ten
 
 
 def annealed_kappa(xp: Any, kappa: Any, d: Any, state: ChannelState, *, follows: bool) -> Any:
-    """1/σ² of the annealed loss: from the selected bandwidth, or the likelihood's 1/σ² if its bandwidth is no wider.
+    """1/σ² of the annealed loss: from the selected bandwidth, or the likelihood's where that is as narrow or narrower.
 
     The annealed loss's d is the scale if d follows the residuals, else the likelihood's d.
     """

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 LEAST_TOTAL = 1.001
-"""Total weight of several residuals, at least: log N is a divisor, and weights normalised to 1 are refused."""
+"""Smallest total weight of several residuals: log N is a divisor, so weights that sum to 1 are rejected."""
 
 
 def entropy_like(

@@ -1,4 +1,4 @@
-"""Panels of a figure, each an SVG element of its own: side by side on a wide page, stacked on a narrow page."""
+"""Panels of a figure, each a separate SVG element: side by side on a wide page, stacked on a narrow page."""
 
 from __future__ import annotations
 

@@ -373,7 +373,9 @@ def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
             label = ",".join(str(int(i)) for i in index)
             numbers[f"{key}[{label}]" if label else key] = value
     if not numbers:
-        raise SimulationError(f"{name}: the module has no parameters; there is nothing to fit with what is found.")
+        raise SimulationError(
+            f"{name}: the module has no parameters; register at least one number as nn.Parameter, to be fitted."
+        )
     if len(numbers) > MOST_PARAMETERS:
         raise SimulationError(
             f"{name}: the module has {len(numbers):,} numbers, more than {MOST_PARAMETERS}; a network that can follow "

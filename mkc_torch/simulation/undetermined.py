@@ -64,6 +64,6 @@ def _sentence(direction: Float[Tensor, " p"], names: Sequence[str]) -> str:
     parameters = " and ".join(f"`{name}`" for name, _ in moving)
     sum_ = " ".join(f"{'+' if share > 0 else '−'} {abs(share):.2g} {name}" for name, share in moving).removeprefix("+ ")
     return (
-        f"The recording does not determine {parameters}, but only what they are together: they can move along one "
-        f"direction and the residual stays (direction {sum_}, relative)."
+        f"The recording does not determine {parameters} separately: moving them along one direction leaves the "
+        f"residual unchanged (direction {sum_}, relative)."
     )

@@ -13,7 +13,7 @@ from mkc_torch.recording.formats.magic_numbers import wrong_format_error
 from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
 _TRIAL = Path(__file__).with_name("hdf5_objects.py").read_text(encoding="utf-8")
-"""Source that a process of its own runs first: a damaged file can end the process that reads it."""
+"""Source that a separate process runs first, because a damaged file can crash the process that reads it."""
 
 
 def h5py(extra: str) -> Any:

@@ -86,7 +86,7 @@ def _topic(data: Any) -> Topic | None:
 
 
 def _with_unique_names(topics: list[Topic]) -> list[Topic]:
-    """Give a topic that was logged again after it had ended a name of its own."""
+    """Number topics that have the same name because they ended and were logged again."""
     seen: Counter[str] = Counter()
     named = []
     for topic in topics:

@@ -78,7 +78,7 @@ class GyroView(View):
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
 
     def _offset_by_turns(self, error: NotIdentifiableError) -> Tensor:
-        """The offset for which the field of each window is constant, by reweighted least squares; the matrix is 1.
+        """The offset, with matrix 1, that makes the field of each window constant, by reweighted least squares.
 
         Raises:
             NotIdentifiableError: ``error``, where the turns do not determine the offset either.

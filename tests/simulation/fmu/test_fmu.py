@@ -137,7 +137,7 @@ STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force
 @pytest.mark.parametrize(
     ("text", "more", "words"),
     [
-        (None, (), "this is no FMU, or a damaged one: it has no modelDescription.xml"),
+        (None, (), "this is not an FMU, or it is damaged: it has no modelDescription.xml"),
         ("<fmiModelDescription fmiVersion='2.0'", (), "its modelDescription.xml cannot be parsed"),
         (description(PENDULUM, fmi="1.0"), (), "this FMU is of FMI 1.0; FMI 2.0 and 3.0 are read"),
         ("<model/>", (), "this FMU is of FMI (no version)"),

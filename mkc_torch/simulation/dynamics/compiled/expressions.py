@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 CONSTANT, PARAMETER, STATE = 0, 1, 2
-"""Level of a node: the last kind of leaf that it depends on."""
+"""Level of a node: the highest kind of leaf that it depends on."""
 
 
 def _sigmoid(x: Any) -> Any:
