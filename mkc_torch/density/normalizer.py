@@ -172,9 +172,6 @@ class _LogPartition(torch.autograd.Function):
 def refuse_bad_ratio(length: Float[Tensor, "*batch"]) -> None:
     """Raise ValueError for a ratio ``bound / d`` whose square overflows or underflows.
 
-    Args:
-        length: ``bound / d``.
-
     Raises:
         ValueError: a ratio out of range, where values are checked; see :mod:`mkc_torch.functional`.
     """

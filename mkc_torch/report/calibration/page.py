@@ -94,10 +94,6 @@ def calibration_report(
 def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
     """Return the page of a recording that determines no calibration, with the missing directions.
 
-    Args:
-        recording: the refused recording.
-        error: the refusal.
-
     Example:
         >>> import torch
         >>> from mkc_torch.calibration.calibrate import calibrate

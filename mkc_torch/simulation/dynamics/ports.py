@@ -173,10 +173,6 @@ class PortContext:
 def memory_at(kind: str, state: str) -> dict[str, str]:
     """Internal states at the rate of a state, with the state that each starts equal to; empty to start at 0.
 
-    Args:
-        kind: kind of the port.
-        state: the state.
-
     Example:
         >>> memory_at("resonant rate", "speed"), memory_at("rate", "speed")
         ({'deflection_of_speed': '', 'hidden_speed': 'speed'}, {})

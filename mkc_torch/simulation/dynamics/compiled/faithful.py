@@ -24,10 +24,6 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
     """Whether a system's traced functions have the same values and derivatives as torch, near the guess.
 
     They differ where a function defines its own derivative, as a ``torch.autograd.Function`` may.
-
-    Args:
-        system: the prepared system.
-        theta: (p,), its parameters.
     """
     found = traced(system, lambda parameters: (parameters, {}), len(theta))
     if found is None:
