@@ -166,7 +166,7 @@ def _parts(source: str) -> tuple[Path, str]:
     file, _, name = source.rpartition(":")
     if not file.endswith(".py") or not name:
         raise SimulationFileError(
-            f"{source}: this names no simulation; write FILE.py:NAME, as in my.py:Pendulum, or MODEL.fmu."
+            f"{source}: this does not name a simulation; write FILE.py:NAME, as in my.py:Pendulum, or MODEL.fmu."
         )
     return Path(file), name
 

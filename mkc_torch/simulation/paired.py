@@ -90,7 +90,9 @@ class Paired:
         if outputs is not None:
             refuse_text("outputs", outputs, "a tuple of names of columns")
             if not outputs:
-                raise ValueError("Expected argument `outputs` to name a column but got none; None takes all in common.")
+                raise ValueError(
+                    "Expected argument `outputs` to name a column but got none; None compares all common columns."
+                )
         if offset is not None:
             checked_number("offset", offset, advice="it is in s, and None takes half an interval of the recording")
         checked_number("rate", rate, advice=f"{RATE:g} is that of quartz")
@@ -152,7 +154,7 @@ class PreparedPaired(ClosedForm):
                 same.append(name)
         if len(same) == len(shared):
             raise SimulationError(
-                f"All columns in common ({', '.join(shared)}) are the same in the recording and in what was simulated; "
+                f"All columns in common ({', '.join(shared)}) are the same in the recording and the simulated table; "
                 "there is nothing to diagnose. Give the simulator's own output."
             )
         kept = [k for k, name in enumerate(shared) if name not in same]
@@ -339,7 +341,7 @@ def _match_runs(
         )
     count = torch.bincount(number, minlength=len(labels))
     if int(count.min()) < _FEWEST:
-        raise SimulationError(f"{_name_of(simulated, 'The simulated table')} has a run of one moment; it needs two.")
+        raise SimulationError(f"{_name_of(simulated, 'The simulated table')} has a run of one sample; it needs two.")
     last = count.cumsum(0) - 1
     run = torch.tensor([labels.index(label) for label in own_labels])[own]
     low, high = (last - count + 1)[run], last[run]
@@ -348,9 +350,9 @@ def _match_runs(
         if not bool(inside[own == k].any()):
             where = f" of run {label}" if label else ""
             raise SimulationError(
-                f"{_name_of(recording, 'The recording')} and {_name_of(simulated, 'the simulated table')} do not meet "
-                f"in time{where}: {_range(recording, own == k)} was recorded, "
-                f"{_range(simulated, number == labels.index(label))} simulated. Give both the same zero of time."
+                f"{_name_of(recording, 'The recording')} and {_name_of(simulated, 'the simulated table')} do not "
+                f"overlap in time{where}: {_range(recording, own == k)} was recorded, "
+                f"{_range(simulated, number == labels.index(label))} simulated. Count both times from the same moment."
             )
     values = simulated.stack(*names)
     slopes = _slopes(simulated["time"], values, number)

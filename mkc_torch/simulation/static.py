@@ -366,7 +366,7 @@ def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
     numbers: dict[str, float] = {}
     for key, values in module.named_parameters():
         if not values.is_floating_point():
-            raise SimulationError(f"{name}: its parameter `{key}` holds no real numbers but {values.dtype}.")
+            raise SimulationError(f"{name}: its parameter `{key}` holds {values.dtype} instead of real numbers.")
         flat = values.detach().flatten().tolist()
         for place, value in enumerate(flat):
             index = torch.unravel_index(torch.tensor(place), values.shape) if values.dim() else ()
@@ -379,6 +379,7 @@ def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
     if len(numbers) > MOST_PARAMETERS:
         raise SimulationError(
             f"{name}: the module has {len(numbers):,} numbers, more than {MOST_PARAMETERS}; a network that can follow "
-            "anything lacks nothing. Freeze it into a function of few parameters, and write that as `output`."
+            "any recording leaves no physics to find. Freeze it into a function of few parameters, and write that as "
+            "`output`."
         )
     return numbers

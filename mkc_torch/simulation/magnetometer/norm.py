@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class NormView(View):
     """Field strength: one channel, the first-order distance from the ellipsoid, in the measurement's unit.
 
-    Where all samples together determine no ellipsoid, a part of the recording may determine it: a fit starts from that
-    part, and the sensor is fitted together with the change of it.
+    If all samples together do not determine an ellipsoid, a part of the recording may: the fit starts from that part,
+    and the sensor is fitted together with its change.
 
     Args:
         recording: the prepared recording.
@@ -117,6 +117,6 @@ def _start_warning(surface: Surface, view: View, error: NotIdentifiableError) ->
         begin, end = float(view.time[surface.first]), float(view.time[surface.last - 1])
         what = f"the ellipsoid of the samples from {begin:.4g} to {end:.4g} s"
     return (
-        f"All samples together determine no ellipsoid; offset and matrix start from {what}, and are valid together "
-        f"with the change of the sensor. {error}"
+        f"All samples together do not determine an ellipsoid; offset and matrix start from {what}, and are valid "
+        f"together with the change of the sensor. {error}"
     )

@@ -1,4 +1,4 @@
-"""Start surfaces if all samples together determine no ellipsoid: the ellipsoid of a part, or the nearest sphere."""
+"""Start surfaces if all samples do not determine an ellipsoid: the ellipsoid of a part, or the nearest sphere."""
 
 from __future__ import annotations
 

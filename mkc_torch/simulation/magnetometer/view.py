@@ -122,7 +122,7 @@ class View(ClosedForm):
         try:
             return ellipsoid.fit(self.measured[chosen])
         except ValueError as error:
-            raise NoFitError(f"These samples alone determine no ellipsoid. {error}") from error
+            raise NoFitError(f"These samples alone do not determine an ellipsoid. {error}") from error
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
