@@ -48,8 +48,8 @@ class PowerLaw(RateEffect):
     Units: γ, the size at y = c, in the state's unit per s; the scale c, the largest y, in the unit of y; the exponent p
         is a number.
     Plausible: γ ≥ 0, except for a spring: a negative γ softens it.
-    Source: Churchill & Chu, International Journal of Heat and Mass Transfer 18 (1975), of natural convection;
-        Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), of drag.
+    Source: Churchill & Chu, International Journal of Heat and Mass Transfer 18 (1975), natural convection;
+        Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), drag.
 
     Args:
         of: base of the power, ``own``, ``difference``, ``excess`` or ``position``.
@@ -82,7 +82,7 @@ class PowerLaw(RateEffect):
             ),
         ),
     }
-    source = "Churchill & Chu (1975), of natural convection; Torricelli's law; Clift, Grace & Weber (1978), of drag"
+    source = "Churchill & Chu (1975), natural convection; Torricelli's law; Clift, Grace & Weber (1978), drag"
 
     def __init__(self, of: str = "own") -> None:
         self.of = of
