@@ -122,12 +122,7 @@ def run_proof(
 
 
 def _write(
-    output: Path,
-    result: ProofScore,
-    baselines: Mapping[str, Score],
-    settings: Mapping[str, Any],
-    *,
-    overwrite: bool,
+    output: Path, result: ProofScore, baselines: Mapping[str, Score], settings: Mapping[str, Any], *, overwrite: bool
 ) -> None:
     record = {
         "settings": settings,

@@ -158,11 +158,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _results(
-    works: Sequence[Callable[[], T]],
-    parcels: Serializer,
-    todo: int,
-    copies: list[Future[dict[int, bytes]]],
-    thing: str,
+    works: Sequence[Callable[[], T]], parcels: Serializer, todo: int, copies: list[Future[dict[int, bytes]]], thing: str
 ) -> list[T]:
     done = {}
     for number in _take_numbers(todo):

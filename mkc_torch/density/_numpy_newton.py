@@ -64,11 +64,7 @@ Derived = tuple[float, float, float, float, float, float]
 
 
 def channel_step(
-    error: Float64[ndarray, " N"],
-    weight: Float64[ndarray, " N"] | None,
-    at: Channel,
-    free_kappa: bool,
-    free_d: bool,
+    error: Float64[ndarray, " N"], weight: Float64[ndarray, " N"] | None, at: Channel, free_kappa: bool, free_d: bool
 ) -> tuple[float, float, float, float]:
     """Return κ, log d, damping and value after a Newton step that never increases the value.
 

@@ -120,9 +120,7 @@ def channel_values(
 
 
 def checked_domain(
-    residuals: Residuals,
-    bound: float | Float[Tensor, " m"] | None,
-    d_min: float | Float[Tensor, " m"] | None,
+    residuals: Residuals, bound: float | Float[Tensor, " m"] | None, d_min: float | Float[Tensor, " m"] | None
 ) -> Domain:
     """The domain, by default from :func:`domain_rule`, and the floor of d, by default a tenth of the scale.
 

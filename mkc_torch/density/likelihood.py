@@ -237,9 +237,7 @@ def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )
     return replace(
-        state,
-        kappa=kappa if state.free_kappa else state.kappa,
-        log_d=log_d if state.free_d else state.log_d,
+        state, kappa=kappa if state.free_kappa else state.kappa, log_d=log_d if state.free_d else state.log_d
     )
 
 

@@ -236,10 +236,7 @@ class _Others(MetaPathFinder):
         self.path = path
 
     def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: ModuleType | None = None,
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         if fullname != self.path.stem or path is not None:
             return None

@@ -203,10 +203,7 @@ class PreparedPaired(ClosedForm):
         return self.measured - changed_outputs(self._outputs(theta), self.channels, changes)
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         return output_signals(self._outputs(theta), self.channels, changes)
 

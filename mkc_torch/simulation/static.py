@@ -241,10 +241,7 @@ class PreparedStatic(ClosedForm):
         return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         inputs = {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)

@@ -19,10 +19,7 @@ _NAMED = 0.1
 
 
 def undetermined(
-    tangents: Float[Tensor, "R p"],
-    theta: Float[Tensor, " p"],
-    names: Sequence[str],
-    of_interest: int | None = None,
+    tangents: Float[Tensor, "R p"], theta: Float[Tensor, " p"], names: Sequence[str], of_interest: int | None = None
 ) -> tuple[str, ...]:
     """A sentence for each direction of the parameters along which the residual is constant, near ``theta``.
 

@@ -27,11 +27,7 @@ _OTHER = 0.15
 
 
 def with_aid(
-    usable: Recording,
-    refusal: NotIdentifiableError,
-    *,
-    field_strength: float | None = None,
-    earth: Field | None = None,
+    usable: Recording, refusal: NotIdentifiableError, *, field_strength: float | None = None, earth: Field | None = None
 ) -> Calibration:
     """Calibrate by an attitude, a gyroscope or the field of the place; a note gives the reason.
 

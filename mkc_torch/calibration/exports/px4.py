@@ -15,14 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mkc_torch.calibration.exports.base import (
-    MADE_BY,
-    Destination,
-    Export,
-    Exported,
-    ExportError,
-    SensorCorrection,
-)
+from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, ExportError, SensorCorrection
 from mkc_torch.calibration.exports.numbers import one_line, single, symmetric
 from mkc_torch.calibration.exports.units import converted
 

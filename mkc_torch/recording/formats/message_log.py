@@ -32,12 +32,7 @@ class MessageLog:
         return key in self._readers
 
     def open(
-        self,
-        key: object,
-        topic: str,
-        kind: str,
-        read: Callable[[bytes], Mapping[str, Cell]],
-        units: Mapping[str, str],
+        self, key: object, topic: str, kind: str, read: Callable[[bytes], Mapping[str, Cell]], units: Mapping[str, str]
     ) -> None:
         """Register the topic, type, reader and units of the messages under ``key``."""
         known = {**units, LOG_TIME: "ns", _PUBLISH_TIME: "ns"}

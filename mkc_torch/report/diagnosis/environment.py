@@ -17,11 +17,7 @@ _MOST_OUTPUTS = 6
 _STILL = 2.0
 """Variation, in noise floors, up to which an output hardly varies."""
 _MOST_DECIMALS = 4
-_SOURCES = {
-    "declared": "declared",
-    "samples": "estimated",
-    "quantisation": "resolution of the recording",
-}
+_SOURCES = {"declared": "declared", "samples": "estimated", "quantisation": "resolution of the recording"}
 _BETWEEN = {
     "held": "`{input}` is constant between samples",
     "linear": "`{input}` is linear between samples",
@@ -162,12 +158,7 @@ def process_noise_table(environment: NoiseEnvironment) -> Table | None:
         )
         for process in environment.process_noise
     )
-    columns = (
-        "acts on",
-        "standard deviation",
-        "correlation time",
-        "log-likelihood gain, nats",
-    )
+    columns = ("acts on", "standard deviation", "correlation time", "log-likelihood gain, nats")
     return Table(
         "Process noise and drift",
         columns,

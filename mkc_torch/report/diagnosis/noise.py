@@ -13,10 +13,7 @@ _CLEARLY = 0.99
 """Ratio of residuals below which the smaller is reported."""
 
 _KINDS = {"white": "white", "ar": "autoregressive", "random_walk": "random walk"}
-_NOISE = {
-    "drift": "drift of the offset",
-    "drift_period": "cut-off of the drift",
-}
+_NOISE = {"drift": "drift of the offset", "drift_period": "cut-off of the drift"}
 _CHANNELS = {
     "norm": "norm: measured length of the field minus the simulated length",
     "along": "along: residual along the ambient field, which its length shows too",

@@ -58,12 +58,7 @@ def plausible_sizes(
     return largest
 
 
-def flow_of(
-    prepared: Observable,
-    theta: Float[Tensor, " p"],
-    changes: Changes,
-    near: Nearby | None,
-) -> Flow | None:
+def flow_of(prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None) -> Flow | None:
     """Linearise a trajectory, in open loop or with an observer; None where no trajectory is found.
 
     Args:

@@ -278,12 +278,7 @@ class PreparedDynamics(ObservedDynamics):
         return at | {"output": outputs}
 
     def trajectory(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
-        *,
-        patient: bool = False,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None, *, patient: bool = False
     ) -> Trajectory:
         """Solve for the states at all grid times, with the changes by effects.
 

@@ -65,10 +65,7 @@ class GyroView(View):
             offset = self._offset_by_turns(error)
             self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
             self._full = torch.cat([offset, torch.eye(3).to(offset).flatten(), offset.new_zeros(3)])
-            self.warnings = (
-                *self.warnings,
-                f"The gyroscope replaces missing turns: {error}",
-            )
+            self.warnings = (*self.warnings, f"The gyroscope replaces missing turns: {error}")
         else:
             self.strength = float(fit.radius_)
             self._full = self._theta(fit)

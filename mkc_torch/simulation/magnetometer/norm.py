@@ -38,18 +38,12 @@ class NormView(View):
     view = "norm"
     channels = ("norm",)
     independent: tuple[bool, ...] = (True,)
-    parameter_names = (
-        *(f"offset_{a}" for a in AXES),
-        *(f"matrix_{AXES[i]}{AXES[j]}" for i, j in SYMMETRIC),
-    )
+    parameter_names = (*(f"offset_{a}" for a in AXES), *(f"matrix_{AXES[i]}{AXES[j]}" for i, j in SYMMETRIC))
     prior: GaussianPrior | None = None
 
     def __init__(self, recording: Recording, *, sphere: bool = False) -> None:
         super().__init__(recording)
-        self.ports = {
-            "sensor": Port(AXES, self.unit, allows_drift=True),
-            "field": Port(("strength",), self.unit),
-        }
+        self.ports = {"sensor": Port(AXES, self.unit, allows_drift=True), "field": Port(("strength",), self.unit)}
         self.alone = True
         """Whether the field strength determines the sensor without a change of it."""
         try:

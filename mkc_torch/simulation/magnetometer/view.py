@@ -74,10 +74,7 @@ class View(ClosedForm):
         return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N 3"]]:
         """At the port "sensor", the simulated measurement without the offset."""
         # not the measured field: its noise is also in the residual, and would look like a nonlinearity

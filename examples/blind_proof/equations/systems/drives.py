@@ -184,8 +184,5 @@ def trembling(g: Generator, scene: SystemScene) -> HiddenTerm:
 
 
 SERVO = hidden.System(
-    servo_draw,
-    servo_trial,
-    inside=(late, worn, wrong_zero, load, end_of_range, slow_sensor),
-    outside=(trembling,),
+    servo_draw, servo_trial, inside=(late, worn, wrong_zero, load, end_of_range, slow_sensor), outside=(trembling,)
 )

@@ -116,9 +116,7 @@ THERMAL_STEP = 5.0
 
 
 def thermal_rate(x: Array, u: Array, p: Array) -> Array:
-    return np.array(
-        [p[2] * u[0] - p[0] * (x[0] - p[4]), p[3] * u[1] - p[1] * (x[1] - p[4])],
-    )
+    return np.array([p[2] * u[0] - p[0] * (x[0] - p[4]), p[3] * u[1] - p[1] * (x[1] - p[4])])
 
 
 def thermal_draw(g: Generator) -> Setting:

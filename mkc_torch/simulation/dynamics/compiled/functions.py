@@ -26,11 +26,7 @@ class Derivatives:
     """
 
     def __init__(
-        self,
-        expressions: Expressions,
-        nodes: Sequence[int],
-        leaves: Sequence[int],
-        arranged: Callable[[Array], Array],
+        self, expressions: Expressions, nodes: Sequence[int], leaves: Sequence[int], arranged: Callable[[Array], Array]
     ) -> None:
         nothing, columns = expressions.number(0.0), {leaf: j for j, leaf in enumerate(leaves)}
         slopes = {

@@ -14,13 +14,7 @@ from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
 from mkc_torch.simulation.dynamics.compiled.arrays import ArraySystem
-from mkc_torch.simulation.dynamics.compiled.collocation import (
-    ArrayGrid,
-    Collocation,
-    Factor,
-    ParameterSources,
-    marched,
-)
+from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, Collocation, Factor, ParameterSources, marched
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
