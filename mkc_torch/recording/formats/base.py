@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -86,11 +87,21 @@ class FileFormat(NamedTuple):
 
 def polars() -> Any:
     """Import polars, or raise an ImportError that names its installation."""
+    return optional("polars", "Tables", "cli")
+
+
+def optional(module: str, files: str, extra: str) -> Any:
+    """Import a module of an optional package.
+
+    Raises:
+        ImportError: it is not installed; the message names the files that it reads, and the extra to install.
+    """
     try:
-        import polars as package
+        return import_module(module)
     except ImportError as error:
-        raise ImportError('Tables are read with polars; install it with `pip install "mkc-torch[cli]"`.') from error
-    return package
+        raise ImportError(
+            f'{files} are read with {module.partition(".")[0]}; install it with `pip install "mkc-torch[{extra}]"`.'
+        ) from error
 
 
 def is_number(text: str) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, optional
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import check_begins
@@ -45,12 +45,7 @@ def read(path: Path) -> list[Topic]:
         ImportError: rosbags is not installed.
     """
     check_begins(path, "ROS 1 bag of version 2.0", _MAGIC)
-    try:
-        import rosbags.typesys  # noqa: F401 - tests whether it is installed
-    except ImportError as error:
-        raise ImportError(
-            'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'
-        ) from error
+    optional("rosbags.typesys", "ROS bags", "rosbag")
     log = MessageLog()
     warnings = []
     with (

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, listed
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, listed, optional
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
@@ -39,12 +39,7 @@ def read(path: Path) -> list[Topic]:
         RecordingError: not a ROS 2 bag, a bag compressed as a whole, or a bag without a readable message.
         ImportError: rosbags is not installed, or mcap for a bag of MCAP files.
     """
-    try:
-        import rosbags.typesys  # noqa: F401 - tests whether it is installed
-    except ImportError as error:
-        raise ImportError(
-            'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'
-        ) from error
+    optional("rosbags.typesys", "ROS bags", "rosbag")
     log = MessageLog()
     warnings: list[str] = []
     files = _files(path, warnings) if path.is_dir() else [path]
