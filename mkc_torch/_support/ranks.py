@@ -124,7 +124,7 @@ class Ranks:
             raise error
         for rank, message in enumerate(messages):
             if message is not None:
-                raise RanksError(f"Rank {rank} failed, and so no rank goes on: {message}")
+                raise RanksError(f"Rank {rank} failed, so all ranks stopped: {message}")
 
 
 def _error_message(error: Exception | None) -> str | None:

@@ -175,8 +175,8 @@ def _refuse_not_finite(at: Quadratic, reach: Float[Tensor, " K"]) -> None:
         wrong = ~torch.isfinite(value).reshape(len(value), -1).all(-1)
         if bool(wrong.any()):
             raise ValueError(
-                f"The {name} of what is minimised is not finite at start {int(wrong.nonzero()[0])}: squares overflow "
-                "or vanish. Divide the data by units near their scale, or begin elsewhere."
+                f"The {name} of the minimised function is not finite at start {int(wrong.nonzero()[0])}: squares "
+                "overflow or vanish. Rescale the data to values near 1, or choose another start."
             )
 
 

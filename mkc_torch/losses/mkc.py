@@ -326,7 +326,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             )
         if not self._named_dim and input.dim() > 3 and input.shape[1] == m:
             raise ValueError(
-                f"Expected argument `channel_dim` to be named for an input of shape {tuple(input.shape)}, whose second "
+                f"Expected argument `channel_dim` to be given for an input of shape {tuple(input.shape)}, whose second "
                 f"and last dimension both have size {m}: 1 for (N, C, ...), -1 for channels last."
             )
         return axis
