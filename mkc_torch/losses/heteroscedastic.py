@@ -381,7 +381,7 @@ def _refuse_other_shape(name: str, value: Tensor, input: Tensor) -> None:
     refuse_not_real(name, value)
     if value.dim() != input.dim() or any(a not in (1, b) for a, b in zip(value.shape, input.shape, strict=True)):
         raise ValueError(
-            f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or with size 1 in any dimension "
+            f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or of size 1 in any dimension "
             f"but got {tuple(value.shape)}; add the missing dimensions, as {name}.unsqueeze(-1) for a value per sample."
         )
 
