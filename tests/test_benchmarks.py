@@ -1,6 +1,7 @@
 """What the benchmarks measure with: their recordings, and curves that end in time."""
 
 import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ pytest.importorskip("polars")
 pytest.importorskip("matplotlib")
 
 from mkc_torch import Recording
-from tests.benchmarks import diagnosis, samples, sizes
+from tests.benchmarks import diagnosis, fmu, samples, sizes
 
 
 def test_quaternions_turn_as_their_matrices_do():
@@ -78,3 +79,19 @@ def test_the_rotor_is_slower_than_its_simulation_by_quadratic_drag(tmp_path):
     lost = (torque[10:-10] - 0.5 * speed[10:-10] - slope)[:2980]
     drag = speed[10:-10] * speed[10:-10].abs()
     assert float((lost * drag).sum() / drag.square().sum()) == pytest.approx(0.4, abs=0.03)
+
+
+def test_each_recording_is_diagnosed_with_the_model_in_torch_and_with_the_fmu(monkeypatch):
+    seen = []
+
+    def diagnosed(simulation, recording, **_):
+        seen.append((simulation, recording.name))
+        return SimpleNamespace(findings=(), model=SimpleNamespace(theta=torch.ones(2)))
+
+    monkeypatch.setattr(fmu, "as_fmu", lambda system, *_, **__: system)  # compiling takes seconds
+    monkeypatch.setattr(fmu, "load_fmu", lambda system: f"FMU of {system}")
+    monkeypatch.setattr(fmu, "diagnose", diagnosed)  # a diagnosis takes half a minute
+    (pair,) = fmu.pairs(1)
+    assert (pair.name, pair.same, pair.off) == ("thermal_00000", True, 0.0)
+    assert [type(seen[0][0]), seen[1][0]] == [fmu.NOMINAL["thermal"], "FMU of thermal"]
+    assert {name for _, name in seen} == {pair.name}

@@ -6,7 +6,7 @@ import json
 import math
 import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -84,7 +84,7 @@ def run_proof(
     output = claim_folder(output, overwrite=overwrite)
     for name in ("recordings", "second", SIMULATIONS, "diagnoses"):
         claim_folder(output / name, overwrite=overwrite)
-    report = progress or silent
+    report = progress or (lambda *_: None)
     with Pool(workers) as pool:
         keys = every(pool, partial(_draw, seed, output), addresses, partial(report, "draw"))
         text = canonical(keys)
@@ -122,12 +122,7 @@ def run_proof(
 
 
 def _write(
-    output: Path,
-    result: ProofScore,
-    baselines: Mapping[str, Score],
-    settings: Mapping[str, Any],
-    *,
-    overwrite: bool,
+    output: Path, result: ProofScore, baselines: Mapping[str, Score], settings: Mapping[str, Any], *, overwrite: bool
 ) -> None:
     record = {
         "settings": settings,
@@ -234,14 +229,8 @@ def every(
     report: Callable[[int, int], None],
 ) -> list[R]:
     """Return the results of a job for all items. ``report`` is called with the number done."""
-    return list(_reported(run(job, items), len(items), report))
-
-
-def _reported(results: Iterable[R], total: int, report: Callable[[int, int], None]) -> Iterator[R]:
-    for done, result in enumerate(results, start=1):
-        report(done, total)
-        yield result
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Ignore progress."""
+    results: list[R] = []
+    for result in run(job, items):
+        results.append(result)
+        report(len(results), len(items))
+    return results

@@ -18,7 +18,7 @@ from examples.blind_proof.binomial import Share, share, uniformity
 from examples.blind_proof.key import Key, KeyEffect
 from examples.blind_proof.proof import Proof, Scenario
 from examples.blind_proof.scored_case import ScoredCase, scored
-from examples.blind_proof.statements import ADEQUATE, FAILED, UNEXPLAINED, UNFIT, VERDICTS, covered
+from examples.blind_proof.statements import ADEQUATE, FAILED, UNEXPLAINED, UNFIT, VERDICTS, covered, located_right
 
 BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
 """Edges of the bins of z and z_sep."""
@@ -53,7 +53,7 @@ SHARES: Mapping[str, tuple[Condition, Condition]] = MappingProxyType(
         "named_undisturbed": (lambda c: c.strong and not c.disturbed, lambda c: c.named),
         "withheld_named": (lambda c: c.strong and bool(c.truth.withheld), lambda c: c.named),
         "driver": (lambda c: c.strong and not c.truth.at, lambda c: c.driver),
-        "at_port": (lambda c: c.strong and bool(c.truth.at), lambda c: c.at_port),
+        "at_port": (lambda c: c.strong and bool(c.truth.at), lambda c: c.first(located_right)),
         "wrong": (lambda c: c.strong, lambda c: c.wrong),
         "nearest": (lambda c: c.strong, lambda c: c.nearest),
         "extra": (lambda c: c.strong, lambda c: len(c.stated.claims) > 1),

@@ -18,7 +18,6 @@ from examples.blind_proof.statements import (
     StatedDiagnosis,
     driven_state,
     driver_right,
-    located_right,
     named_right,
     sensor_errs,
     stated_diagnosis,
@@ -87,7 +86,7 @@ class ScoredCase:
     @property
     def named(self) -> bool:
         """Whether the first claim has the right name."""
-        return self._first(named_right)
+        return self.first(named_right)
 
     @property
     def own_name(self) -> bool:
@@ -97,12 +96,7 @@ class ScoredCase:
     @property
     def driver(self) -> bool:
         """Whether the first claim has the right drivers."""
-        return self._first(driver_right)
-
-    @property
-    def at_port(self) -> bool:
-        """Whether the first claim is at a right port."""
-        return self._first(located_right)
+        return self.first(driver_right)
 
     @property
     def located(self) -> bool:
@@ -197,7 +191,8 @@ class ScoredCase:
             "findings": [{"effect": f.named.effect, "grade": f.grade} for f in self.stated.findings],
         }
 
-    def _first(self, right: Callable[[StatedCandidate, KeyEffect], bool]) -> bool:
+    def first(self, right: Callable[[StatedCandidate, KeyEffect], bool]) -> bool:
+        """Whether the first claim is right in the sense of a function of the claim and the truth."""
         return self.hides and bool(self.stated.claims) and right(self.stated.claims[0].named, self.truth)
 
 

@@ -13,8 +13,6 @@ from time import monotonic
 from types import FrameType
 from typing import Literal, TypeVar
 
-__all__ = ["Deadline", "Reason", "Stopped", "check_deadline", "is_limited", "limited", "stopped_by_interrupt", "within"]
-
 T = TypeVar("T")
 
 Reason = Literal["time limit", "interrupt"]

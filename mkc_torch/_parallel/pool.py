@@ -23,8 +23,6 @@ from mkc_torch._parallel.deadline import check_deadline, is_limited
 from mkc_torch._parallel.processes import cores
 from mkc_torch._parallel.progress import count, counted, silently
 
-__all__ = ["Serializer", "allow_copies", "shared"]
-
 T = TypeVar("T")
 
 _PARENT_DEATH = 1
@@ -160,11 +158,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _results(
-    works: Sequence[Callable[[], T]],
-    parcels: Serializer,
-    todo: int,
-    copies: list[Future[dict[int, bytes]]],
-    thing: str,
+    works: Sequence[Callable[[], T]], parcels: Serializer, todo: int, copies: list[Future[dict[int, bytes]]], thing: str
 ) -> list[T]:
     done = {}
     for number in _take_numbers(todo):

@@ -17,8 +17,6 @@ from typing import Protocol, TypeVar
 
 import torch
 
-__all__ = ["cores", "in_processes", "keep_memory", "keep_modules", "one_thread"]
-
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -128,15 +126,11 @@ def _start(stop: _Stop) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _stopped() -> bool:
-    return _stop is not None and _stop.value
-
-
 def _interruptible(work: Callable[[T], R], item: T) -> R:
     """Run ``work`` with the default handler of interrupts, so that it removes its half-written files."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        if _stopped():
+        if _stop is not None and _stop.value:
             raise KeyboardInterrupt
         return work(item)
     finally:

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol, TypeVar, runtime_checkable
 
-__all__ = ["Counter", "count", "counted", "counting", "silently"]
-
 T = TypeVar("T")
 
 

@@ -19,28 +19,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "DIVERGED",
-    "as_numbers",
-    "checked_number",
-    "checked_whole",
-    "first_of",
-    "format_value",
-    "refuse_bad_batch",
-    "refuse_bad_weight",
-    "refuse_complex",
-    "refuse_no_tensor",
-    "refuse_not_finite",
-    "refuse_not_real",
-    "refuse_other_shapes",
-    "refuse_other_type",
-    "refuse_out_of_range",
-    "refuse_text",
-    "seems_finite",
-]
 
-
-DIVERGED = "The network has diverged, or what it was given holds NaN: lower the learning rate, or look at its inputs"
+DIVERGED = "The network has diverged, or its inputs hold NaN: lower the learning rate, or check the inputs"
 """The remedy for predictions that are not finite."""
 
 
@@ -239,7 +219,7 @@ def refuse_bad_weight(weight: object, name: str = "weight") -> None:
     wrong = ~((weight >= 0) & (weight < math.inf))
     raise ValueError(
         f"Expected argument `{name}` to be >= 0 and finite but got {first_of(weight, wrong)} ({int(wrong.sum())} such "
-        "values); what is not to count has the weight 0 or False."
+        "values); give samples that do not count the weight 0 or False."
     )
 
 

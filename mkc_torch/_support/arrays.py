@@ -15,20 +15,6 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_no_tensor
 
-__all__ = [
-    "ArrayLike",
-    "Data",
-    "absent",
-    "as_tensor",
-    "as_tensors",
-    "column_names",
-    "is_array",
-    "is_frame",
-    "numbers_of",
-    "refuse_other_columns",
-    "series_of",
-]
-
 
 class ArrayLike(Protocol):
     """A NumPy array, a pandas or polars DataFrame or Series, or another object that converts to a NumPy array."""

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-__all__ = ["BLUE", "DARK_ORANGE", "GREY", "INK", "ORANGE", "PALE", "SHADE", "STYLE", "array", "axes_or_new", "style"]
-
 # Okabe and Ito's colours, distinguishable with any colour vision
 BLUE, ORANGE, INK, GREY = "#0072B2", "#D55E00", "#222222", "#8A8A8A"
 DARK_ORANGE = "#9A4300"

@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["effective_size"]
-
 
 def effective_size(values: Float[Tensor, " N"]) -> float:
     """Number of independent samples whose mean has the same variance: N over the integrated autocorrelation time.

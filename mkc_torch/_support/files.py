@@ -13,8 +13,6 @@ from pathlib import Path
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["claim_folder", "folder_held", "write_atomically"]
-
 
 def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwrite: bool = False) -> None:
     """Write a file atomically.
@@ -144,7 +142,7 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file, not a folder; choose another output folder.")
-    if path.is_dir() and not overwrite and _something_in(path):
+    if path.is_dir() and not overwrite and not all(_LEFTOVER.fullmatch(inner.name) for inner in path.iterdir()):
         raise FileExistsError(
             f"{path} exists and is not empty; use `--force` (in Python `overwrite=True`) to write into it, "
             "or choose another output folder."
@@ -156,10 +154,6 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files
         )
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def _something_in(folder: Path) -> bool:
-    return any(not _LEFTOVER.fullmatch(path.name) for path in folder.iterdir())
 
 
 def _foreign(folder: Path, names: Sequence[str]) -> list[str]:

@@ -13,17 +13,6 @@ from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
 
-__all__ = [
-    "Residual",
-    "directions_at_once",
-    "forward_jacobian",
-    "forward_tangents",
-    "load_forward_mode",
-    "make_dual",
-    "reverse_tangents",
-    "twice_reverse_tangents",
-]
-
 Residual = Callable[..., Tensor]
 
 

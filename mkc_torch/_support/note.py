@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["Note", "notes_of", "warnings_of"]
-
 
 class Note(str):
     """A sentence on how data were read, such as a column's name or a converted unit.

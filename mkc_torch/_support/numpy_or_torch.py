@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["at_least", "at_most"]
-
 
 def at_least(xp: Any, values: Any, low: float) -> Any:
     """The elementwise maximum of values and a number.

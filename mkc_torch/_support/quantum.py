@@ -9,8 +9,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["quanta_of", "rounding_of"]
-
 _DECIMALS = 7
 """Numbers of a file with fewer decimals than this are taken as rounded."""
 

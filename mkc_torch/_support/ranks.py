@@ -13,8 +13,6 @@ from torch import distributed as dist
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Ranks", "RanksError"]
-
 T = TypeVar("T")
 
 
@@ -126,7 +124,7 @@ class Ranks:
             raise error
         for rank, message in enumerate(messages):
             if message is not None:
-                raise RanksError(f"Rank {rank} failed, and so no rank goes on: {message}")
+                raise RanksError(f"Rank {rank} failed, so all ranks stopped: {message}")
 
 
 def _error_message(error: Exception | None) -> str | None:

@@ -63,11 +63,7 @@ def _with_identity(gram: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch 2
 
 
 def inverse_factor(gram: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Float[Tensor, "*batch n"]]:
-    """Upper triangular T with ``T Tᵀ = gram⁻¹``, and the pivots; columns of pivots that are not positive are 0.
-
-    Args:
-        gram: symmetric positive definite matrices.
-    """
+    """Upper triangular T with ``T Tᵀ = gram⁻¹``, and the pivots; columns of pivots that are not positive are 0."""
     n = gram.shape[-1]
     columns = _columns(_with_identity(gram), 0.0)
     factor = torch.stack([column[..., n - j :] for j, column in enumerate(columns)], -1)
@@ -98,11 +94,9 @@ def orthonormalising(
 ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n n"], Bool[Tensor, " B"]]:
     """R and its inverse, with ``rows R⁻¹`` orthonormal, and whether the columns are well conditioned.
 
-    Cholesky factor of the Gram matrix, of the Gram matrix of the result, and their product, in float64 whatever the
-    dtype of the rows: R has a relative error of a few n · eps of float64 where the third result is true.
-
-    Args:
-        rows: columns of about unit size.
+    The columns should be of about unit size. R is the product of the Cholesky factors of the Gram matrices of the rows
+    and of the first result, in float64 whatever the dtype of the rows. Where the third result is true, R has a relative
+    error of a few n · eps of float64.
     """
     rows = _double(rows)
     n = rows.shape[-1]

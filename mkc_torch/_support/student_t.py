@@ -11,8 +11,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["fisher_tail", "incomplete_beta", "student_quantile", "student_tails"]
-
 _STEPS = 2000
 """Maximum number of terms of the continued fraction; twice the root of the larger parameter suffices."""
 

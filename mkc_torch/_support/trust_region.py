@@ -15,8 +15,6 @@ from mkc_torch._support.small_factors import symmetric_eigen
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Minima", "Quadratic", "minimise"]
-
 _NEGATIVE = 1e-6
 """Negative curvature, relative to the largest curvature, up to which a stationary point counts as a minimum."""
 
@@ -52,7 +50,7 @@ class Minima:
 
 @dataclass(frozen=True)
 class _Step:
-    """Steps (K, n), their lengths, the predicted gains of them and of the full Newton steps, and convexity."""
+    """Steps (K, n), their lengths, predicted gains of the steps and of the full Newton steps, and convexity."""
 
     step: Float[Tensor, "K n"]
     length: Float[Tensor, " K"]
@@ -108,7 +106,8 @@ def minimise(
         tol: predicted gain of Newton's step below which a descent ends with that step, relative to the absolute value
             of the function or 1 if larger; default 64 times the rounding error of the dtype.
         max_iter: maximum number of steps tried.
-        retract: maps points to equivalent points, where a function is constant along some curves.
+        retract: maps points to others with the same value, for functions that are constant along curves; None keeps
+            the points.
 
     Raises:
         ValueError: a function, its gradient or its Hessian is not finite at a start.
@@ -176,8 +175,8 @@ def _refuse_not_finite(at: Quadratic, reach: Float[Tensor, " K"]) -> None:
         wrong = ~torch.isfinite(value).reshape(len(value), -1).all(-1)
         if bool(wrong.any()):
             raise ValueError(
-                f"The {name} of what is minimised is not finite at start {int(wrong.nonzero()[0])}: squares overflow "
-                "or vanish. Divide the data by units near their scale, or begin elsewhere."
+                f"The {name} of the minimised function is not finite at start {int(wrong.nonzero()[0])}: squares "
+                "overflow or vanish. Rescale the data to values near 1, or choose another start."
             )
 
 

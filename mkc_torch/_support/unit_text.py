@@ -6,8 +6,6 @@ import math
 import re
 from collections.abc import Mapping
 
-__all__ = ["duration", "quotient", "ratio", "share_of", "sized", "tidy"]
-
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FACTOR = re.compile(r"(?P<name>[^\d⁻⁰¹²³⁴⁵⁶⁷⁸⁹^]+)\^?(?P<power>[-⁻]?[\d⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")

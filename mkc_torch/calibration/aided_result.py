@@ -9,8 +9,6 @@ from typing import Any
 
 from mkc_torch.calibration.file import CheckedValues, Vector, finite_or_none
 
-__all__ = ["AidedResult", "aid_from_json", "aid_to_json"]
-
 
 @dataclass(frozen=True)
 class AidedResult:

@@ -13,8 +13,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["CLIPPED", "clipped_entries", "distinct_rows", "without_clipped"]
-
 CLIPPED = "clipped samples"
 
 _LEAST = 20

@@ -180,7 +180,5 @@ def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
         apart = torch.rad2deg(torch.acos((grid @ grid[worst]).clamp(-1.0, 1.0)))
         uncovered[apart < max(60.0, float(uncovered[worst]))] = 0.0
     return Coverage(
-        fraction=float((angle < NEAR_DEGREES).double().mean()),
-        gaps=tuple(gaps),
-        information=max(information, 0.0),
+        fraction=float((angle < NEAR_DEGREES).double().mean()), gaps=tuple(gaps), information=max(information, 0.0)
     )

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-__all__ = ["LEVEL", "Difference", "Differences", "differences"]
-
 LEVEL = 0.01
 """Significance level of the comparison of two calibrations, with Bonferroni's correction for the ten numbers, which is
 valid for any correlation."""

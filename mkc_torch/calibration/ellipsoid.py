@@ -12,16 +12,6 @@ from mkc_torch._support.small_factors import solve, symmetric_eigen
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "Ellipsoid",
-    "coefficients_from_ellipsoid",
-    "ellipsoid_from_coefficients",
-    "ellipsoid_from_root",
-    "monomials",
-    "sampson_distance",
-    "symmetric_root",
-]
-
 
 class Ellipsoid(NamedTuple):
     """``(p - center)ᵀ shape (p - center) = 1``."""

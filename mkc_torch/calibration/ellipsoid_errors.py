@@ -15,8 +15,6 @@ from mkc_torch.linear._implicit.layer import needs_derivatives
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["derived_slopes"]
-
 
 def derived_slopes(
     local: Ellipsoid, parameters: Float[Tensor, "*batch 9"], ellipsoid_of: Callable[[Tensor], Ellipsoid]

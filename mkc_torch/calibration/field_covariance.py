@@ -8,8 +8,6 @@ from mkc_torch.calibration.file import Matrix
 from mkc_torch.calibration.plain_values import matrix_of
 from mkc_torch.calibration.result import Calibration
 
-__all__ = ["field_covariance", "field_noise"]
-
 
 def field_covariance(calibration: Calibration) -> Matrix:
     """The covariance of an undisturbed sample's corrected field, (3, 3), in ``field_unit²``.

@@ -15,8 +15,6 @@ from mkc_torch.calibration.result import Calibration
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["MagneticFieldMessages", "magnetic_field_messages"]
-
 
 class MagneticFieldMessages(NamedTuple):
     """Fields of ``sensor_msgs/MagneticField`` for N samples.

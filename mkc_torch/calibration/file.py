@@ -7,9 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
-__all__ = ["CalibrationFileError"]
-
-
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 

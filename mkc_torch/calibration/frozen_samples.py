@@ -9,14 +9,12 @@ from torch import Tensor
 
 from mkc_torch.calibration.clipped_samples import clipped_entries
 from mkc_torch.calibration.repeats import Repeat, next_place, quietest_noise, repeats, step_of_digits, usual_move
-from mkc_torch.calibration.runs import run_ends
+from mkc_torch.calibration.runs import run_slices
 from mkc_torch.recording.formats.base import counted
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-__all__ = ["FROZEN", "without_frozen"]
 
 FROZEN = "samples of a frozen sensor"
 
@@ -64,7 +62,7 @@ def without_frozen(recording: Recording, *names: str) -> Recording:
         ('Left out 100 of 1000 samples of a frozen sensor: all of `x`, `y` from sample 301 to 400 (100).',)
     """
     values = recording.stack(*names)
-    ends = list(run_ends(recording))
+    ends = [run.start for run in run_slices(recording)[1:]]
     # a clipped axis repeats its value too, which is another fault
     clipped = clipped_entries(values)
     # a log may be written faster than the sensor samples

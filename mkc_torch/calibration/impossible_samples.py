@@ -16,8 +16,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["without_impossible"]
-
 _APART = 20.0
 """Smallest ratio of an impossible sample's distance from the middle to that of all others. A magnetic disturbance also
 has samples between, before and after its maximum."""

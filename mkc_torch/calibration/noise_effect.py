@@ -21,8 +21,6 @@ from mkc_torch.calibration.ellipsoid import monomials, sampson_distance
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Bias", "NoisyMoments", "algebraic_rows", "bias_by_noise", "distance_rows", "moments_of"]
-
 _STEP = 0.25
 """Step of the finite differences, in standard deviations of the noise: small compared with the curvature of the rows;
 the rounding error is 16 times that of the moments."""

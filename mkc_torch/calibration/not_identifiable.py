@@ -7,8 +7,6 @@ from torch import Tensor
 
 from mkc_torch.calibration.coverage import Coverage, coverage
 
-__all__ = ["NotIdentifiableError"]
-
 
 class NotIdentifiableError(ValueError):
     """The points do not determine an ellipsoid.

@@ -18,8 +18,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["ACCEL", "GRAVITY", "accelerometer", "as_magnetometer", "rest_bias"]
-
 GRAVITY = 9.80665
 """Standard gravity in m/s²; local gravity is within 0.3 % of it."""
 

@@ -13,8 +13,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["disturbed_places", "numbered", "places"]
-
 _ROW = "row of the recording"
 """Name of the internal column of row numbers."""
 

@@ -11,8 +11,6 @@ from mkc_torch.calibration.file import Matrix, Vector
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ResidualSpread", "matrix_of", "spread_of", "vector_of"]
-
 
 class ResidualSpread(NamedTuple):
     """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""

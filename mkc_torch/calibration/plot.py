@@ -17,8 +17,6 @@ from mkc_torch.calibration.places import numbered, places
 from mkc_torch.functional import mkc_nll
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["PLANES", "Calibrated", "CalibrationPlot", "draw_coverage", "draw_density", "draw_residual", "draw_sphere"]
-
 PLANES = ("xy", "xz", "yz")
 _MOST_POINTS = 20_000
 """Most points that a plot draws."""

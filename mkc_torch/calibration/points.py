@@ -7,8 +7,6 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
 
-__all__ = ["MIN_POINTS", "prepared", "refuse_no_points"]
-
 MIN_POINTS = 9
 """Fewest points: as many as coefficients of an ellipsoid."""
 

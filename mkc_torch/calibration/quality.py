@@ -8,8 +8,6 @@ from mkc_torch.calibration.places import ROWS_A_SECOND
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.recording.disturbance import RejectedInterval
 
-__all__ = ["Doubt", "disturbances", "doubts"]
-
 Doubt = Literal["not_better", "much_rejected"]
 """``not_better``: the corrected field's length scatters no less than the measured length.
 ``much_rejected``: a third or more of the samples were rejected.

@@ -14,8 +14,6 @@ from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning,
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["recorded_ellipsoid"]
-
 _ERRORS = 3.0
 """Largest difference between two fits to the same samples, in standard errors."""
 

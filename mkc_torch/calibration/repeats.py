@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Repeat", "quietest_noise", "repeats", "step_of_digits", "usual_move"]
-
 _AFTER = 5
 """Number of samples whose median is the next position of a sensor; two outliers do not change it."""
 

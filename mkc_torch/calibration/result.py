@@ -73,7 +73,7 @@ class Calibration:
         sensor: "mag", or "accel" for an accelerometer, whose field is gravity.
         rest_bias: bias of the gyroscope at rest; None without a gyroscope or a rest.
         coverage: coverage of directions by the samples in use.
-        warnings: what makes the result doubtful, the weightiest first.
+        warnings: reasons to doubt the result, most important first.
         notes: how the recording was read and fitted.
         name: name of the sensor; the recording's name unless another name was given.
         tails: tails of :meth:`algebraic_residual` compared with a Gaussian's, and the expected share of errors beyond

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,8 +13,6 @@ from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-__all__ = ["apart", "in_each_run", "run_ends", "run_slices"]
 
 _EXPERIMENT = "experiment"
 
@@ -71,8 +69,3 @@ def apart(
         parts += [points[run], points[run][-1:].expand(far, 3)]
         shares += [taken[run], taken.new_zeros(far)]
     return torch.cat(parts[:-1]), torch.cat(shares[:-1])
-
-
-def run_ends(recording: Recording) -> Iterator[int]:
-    """Yield the first row of each run except the first."""
-    yield from (run.start for run in run_slices(recording)[1:])

@@ -14,8 +14,6 @@ from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["refuse_at_rest", "thin_at_rest", "turning", "way"]
-
 _PARTS = 200
 """Number of half windows in a recording."""
 

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from mkc_torch.calibration.clipped_samples import CLIPPED
 from mkc_torch.calibration.frozen_samples import FROZEN
 
-__all__ = ["NOT_COVERED", "by_weight", "is_fault"]
-
 NOT_COVERED = "Directions not covered"
 """Beginning of the warning about missing directions, which clipped samples may have caused."""
 

@@ -18,8 +18,6 @@ from mkc_torch.cli.export import export
 from mkc_torch.cli.inspect import inspect
 from mkc_torch.cli.new import new_effect, new_simulation
 
-__all__ = ["app"]
-
 
 class _Commands(TyperGroup):
     """A typer group that does not import pydantic to show help."""

@@ -21,9 +21,6 @@ from mkc_torch.cli.exported import exports_of, stale_exports
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
 
-__all__ = ["CalibrationOutcome", "CalibrationRequest", "calibrations_of", "read_calibration"]
-
-
 ACCELEROMETER = "accel"
 """The quantity of an accelerometer; that of a magnetometer is ``mag``."""
 
@@ -139,7 +136,7 @@ def _refuse_for_one(path: Path, request: CalibrationRequest, names: list[str]) -
         if given is not None:
             raise ValueError(
                 f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is for one "
-                f"sensor; add `--sensor {names[0]}`, and calibrate each of the others in a call of its own."
+                f"sensor; add `--sensor {names[0]}`, and calibrate the others in separate calls."
             )
 
 

@@ -13,8 +13,6 @@ from mkc_torch.cli.calibration_files import CalibrationOutcome
 from mkc_torch.cli.calibration_summary import SensorResult, show, show_sensors
 from mkc_torch.cli.console import complain, sentence_of
 
-__all__ = ["Counts", "show_results"]
-
 
 class Counts(NamedTuple):
     """Numbers of sensors that failed, in whole or in part, and of doubtful calibrations."""

@@ -18,8 +18,6 @@ from mkc_torch.report.words import numbers as w
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
 from mkc_torch.report.words.verdict import calibration_verdict, is_doubtful, result_in_a_word
 
-__all__ = ["SensorResult", "show", "show_sensors"]
-
 _LABEL = 11
 """Letters of the column of labels."""
 

@@ -28,16 +28,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation import Simulation
 
-__all__ = [
-    "Corrected",
-    "correct",
-    "correct_as_messages",
-    "read_correction",
-    "show_correction",
-    "unit_of",
-    "write_correction",
-]
-
 _NOT_MEASURED = ("time", "experiment")
 
 _OTHER_LENGTH = 1.15

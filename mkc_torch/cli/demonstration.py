@@ -32,17 +32,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.report import Comparison
 
-__all__ = [
-    "CONCEALED",
-    "FILES",
-    "Second",
-    "calibrate_simulated",
-    "correct_second",
-    "diagnose_simulated",
-    "show_calibration",
-    "show_diagnosis",
-]
-
 _NOTE = (
     "SIMULATED: no sensor recorded this. A program turned a sensor with a known offset and known gains through all "
     "directions for 90 s while a loudspeaker was carried past it, so the result can be compared with the truth."

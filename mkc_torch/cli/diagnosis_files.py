@@ -34,16 +34,6 @@ from mkc_torch.simulation.load import load_simulation, raised_in
 if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
-__all__ = [
-    "WRITTEN",
-    "diagnose_file",
-    "diagnose_together",
-    "named_simulation",
-    "paired_simulation",
-    "simulation_of",
-    "write_diagnosis",
-]
-
 _EXPERIMENT = "experiment"
 WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 

@@ -6,18 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = [
-    "INPUT_HOLDS",
-    "LEVEL",
-    "MAGNETOMETER",
-    "SIMULATIONS",
-    "SURROGATES",
-    "TOGETHER",
-    "Outcome",
-    "Request",
-    "is_file_of_a_simulation",
-]
-
 MAGNETOMETER = "magnetometer"
 SIMULATIONS = (MAGNETOMETER,)
 """Simulations that `--simulation` accepts by name."""

@@ -10,8 +10,6 @@ import typer
 
 from mkc_torch.cli.loading import loading
 
-__all__ = ["EXTRAS", "Extra", "doctor"]
-
 
 class Extra(NamedTuple):
     """An extra of the installation: its features, and the packages that it installs."""

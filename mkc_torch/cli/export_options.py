@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["DEVICE_ID", "INSTANCE", "KINDS", "checked_exports"]
-
 # the same as in mkc_torch.calibration.exports, which imports torch; a wrong name is reported before that import
 KINDS = ("px4", "ardupilot", "c-header", "ros-yaml", "imu-calib", "json")
 _NUMBERED = ("px4", "ardupilot")

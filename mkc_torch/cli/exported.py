@@ -11,8 +11,6 @@ from mkc_torch.calibration.exports import EXPORTS, Destination, ExportError, Sen
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.sensor_correction import sensor_correction
 
-__all__ = ["correction_of", "exports_of", "stale_exports"]
-
 
 def correction_of(known: Calibration | DiagnosedModel, path: Path, name: str | None) -> SensorCorrection:
     """Return the exportable part of a calibration or model. A model takes the name of its folder.

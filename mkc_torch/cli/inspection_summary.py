@@ -16,8 +16,6 @@ from mkc_torch.cli.recorded import read_magnetometer
 from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.inspection import FileSeen, SensorSeen, TopicSeen
 
-__all__ = ["as_data", "commands_of", "show"]
-
 _MOST_PROPOSED = 3
 """Most commands that are proposed for columns that may be a magnetometer."""
 

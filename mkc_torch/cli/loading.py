@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["loading", "when_loaded"]
-
 _callbacks: list[Callable[[], None]] = []
 
 

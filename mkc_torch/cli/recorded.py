@@ -15,16 +15,6 @@ from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = [
-    "read_accelerometer",
-    "read_again",
-    "read_magnetometer",
-    "read_table",
-    "refuse_likely_size",
-    "refuse_no_magnetometer",
-    "sensor_names",
-]
-
 _AXES = ("mag_x", "mag_y", "mag_z")
 
 

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 
 from mkc_torch._words.typesetting import plain
 
-__all__ = ["NOTE", "note_rows", "warning_rows"]
-
 NOTE = "note"
 """Label of a note."""
 
@@ -20,7 +18,7 @@ def warning_rows(warnings: Sequence[str], file: str, most: int = MOST_LINES) -> 
     """Yield a label and a text for each warning; the first is always shown.
 
     Args:
-        warnings: the weightiest first.
+        warnings: most important first.
         file: the file that lists all of them.
         most: most rows.
 

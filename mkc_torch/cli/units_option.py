@@ -8,17 +8,6 @@ from pathlib import Path
 
 import typer
 
-__all__ = [
-    "CONVERT_HELP",
-    "CONVERT_METAVAR",
-    "LABEL_HELP",
-    "QUANTITIES",
-    "SENSOR_HELP",
-    "parsed_units",
-    "reading_options",
-    "split_trailing_pairs",
-]
-
 CONVERT_METAVAR = "NAME=UNIT,..."
 CONVERT_HELP = "Convert a quantity or a column from this unit: mag=gauss,time=us"
 LABEL_HELP = "Label the magnetometer's unit, such as counts; nothing is converted."

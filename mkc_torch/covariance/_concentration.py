@@ -60,7 +60,7 @@ class Support:
 
 
 def singular_below(dtype: torch.dtype) -> float:
-    """Conditional variance of a column given others, as a share of its own, below which rounding dominates."""
+    """Conditional variance of a column given others, relative to its variance, below which rounding dominates."""
     return 512.0 * torch.finfo(dtype).eps
 
 

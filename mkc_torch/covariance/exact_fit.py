@@ -73,10 +73,6 @@ class ExactFitError(ValueError):
 def refuse_exact_fit(sample: Sample, counts: Bool[Tensor, "B N"]) -> None:
     """Raise ExactFitError if a support lies on a hyperplane, within the rounding of the values.
 
-    Args:
-        sample: the sample.
-        counts: mask of the support.
-
     Raises:
         ExactFitError: for the first such problem.
         ValueError: the support contains an outlier so far out that rounding hides the other samples.

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from numpy import ndarray
 
-__all__ = ["KAPPA_OFFSET", "LEAST_KAPPA_SHARE", "LONGEST_STEP", "Channel", "channel_step", "is_short"]
-
 KAPPA_OFFSET = 0.02
 """Offset of κ in relative steps, Δκ / (κ + offset): near a Gaussian small absolute changes matter."""
 
@@ -66,11 +64,7 @@ Derived = tuple[float, float, float, float, float, float]
 
 
 def channel_step(
-    error: Float64[ndarray, " N"],
-    weight: Float64[ndarray, " N"] | None,
-    at: Channel,
-    free_kappa: bool,
-    free_d: bool,
+    error: Float64[ndarray, " N"], weight: Float64[ndarray, " N"] | None, at: Channel, free_kappa: bool, free_d: bool
 ) -> tuple[float, float, float, float]:
     """Return κ, log d, damping and value after a Newton step that never increases the value.
 

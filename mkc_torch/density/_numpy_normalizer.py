@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from numpy import ndarray
 
-__all__ = ["is_few", "log_partition_and_slopes"]
-
 _FEW = 64
 """Channels up to which NumPy is faster than torch."""
 

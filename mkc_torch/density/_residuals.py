@@ -16,8 +16,6 @@ from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Domain", "Residuals", "channel_values", "checked_domain", "checked_residuals", "checked_weight"]
-
 
 class Residuals(NamedTuple):
     """Residuals with their weights and robust scales.
@@ -122,9 +120,7 @@ def channel_values(
 
 
 def checked_domain(
-    residuals: Residuals,
-    bound: float | Float[Tensor, " m"] | None,
-    d_min: float | Float[Tensor, " m"] | None,
+    residuals: Residuals, bound: float | Float[Tensor, " m"] | None, d_min: float | Float[Tensor, " m"] | None
 ) -> Domain:
     """The domain, by default from :func:`domain_rule`, and the floor of d, by default a tenth of the scale.
 

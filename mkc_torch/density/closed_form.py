@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 
 from mkc_torch._support.numpy_or_torch import at_least, at_most
 
-__all__ = ["ElementEnergy", "element_energy"]
-
 _SERIES_BELOW = 0.3
 """x = kappa z² / 2 below which the derivative by kappa is a series: a difference of exponentials loses digits."""
 

@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["WIDE", "domain_rule", "refuse_bad_bound"]
-
 WIDE = 10.0
 """Smallest default half-width of the domain, in scales."""
 

@@ -13,8 +13,6 @@ from mkc_torch.density.likelihood import DensityState, initial_state
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["gaussian_state", "normalised", "replace_problems", "weighted_rms"]
-
 
 def normalised(weight: Float[Tensor, "*batch N m"] | None) -> Float[Tensor, "*batch N m"] | None:
     """Weights that sum to 1 in each channel, as an E-step needs them."""

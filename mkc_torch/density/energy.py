@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-__all__ = ["KAPPA_MAX", "energy", "inverse_square"]
-
 KAPPA_MAX = 400.0
 """Largest ``1 / sigma^2`` for which the quadrature is accurate: ``sigma = 0.05``."""
 

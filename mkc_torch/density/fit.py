@@ -30,8 +30,6 @@ from mkc_torch.density.tails import Tails, assess_tails
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["DensityFit", "fit_density"]
-
 
 @dataclass(frozen=True)
 class DensityFit:

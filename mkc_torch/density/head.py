@@ -15,17 +15,6 @@ from mkc_torch.density.energy import energy_value
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
-__all__ = [
-    "HEAD_TOLERANCE",
-    "head_integral",
-    "head_quadrature",
-    "head_reach",
-    "head_rule",
-    "head_rule_constants",
-    "integrate",
-    "tail_density",
-]
-
 HEAD_TOLERANCE = 1e-13
 """Excess of the density over its flat tail at which the head ends."""
 

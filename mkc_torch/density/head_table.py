@@ -19,8 +19,6 @@ from mkc_torch.density.head import head_integral
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["DEGREE", "INTERVALS", "RATE", "head_table", "look_up", "reaches_beyond_head"]
-
 RATE = 12.0
 """Factor on kappa in ``w``, chosen so that the intervals have about equal shares of the curvature."""
 

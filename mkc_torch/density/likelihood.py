@@ -122,11 +122,8 @@ class DensityState:
 def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
     """Mean negative log-density of the residuals of each channel."""
     z = error * torch.exp(-state.log_d).unsqueeze(-2)
-    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
-
-
-def _log_z(state: DensityState) -> Tensor:
-    return log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
+    log_z = log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
+    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + log_z
 
 
 def initial_state(
@@ -240,9 +237,7 @@ def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )
     return replace(
-        state,
-        kappa=kappa if state.free_kappa else state.kappa,
-        log_d=log_d if state.free_d else state.log_d,
+        state, kappa=kappa if state.free_kappa else state.kappa, log_d=log_d if state.free_d else state.log_d
     )
 
 
@@ -260,7 +255,7 @@ class Maximum(NamedTuple):
 
 
 def maximise(error: Tensor, weight: Tensor | None, state: DensityState, *, max_iter: int, tol: float) -> Maximum:
-    """Maximise the likelihood of each channel by Newton steps, until two steps gain less than ``tol`` and rounding.
+    """Maximise the likelihood of each channel by Newton steps, until two in a row gain less than ``tol`` plus rounding.
 
     Args:
         error: residuals, (*, N, m).

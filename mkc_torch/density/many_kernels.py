@@ -23,8 +23,6 @@ from mkc_torch.density.domain import refuse_bad_bound
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["KernelsFit", "fit_kernels"]
-
 _NARROWEST = 0.5
 """Smallest bandwidth, in robust scales. Tuned on draws of the Cauchy and the Gaussian distribution."""
 

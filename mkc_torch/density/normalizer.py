@@ -19,8 +19,6 @@ from mkc_torch.density.head_table import look_up, reaches_beyond_head
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["log_partition"]
-
 _RULE = (head_rule_constants()[0].numpy(), head_rule_constants()[1].numpy())
 """Nodes and weights of the head's quadrature as NumPy arrays."""
 
@@ -173,9 +171,6 @@ class _LogPartition(torch.autograd.Function):
 
 def refuse_bad_ratio(length: Float[Tensor, "*batch"]) -> None:
     """Raise ValueError for a ratio ``bound / d`` whose square overflows or underflows.
-
-    Args:
-        length: ``bound / d``.
 
     Raises:
         ValueError: a ratio out of range, where values are checked; see :mod:`mkc_torch.functional`.

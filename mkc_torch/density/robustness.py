@@ -24,19 +24,6 @@ from mkc_torch.density.energy import as_computed, inverse_square, kernel_weight
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = [
-    "bandwidth_for_efficiency",
-    "breakdown_point",
-    "error_bound",
-    "error_bound_slope",
-    "gaussian_breakdown",
-    "gaussian_efficiency",
-    "least_bandwidth",
-    "least_error_bound",
-    "optimal_bandwidth",
-    "phi",
-]
-
 
 def _refuse(name: str, wanted: str, value: object, right: Tensor, advice: str) -> None:
     if not bool(right.all()):

@@ -23,8 +23,6 @@ from mkc_torch.density.likelihood import DensityState, initial_state, maximise
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["GAUSSIAN_BELOW", "ChannelTails", "Tails", "assess_tails", "percent_with_error", "time_series_tails"]
-
 GAUSSIAN_BELOW = 2.71
 """5 % point of the equal mixture of χ²₀ and χ²₁, because κ = 0 is on the boundary: Chernoff 1954, Self & Liang 1987."""
 

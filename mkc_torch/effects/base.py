@@ -16,8 +16,6 @@ from mkc_torch.effects.waveforms import outer_product, per
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Effect", "GainEffect", "in_words"]
-
 _SPELLINGS = {
     "hard iron": "hard-iron",
     "soft iron": "soft-iron",

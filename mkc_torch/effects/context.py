@@ -13,8 +13,6 @@ from mkc_torch.effects.runs import run_numbers
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["SEVERAL", "Context", "Quantity", "Shape"]
-
 SEVERAL = "several"
 """The part of the port of all outputs, where there are several outputs with the same unit."""
 

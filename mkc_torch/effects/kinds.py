@@ -6,8 +6,6 @@ from typing import Literal
 
 from mkc_torch.effects.context import Context
 
-__all__ = ["CELSIUS", "MOTION", "Kind", "kind_at", "kind_of", "zero_of"]
-
 Kind = Literal["temperature", "angle", "rotation", "position", "speed", "level", "voltage", "current", "pressure", ""]
 """Kind of a quantity; empty if not known."""
 

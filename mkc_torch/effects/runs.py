@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["clamped_recurrence", "first_of_runs", "linear_recurrence", "run_numbers"]
-
 
 def run_numbers(time: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
     """Number of each sample's run; a run begins where time goes back.

@@ -14,8 +14,6 @@ from mkc_torch.effects.context import Context, Quantity, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["CORNER", "SOFTNESS", "Saturation", "ShareEffect", "soft_clip"]
-
 CORNER = 0.1
 """Softness of a corner in the grid search; see :func:`soft_clip`."""
 

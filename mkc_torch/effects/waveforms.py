@@ -12,8 +12,6 @@ from mkc_torch.effects.runs import clamped_recurrence, first_of_runs, linear_rec
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["apply_basis", "in_contact", "lagged", "outer_product", "per", "played", "unit_step"]
-
 _MIN_RATIO = 1e-12
 """Lower limit of a sampling interval over the lag, a divisor."""
 

@@ -19,9 +19,6 @@ from mkc_torch.losses.mkc import MKCLoss
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-
-__all__ = ["SIGMA_CAP"]
-
 SIGMA_CAP = 1000.0
 """Largest σ that is logged, and that a loss with ``learn_sigma=True`` gets. At an error of two d its energy equals the
 Gaussian's to 1e-6."""

@@ -17,9 +17,6 @@ from mkc_torch.losses.mkc import MKCLoss
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-
-__all__ = ["MIN_RESIDUALS"]
-
 MIN_RESIDUALS = 30
 """Minimum number of residuals of a channel for an E-step; with fewer, the channel keeps its σ and d."""
 

@@ -8,8 +8,6 @@ from torch import nn
 from mkc_torch.losses.bandwidth_schedule import WARMUP_STEPS, BandwidthSchedule
 from mkc_torch.losses.residual_scale import ResidualScale
 
-__all__ = ["Guide", "set_pace"]
-
 WARMUP_EPOCHS = 3
 """Epochs in which the initial loss is used alone, if they have fewer batches than ``WARMUP_STEPS``. Annealing takes
 twice as many. This leaves most of thirty epochs to the likelihood."""

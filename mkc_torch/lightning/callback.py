@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     Residuals = Callable[[LightningModule, Any], tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]]
 
-__all__ = ["MKCExpectationMaximization"]
-
 
 class MKCExpectationMaximization(Callback):
     """Alternate between the network's weights and the loss's (σ, d): MKC-EM with an optimiser for the M-step.

@@ -70,7 +70,7 @@ class ResidualHistogram:
     def __init__(self, bound: Float[Tensor, " m"] | None = None, *, num_channels: int | None = None) -> None:
         m = num_channels if bound is None else len(bound)
         if m is None or num_channels not in (None, m):
-            raise ValueError(f"Expected `bound` or `num_channels`, or both alike, but got {bound} and {num_channels}.")
+            raise ValueError(f"Expected `bound`, or `num_channels` (m if both), but got {bound} and {num_channels}.")
         flat = torch.zeros(2 * m * BINS + 2 * m + 1, dtype=torch.float64)
         self._begun = False
         self._place(flat, torch.zeros_like(flat[:m]), torch.zeros_like(flat[:m]))

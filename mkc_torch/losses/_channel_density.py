@@ -22,8 +22,6 @@ from mkc_torch.losses.residual_scale import SCALES_IN_BOUND, ResidualScale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["DEFAULT_BOUND_IN_D", "DEFAULT_D_MIN_IN_D", "ChannelDensity", "Objective", "is_auto"]
-
 Objective = Literal["robust", "likelihood"]
 
 DEFAULT_BOUND_IN_D = 100.0

@@ -9,16 +9,6 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
 
-__all__ = [
-    "Reduction",
-    "checked_axis",
-    "checked_weight",
-    "format_channels",
-    "refuse_no_dimension",
-    "refuse_other_reduction",
-    "refuse_other_shapes",
-]
-
 Reduction = Literal["none", "mean", "sum"]
 
 _SHOWN = 6

@@ -19,8 +19,6 @@ from mkc_torch.functional import mkc_energy, mkc_weight
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ChannelCurves", "Curves", "SampleCurves"]
-
 _REACH = 3.0
 """Half-width of a picture in bandwidths: the weight there is 1 %."""
 

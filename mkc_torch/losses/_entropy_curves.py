@@ -15,8 +15,6 @@ from mkc_torch.losses._curves import Curves
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["EntropyCurves"]
-
 _REACH = 6.0
 """Half-width of a picture, in robust scales."""
 
@@ -105,7 +103,7 @@ def _unit(batch: Tensor) -> Tensor:
     if not bool(largest > 0):
         raise ValueError(
             "Expected argument `batch` to hold an error that is not 0 but got "
-            f"{'none' if batch.numel() == 0 else 'zeros alone'}; the entropy is that of relative squares."
+            f"{'none' if batch.numel() == 0 else 'only zeros'}; the entropy is that of relative squares."
         )
     return largest
 

@@ -24,8 +24,6 @@ from mkc_torch.losses.residual_scale import SMALL_STATE, numpy_may_read
 if TYPE_CHECKING:
     pass
 
-__all__ = ["fused_loss"]
-
 SMALL_BATCH = 1 << 14
 """Elements up to which NumPy computes a batch on the CPU: its overhead per call is smaller than torch's."""
 

@@ -9,8 +9,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Implementation", "checked_implementation", "kernels_are_available", "runs_kernels"]
-
 Implementation = Literal["auto", "eager", "compile", "triton"]
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["SHARPNESS", "initial_influence", "initial_loss"]
-
 SHARPNESS = 0.2
 """Residual, in scales, of the transition from a quadratic to a square-root loss."""
 

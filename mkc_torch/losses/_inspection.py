@@ -11,8 +11,6 @@ from torch.optim import Optimizer
 from mkc_torch.density.tails import Tails, assess_tails
 from mkc_torch.losses._checks import checked_weight, format_channels
 
-__all__ = ["tails_of", "training_warnings"]
-
 NEAR_FLOOR = 2.0
 """Factor on the floor of d below which a scale is reported as collapsed."""
 

@@ -13,8 +13,6 @@ from mkc_torch.losses._curves import Curves
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["LabelCurves"]
-
 _POINTS = 401
 """Points per curve of a picture."""
 

@@ -15,8 +15,6 @@ from mkc_torch.losses.bandwidth_schedule import UNLIMITED
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ChannelState", "ChannelTable", "annealed_kappa", "channel_table", "logistic", "scale_ratio", "to_d"]
-
 _LEAST_LOGIT = -80.0
 """Lower limit of the logistic function's argument: below it exp overflows float32, and the value is below 1e-34."""
 
@@ -85,7 +83,7 @@ def to_d(raw: Tensor | None, state: ChannelState, *, follows: bool) -> Float[Ten
 
 
 def annealed_kappa(xp: Any, kappa: Any, d: Any, state: ChannelState, *, follows: bool) -> Any:
-    """1/σ² of the annealed loss: from the selected bandwidth, or the likelihood's 1/σ² if its bandwidth is no wider.
+    """1/σ² of the annealed loss: from the selected bandwidth, or the likelihood's where that is as narrow or narrower.
 
     The annealed loss's d is the scale if d follows the residuals, else the likelihood's d.
     """

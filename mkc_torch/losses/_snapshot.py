@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["snapshot"]
-
 
 # the schema is stated, because torch 2.6 derives none from `list`
 @torch.library.custom_op("mkc_torch::snapshot", mutates_args=(), schema="(Tensor[] values) -> Tensor[]")

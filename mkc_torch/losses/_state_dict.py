@@ -12,8 +12,6 @@ from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.losses._parameters import ChannelState, to_d
 from mkc_torch.losses.residual_scale import ResidualScale
 
-__all__ = ["logit_of_kappa", "logit_of_scale", "translate"]
-
 
 def logit_of_kappa(kappa: Tensor) -> Tensor:
     # slightly inside the range, where the gradient is not 0

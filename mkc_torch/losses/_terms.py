@@ -21,8 +21,6 @@ from mkc_torch.losses._parameters import ChannelState, annealed_kappa, logistic,
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Batch", "LossSettings", "LossTerms", "loss_terms", "loss_value"]
-
 
 class Batch(NamedTuple):
     """A checked batch in the dtype of the computation; ``weight`` and the mask ``counts`` have the input's shape."""

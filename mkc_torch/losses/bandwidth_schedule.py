@@ -23,8 +23,6 @@ from mkc_torch.losses.residual_scale import RATE, SMALL_STATE, ResidualScale, av
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["BandwidthSchedule"]
-
 WARMUP_STEPS = 100
 """Batches in which the initial loss is used alone."""
 

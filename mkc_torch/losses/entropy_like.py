@@ -40,10 +40,8 @@ from mkc_torch.losses._entropy_curves import EntropyCurves
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["EntropyLikeMinima", "LELoss", "entropy_like", "least_entropy_like", "orthogonal_starts"]
-
 LEAST_TOTAL = 1.001
-"""Total weight of several residuals, at least: log N is a divisor, and weights normalised to 1 are refused."""
+"""Smallest total weight of several residuals: log N is a divisor, so weights that sum to 1 are rejected."""
 
 
 def entropy_like(

@@ -29,8 +29,6 @@ from mkc_torch.losses.heteroscedastic import _WideBuffers
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["SIGMA_LEAST", "GeneralizedCrossEntropyLoss", "generalized_cross_entropy", "graduated_sigma"]
-
 SIGMA_LEAST = 0.5
 """Smallest σ accepted: its gradient is p⁴ times that of cross-entropy, too small for learning."""
 

@@ -28,8 +28,6 @@ from mkc_torch.losses._parameters import logistic
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["HeteroscedasticMKCLoss", "MKCConvHead", "MKCHead", "MKCHeadOutput"]
-
 KAPPA_MIN = 1e-6
 """Smallest ``1 / sigma²`` of a head; below it the gradients of σ leave the range of float32."""
 
@@ -383,7 +381,7 @@ def _refuse_other_shape(name: str, value: Tensor, input: Tensor) -> None:
     refuse_not_real(name, value)
     if value.dim() != input.dim() or any(a not in (1, b) for a, b in zip(value.shape, input.shape, strict=True)):
         raise ValueError(
-            f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or that with any dimensions 1, "
+            f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or of size 1 in any dimension "
             f"but got {tuple(value.shape)}; add the missing dimensions, as {name}.unsqueeze(-1) for a value per sample."
         )
 

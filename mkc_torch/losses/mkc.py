@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.density.tails import Tails
 
-__all__ = ["MKCLoss", "checked_loss"]
-
 
 class MKCLoss(ChannelCurves, ChannelDensity):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
@@ -328,7 +326,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             )
         if not self._named_dim and input.dim() > 3 and input.shape[1] == m:
             raise ValueError(
-                f"Expected argument `channel_dim` to be named for an input of shape {tuple(input.shape)}, whose second "
+                f"Expected argument `channel_dim` to be given for an input of shape {tuple(input.shape)}, whose second "
                 f"and last dimension both have size {m}: 1 for (N, C, ...), -1 for channels last."
             )
         return axis

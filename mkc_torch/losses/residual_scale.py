@@ -16,8 +16,6 @@ from mkc_torch._support.torch_internals import is_wrapped
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["ResidualScale", "average_over_processes", "is_distributed", "numpy_may_read", "synchronized_state"]
-
 QUANTILE = 0.4
 """Level of the quantile of |residual| that gives the scale: below 0.5, because half of the targets may be wrong."""
 

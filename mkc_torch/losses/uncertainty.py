@@ -17,8 +17,6 @@ from mkc_torch.losses.mkc import MKCLoss, checked_loss
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["BeyondBound", "PredictiveInterval", "beyond_bound", "inlier_weight", "outliers", "predictive_interval"]
-
 
 @dataclass(frozen=True)
 class BeyondBound:

@@ -10,12 +10,4 @@ from mkc_torch.nonlinear.energy import Solution, minimise
 from mkc_torch.nonlinear.likelihood import NonlinearFit, fit
 from mkc_torch.nonlinear.prior import GaussianPrior
 
-__all__ = [
-    "GaussianPrior",
-    "NoFitError",
-    "NonlinearFit",
-    "Solution",
-    "fit",
-    "load_forward_mode",
-    "minimise",
-]
+__all__ = ["GaussianPrior", "NoFitError", "NonlinearFit", "Solution", "fit", "load_forward_mode", "minimise"]

@@ -14,8 +14,6 @@ from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
 
-__all__ = ["AlternatingMaximum", "alternate", "gaussian_candidate", "likelihood_of"]
-
 
 @dataclass(frozen=True)
 class _Likelihood:

@@ -16,8 +16,6 @@ from mkc_torch.nonlinear._descent import within
 from mkc_torch.nonlinear._problem import TANGENTS, Constraint, Problem, ProblemPoint
 from mkc_torch.nonlinear.prior import GaussianPrior
 
-__all__ = ["per_channel", "prepare", "refuse_out_of_reach"]
-
 
 class NoFitError(ValueError):
     """The residual cannot be fitted from the start: not finite, without finite derivatives, or beyond the domain."""

@@ -11,8 +11,6 @@ from mkc_torch.nonlinear._descent import Descent, descend
 from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
 
-__all__ = ["descend_constrained"]
-
 _MULTIPLIERS = 30
 """Largest number of updates of the multipliers."""
 

@@ -15,8 +15,6 @@ from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["parameter_covariance"]
-
 
 def parameter_covariance(
     problem: Problem,

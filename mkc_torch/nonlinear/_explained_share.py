@@ -12,8 +12,6 @@ from mkc_torch._support.order_statistic import order_statistic, robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["explained"]
-
 
 def explained(residual: Float[Tensor, "*batch N m"], target: Tensor) -> Float[Tensor, "*batch m"]:
     """1 minus the squared ratio of the robust scales of residuals and targets.

@@ -15,8 +15,6 @@ from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["LEAST_SCALE", "graduated", "residual_scale"]
-
 LEAST_SCALE = 0.3
 """Least d in robust scales. Outliers at most double a scale; the d of a fit that interpolates is far smaller."""
 

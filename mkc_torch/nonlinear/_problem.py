@@ -16,18 +16,6 @@ from mkc_torch._support.forward_mode import Residual, forward_tangents, reverse_
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "NONLINEAR",
-    "TANGENTS",
-    "TRUST",
-    "Constraint",
-    "Descent",
-    "Problem",
-    "ProblemPoint",
-    "kernel_weights",
-    "shaped_jacobian",
-]
-
 TANGENTS: dict[str, Callable[[Residual], Residual]] = {
     "forward": forward_tangents,
     "reverse": reverse_tangents,

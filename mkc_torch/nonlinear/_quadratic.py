@@ -15,8 +15,6 @@ from mkc_torch.nonlinear._problem import TRUST, Problem, ProblemPoint
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Penalty", "model_curvature", "objective", "positive", "prior_value", "quadratic_about"]
-
 
 @dataclass(frozen=True)
 class Penalty:

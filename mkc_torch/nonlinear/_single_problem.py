@@ -11,8 +11,6 @@ from torch import Tensor
 
 from mkc_torch.nonlinear._problem import NONLINEAR, TRUST, Descent, Problem, ProblemPoint
 
-__all__ = ["descend_single", "is_single"]
-
 Array = NDArray[np.float64]
 
 

@@ -18,8 +18,6 @@ from mkc_torch.nonlinear._quadratic import prior_value
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Ends", "draw_starts", "most_likely", "repeat_problem"]
-
 AGREE = 0.01
 """Difference of log-likelihoods of all residuals, in nats, up to which two results count as the same minimum."""
 
@@ -114,7 +112,7 @@ def most_likely(
     first = scale.clamp(min=tiny).log().sum(-1).argmin(-1)
     rows = torch.arange(len(first), device=first.device)
     domain = bound[rows, first] if given is None else given
-    # a result beyond the domain is no candidate; the reference result replaces it
+    # a result outside the domain is replaced by the reference result
     near = (2.0 * scale <= domain.unsqueeze(1)).all(-1)
     shape = residual.shape[:2]
     judged = torch.where(near[..., None, None], residual, residual[rows, first].unsqueeze(1))

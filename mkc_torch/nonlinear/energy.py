@@ -20,8 +20,6 @@ from mkc_torch.nonlinear.prior import GaussianPrior
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Solution", "minimise"]
-
 
 @dataclass(frozen=True)
 class Solution:

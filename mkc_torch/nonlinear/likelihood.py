@@ -27,8 +27,6 @@ from mkc_torch.nonlinear.prior import GaussianPrior
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["NonlinearFit", "fit"]
-
 
 @dataclass(frozen=True)
 class NonlinearFit:

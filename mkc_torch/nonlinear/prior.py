@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["GaussianPrior"]
-
 
 @dataclass(frozen=True)
 class GaussianPrior:

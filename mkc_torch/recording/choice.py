@@ -10,8 +10,6 @@ from mkc_torch.recording.column_names import meaning
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
 from mkc_torch.recording.recognise import RecognisedColumns, SensorColumns, candidates, recognised, time_column
 
-__all__ = ["ColumnChoice", "choose", "columns_option", "sensors_in", "which_columns"]
-
 _MAG = ("mag_x", "mag_y", "mag_z")
 
 

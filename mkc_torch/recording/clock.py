@@ -13,8 +13,6 @@ from mkc_torch.recording.formats.text_cells import is_stamp
 from mkc_torch.recording.stamps import as_iso
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["ClockError", "TimeAxis", "clock_of"]
-
 _NANO = 10**9
 """Nanoseconds in a second."""
 

@@ -9,8 +9,6 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["interleaved", "spread", "turned_over"]
-
 _DAY, _WEEK = 86_400, 604_800
 _CLOSE = 5.0
 """Largest step over the end of a counter, in median intervals."""

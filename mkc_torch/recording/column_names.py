@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from mkc_torch.recording.unit_words import CANONICAL, conversion
 
-__all__ = ["Meaning", "is_about_magnetometer", "is_derived", "meaning", "split_unit"]
-
 _STRONG = {
     "mag": {
         "mag",

@@ -14,8 +14,6 @@ from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, is
 if TYPE_CHECKING:
     from mkc_torch.recording.choice import ColumnChoice
 
-__all__ = ["DEFAULT_UNITS", "Units", "converted", "in_units", "quantity_of", "stated_units", "unit_conversion_warnings"]
-
 _AXES = {"mag": "xyz", "field": "xyz", "gyro": "xyz", "accel": "xyz", "position": "xyz", "q": "wxyz"}
 DEFAULT_UNITS: Mapping[str, str] = {
     f"{quantity}_{axis}" if axis else quantity: unit

@@ -14,8 +14,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FIELD_PER_AMPERE", "Truth", "concealed_recording", "simulated_recording"]
-
 RATE = 50.0  # Hz
 SECONDS = 90.0
 FIELD = 48.0  # µT

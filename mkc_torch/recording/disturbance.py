@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["RejectedInterval", "disturbed_intervals"]
-
 _WINDOW_SECONDS = 0.25
 """Length of the window around a sample, in s."""
 

@@ -15,8 +15,6 @@ from mkc_torch._support.arrays import Data, absent, is_array, is_frame, numbers_
 from mkc_torch.recording.formats.base import RecordingError, Table, listed, polars
 from mkc_torch.recording.formats.cells import renamed
 
-__all__ = ["EXPERIMENT", "FrameColumns", "checked_columns", "columns_of_frame", "table_of_frame"]
-
 EXPERIMENT = "experiment"
 """Name of the column that numbers the runs; the only column in which text is accepted."""
 

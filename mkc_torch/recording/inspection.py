@@ -21,8 +21,6 @@ from mkc_torch.recording.recognise import time_column
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["ColumnSeen", "FileSeen", "SensorSeen", "TopicSeen", "inspect_file"]
-
 _GAP = 10.0  # longest interval that is not a gap, in median intervals
 
 

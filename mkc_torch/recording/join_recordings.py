@@ -16,8 +16,6 @@ from mkc_torch.recording.formats.base import RecordingError, listed
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["Clock", "join_recordings", "joint_name", "recording_names", "refuse_no_recording"]
-
 Clock = Literal["own", "restart", "follow"]
 """How the times of consecutive runs are arranged: unchanged, restarting, or following each other."""
 

@@ -18,8 +18,6 @@ from mkc_torch.recording.unit_words import conversion
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ResampledColumns", "interpolated", "join_topics"]
-
 _GAP = 10.0
 """Longest interval, in median intervals of a topic, across which values are interpolated."""
 

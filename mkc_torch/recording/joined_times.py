@@ -12,8 +12,6 @@ from mkc_torch.recording.formats.base import Table, Topic, polars
 from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.text_cells import is_date, is_time_of_day
 
-__all__ = ["with_joined_times"]
-
 _SECONDS = ("sec", "secs", "second", "seconds", "tv_sec", "s")
 _PARTS = {
     "nsec": 9, "nsecs": 9, "nanosec": 9, "nanosecs": 9, "nanosecond": 9, "nanoseconds": 9, "tv_nsec": 9, "ns": 9,

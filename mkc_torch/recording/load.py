@@ -33,8 +33,6 @@ from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["REQUIRED_COLUMNS", "LoadedTable", "load_table", "read_file"]
-
 REQUIRED_COLUMNS = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Required columns: text in any of them is an error."""
 
@@ -212,7 +210,9 @@ def _add_runs(
 
     Without a time, a run starts at each repeated header. A converted time starts at 0 s in each run.
     """
-    warnings = [] if clock is None or not clock.format else [_clock_warning(clock)]
+    warnings: list[str] = []
+    if clock is not None and clock.format:
+        warnings.append(Note(f"The times are {clock.format}; they were converted to seconds from the first sample."))
     if EXPERIMENT in values:
         _count_from_first(values, clock, [])
         return warnings
@@ -229,10 +229,6 @@ def _add_runs(
     count = counted(len(begins) + 1, "run")
     warnings.append(Note(f"{what} at {rows}{more}: {count}, numbered in the column `{EXPERIMENT}`."))
     return warnings
-
-
-def _clock_warning(clock: TimeAxis) -> str:
-    return Note(f"The times are {clock.format}; they were converted to seconds from the first sample.")
 
 
 def _count_from_first(values: dict[str, Tensor], clock: TimeAxis | None, begins: Sequence[int]) -> None:

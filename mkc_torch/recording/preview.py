@@ -8,8 +8,6 @@ from torch import Tensor
 
 from mkc_torch._support.html_table import html_table
 
-__all__ = ["TablePreview"]
-
 _MOST_COLUMNS = 30
 _MOST_WARNINGS = 6
 

@@ -7,8 +7,6 @@ from types import MappingProxyType
 
 from mkc_torch.recording.formats.base import Table
 
-__all__ = ["PX4_UNITS", "is_px4_magnetometer", "is_px4_message"]
-
 PX4_UNITS: Mapping[str, str] = MappingProxyType({"time": "us", "mag": "gauss"})
 """Units of ``timestamp`` and ``sensor_mag`` (msg/SensorMag.msg of PX4: "time since system start (microseconds)", "in
 Gauss")."""

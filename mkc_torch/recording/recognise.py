@@ -12,8 +12,6 @@ from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["RecognisedColumns", "SensorColumns", "candidates", "companion_columns", "recognised", "time_column"]
-
 _MAG = ("mag_x", "mag_y", "mag_z")
 _SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
 _ROS = "magnetic_field"

@@ -10,8 +10,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.column_names import is_about_magnetometer, meaning
 from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 
-__all__ = ["with_row_sensors"]
-
 _SENSOR = {
     "sensor",
     "sensorid",

@@ -9,8 +9,6 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["restarts"]
-
 _FEWEST = 3
 """Fewest samples of a run."""
 

@@ -13,8 +13,6 @@ from mkc_torch.recording.formats.base import counted
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["note_if_few", "time_order"]
-
 _GAP = 10.0
 """Longest interval, in median intervals, that is not a gap."""
 

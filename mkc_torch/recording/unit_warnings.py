@@ -12,8 +12,6 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["RECORDED", "converted_from", "field_size", "field_warning", "likely_unit", "time_warning", "unit_warnings"]
-
 RECORDED = "recorded units"
 """Unit label of measurements whose magnitude does not fit their assumed unit."""
 

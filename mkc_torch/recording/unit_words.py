@@ -9,8 +9,6 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = ["CANONICAL", "Conversion", "conversion", "is_unit", "known_units"]
-
 CANONICAL: Mapping[str, str] = MappingProxyType(
     {
         "time": "s",

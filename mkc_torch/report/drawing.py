@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from mkc_torch._support.drawing import BLUE, DARK_ORANGE, INK, ORANGE
 
-__all__ = ["svg", "themed"]
-
 _OF_PAGE = {
     INK.lower(): "ink",
     DARK_ORANGE.lower(): "orange",

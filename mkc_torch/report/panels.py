@@ -1,4 +1,4 @@
-"""Panels of a figure, each an SVG element of its own: side by side on a wide page, stacked on a narrow page."""
+"""Panels of a figure, each a separate SVG element: side by side on a wide page, stacked on a narrow page."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from mkc_torch.report.drawing import svg
-
-__all__ = ["Margins", "Panels", "title"]
 
 _WIDTHS = {1: 6.4, 2: 4.9, 3: 3.25}
 """Width of a panel in inches by the number of panels in a row; 99 pixels of a wide page each."""

@@ -11,8 +11,6 @@ from mkc_torch._words.typesetting import capital
 from mkc_torch.calibration.coverage import nearest_axis
 from mkc_torch.report.words import numbers as wording
 
-__all__ = ["render"]
-
 
 def render(template: str, **values: Any) -> str:
     """Render a template of this package; values are escaped unless they are markup."""

@@ -15,8 +15,6 @@ from mkc_torch.simulation.ports import Answer, Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Answering", "CompiledResidual", "Continuation", "Meaning", "ResidualTangents", "is_plain"]
-
 Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
 """Maps the parameters of a fit to the simulation's own parameters and the changes at its ports."""
 

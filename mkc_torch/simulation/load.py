@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.protocol import Simulation
 
-__all__ = ["SimulationFileError", "base_class", "file_of", "load_simulation", "raised_in"]
-
 _PREFIX = "_simulation_"
 """Prefix of the names of modules that are loaded from files."""
 
@@ -168,7 +166,7 @@ def _parts(source: str) -> tuple[Path, str]:
     file, _, name = source.rpartition(":")
     if not file.endswith(".py") or not name:
         raise SimulationFileError(
-            f"{source}: this names no simulation; write FILE.py:NAME, as in my.py:Pendulum, or MODEL.fmu."
+            f"{source}: this does not name a simulation; write FILE.py:NAME, as in my.py:Pendulum, or MODEL.fmu."
         )
     return Path(file), name
 
@@ -238,10 +236,7 @@ class _Others(MetaPathFinder):
         self.path = path
 
     def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: ModuleType | None = None,
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         if fullname != self.path.stem or path is not None:
             return None

@@ -5,8 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-__all__ = ["Names"]
-
 
 class Names(SimpleNamespace):
     """Values as attributes; the error of a missing name lists the names.

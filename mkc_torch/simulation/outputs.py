@@ -16,8 +16,6 @@ from mkc_torch.simulation.ports import Changes, Port, SignalSizes
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["ALL", "changed_outputs", "output_ports", "output_signals"]
-
 ALL = "all outputs"
 """Name of the port of all outputs together, of kind "outputs"; the port of an output is named ``output NAME``."""
 

@@ -12,8 +12,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["OwnOffset", "determined_offsets"]
-
 _DETERMINED = 0.01
 """Share of an offset's column that must be independent of the other parameters for the offset to be fitted."""
 

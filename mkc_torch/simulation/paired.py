@@ -22,8 +22,6 @@ from mkc_torch.simulation.runs import successive_runs
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Paired", "PairedCorrection", "PreparedPaired"]
-
 RATE = 5e-5
 """Prior standard deviation of the relative rate of two clocks: 50 ppm, of free-running quartz oscillators."""
 
@@ -92,7 +90,9 @@ class Paired:
         if outputs is not None:
             refuse_text("outputs", outputs, "a tuple of names of columns")
             if not outputs:
-                raise ValueError("Expected argument `outputs` to name a column but got none; None takes all in common.")
+                raise ValueError(
+                    "Expected argument `outputs` to name a column but got none; None compares all common columns."
+                )
         if offset is not None:
             checked_number("offset", offset, advice="it is in s, and None takes half an interval of the recording")
         checked_number("rate", rate, advice=f"{RATE:g} is that of quartz")
@@ -154,7 +154,7 @@ class PreparedPaired(ClosedForm):
                 same.append(name)
         if len(same) == len(shared):
             raise SimulationError(
-                f"All columns in common ({', '.join(shared)}) are the same in the recording and in what was simulated; "
+                f"All columns in common ({', '.join(shared)}) are the same in the recording and the simulated table; "
                 "there is nothing to diagnose. Give the simulator's own output."
             )
         kept = [k for k, name in enumerate(shared) if name not in same]
@@ -203,10 +203,7 @@ class PreparedPaired(ClosedForm):
         return self.measured - changed_outputs(self._outputs(theta), self.channels, changes)
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         return output_signals(self._outputs(theta), self.channels, changes)
 
@@ -341,7 +338,7 @@ def _match_runs(
         )
     count = torch.bincount(number, minlength=len(labels))
     if int(count.min()) < _FEWEST:
-        raise SimulationError(f"{_name_of(simulated, 'The simulated table')} has a run of one moment; it needs two.")
+        raise SimulationError(f"{_name_of(simulated, 'The simulated table')} has a run of one sample; it needs two.")
     last = count.cumsum(0) - 1
     run = torch.tensor([labels.index(label) for label in own_labels])[own]
     low, high = (last - count + 1)[run], last[run]
@@ -350,9 +347,9 @@ def _match_runs(
         if not bool(inside[own == k].any()):
             where = f" of run {label}" if label else ""
             raise SimulationError(
-                f"{_name_of(recording, 'The recording')} and {_name_of(simulated, 'the simulated table')} do not meet "
-                f"in time{where}: {_range(recording, own == k)} was recorded, "
-                f"{_range(simulated, number == labels.index(label))} simulated. Give both the same zero of time."
+                f"{_name_of(recording, 'The recording')} and {_name_of(simulated, 'the simulated table')} do not "
+                f"overlap in time{where}: {_range(recording, own == k)} was recorded, "
+                f"{_range(simulated, number == labels.index(label))} simulated. Count both times from the same moment."
             )
     values = simulated.stack(*names)
     slopes = _slopes(simulated["time"], values, number)

@@ -10,8 +10,6 @@ import torch
 
 from mkc_torch._support.arguments import checked_number, format_value, refuse_other_type
 
-__all__ = ["Parameter", "SimulationError", "known_parameters"]
-
 
 class SimulationError(ValueError):
     """A simulation that cannot be computed; the message states where and why."""

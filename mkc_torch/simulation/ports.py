@@ -1,4 +1,4 @@
-"""Ports of a simulation, at which effects act: their signals, the changes of them, and the residual that answers."""
+"""Ports of a simulation, where effects act: the signals there, their changes, and the resulting residual."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Answer", "Change", "Changes", "FreeChange", "Nearby", "Port", "SignalSizes", "SignalTimes"]
-
 Change = Callable[[Tensor], Tensor]
 """The change at a port, (N, c), as a function of the signal there.
 
-At a port with memory the signal can have more components, the internal states; the change then has more channels, their
-rates.
+At a port with memory, the signal may have the internal states as further components; the change then has their rates as
+further channels.
 """
 
 Changes = Mapping[str, Change]
@@ -132,7 +130,7 @@ class Nearby(Protocol):
     """The start of an evaluation near a known evaluation, such as a trajectory.
 
     Attributes:
-        bare: the same without derived data that can be recomputed.
+        bare: a copy without derived data that can be recomputed.
     """
 
     @property

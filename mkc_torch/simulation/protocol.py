@@ -22,15 +22,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from typing_extensions import Self
 
-__all__ = [
-    "ClosedForm",
-    "CorrectableSimulation",
-    "Correction",
-    "Jacobian",
-    "PreparedSimulation",
-    "Simulation",
-]
-
 Jacobian = Literal["forward", "reverse twice"]
 """How a fit differentiates a residual: by forward mode, or for many small operations by double reverse mode."""
 

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.recording.recording import Recording
 
-__all__ = ["experiment_runs", "successive_runs"]
-
 
 def successive_runs(label: Shaped[Tensor, " N"], time: Float[Tensor, " N"]) -> Tensor:
     """Number of each sample's run, (N,), ascending; a run begins where the label changes or time goes back.

@@ -24,8 +24,6 @@ from mkc_torch.simulation.undetermined import undetermined
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["PreparedStatic", "Static", "StaticCorrection"]
-
 MOST_PARAMETERS = 200
 """Largest number of parameters of a module; a larger module can fit anything, and so lacks no effect."""
 
@@ -243,10 +241,7 @@ class PreparedStatic(ClosedForm):
         return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N k"]]:
         inputs = {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)
@@ -368,17 +363,20 @@ def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
     numbers: dict[str, float] = {}
     for key, values in module.named_parameters():
         if not values.is_floating_point():
-            raise SimulationError(f"{name}: its parameter `{key}` holds no real numbers but {values.dtype}.")
+            raise SimulationError(f"{name}: its parameter `{key}` holds {values.dtype} instead of real numbers.")
         flat = values.detach().flatten().tolist()
         for place, value in enumerate(flat):
             index = torch.unravel_index(torch.tensor(place), values.shape) if values.dim() else ()
             label = ",".join(str(int(i)) for i in index)
             numbers[f"{key}[{label}]" if label else key] = value
     if not numbers:
-        raise SimulationError(f"{name}: the module has no parameters; there is nothing to fit with what is found.")
+        raise SimulationError(
+            f"{name}: the module has no parameters; register at least one number as nn.Parameter, to be fitted."
+        )
     if len(numbers) > MOST_PARAMETERS:
         raise SimulationError(
             f"{name}: the module has {len(numbers):,} numbers, more than {MOST_PARAMETERS}; a network that can follow "
-            "anything lacks nothing. Freeze it into a function of few parameters, and write that as `output`."
+            "any recording leaves no physics to find. Freeze it into a function of few parameters, and write that as "
+            "`output`."
         )
     return numbers

@@ -11,8 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["undetermined"]
-
 _TINY = 1e-6
 """Relative singular value up to which a direction is undetermined."""
 
@@ -21,10 +19,7 @@ _NAMED = 0.1
 
 
 def undetermined(
-    tangents: Float[Tensor, "R p"],
-    theta: Float[Tensor, " p"],
-    names: Sequence[str],
-    of_interest: int | None = None,
+    tangents: Float[Tensor, "R p"], theta: Float[Tensor, " p"], names: Sequence[str], of_interest: int | None = None
 ) -> tuple[str, ...]:
     """A sentence for each direction of the parameters along which the residual is constant, near ``theta``.
 
@@ -66,6 +61,6 @@ def _sentence(direction: Float[Tensor, " p"], names: Sequence[str]) -> str:
     parameters = " and ".join(f"`{name}`" for name, _ in moving)
     sum_ = " ".join(f"{'+' if share > 0 else '−'} {abs(share):.2g} {name}" for name, share in moving).removeprefix("+ ")
     return (
-        f"The recording does not determine {parameters}, but only what they are together: they can move along one "
-        f"direction and the residual stays (direction {sum_}, relative)."
+        f"The recording does not determine {parameters} separately: moving them along one direction leaves the "
+        f"residual unchanged (direction {sum_}, relative)."
     )

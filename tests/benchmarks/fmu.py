@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from examples.blind_proof.equations import models
+from examples.blind_proof.equations import cases, models
 from mkc_torch import Diagnosis, diagnose
 from mkc_torch.simulation import Dynamics, Parameter, Simulation, load_fmu
 from tests.simulation.fmu.made import Model, make_fmu
@@ -95,7 +95,7 @@ def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates:
     with tempfile.TemporaryDirectory() as place:
         fmus: dict[str, Simulation] = {}
         for index in range(FIRST, FIRST + count):
-            case = generator.draw(SEED, index)
+            case = cases.draw(SEED, index)
             system = case.key.mode
             if system not in RATES:  # a system without differential equations
                 continue

@@ -56,5 +56,5 @@ def test_unusable_input_is_refused_before_anything_is_written(tmp_path):
     table = tank_table(tmp_path / "runs.csv")
     result = mkc("diagnose", table, "--simulation", tmp_path / "tank.fmu", "--output", tmp_path / "out")
     assert result.exit_code == 1
-    assert "a damaged one: it is no zip archive. Export it again." in flat(result.stderr)
+    assert "it is damaged: it is not a zip archive. Export it again." in flat(result.stderr)
     assert not (tmp_path / "out").exists()

@@ -301,7 +301,7 @@ def test_what_a_simulator_wrote(tmp_path):
     write_table(tmp_path / "LATE.csv", {"time": dense + 1000.0, "y": signal(dense)})
     result = mkc("diagnose", table, "--simulator-output", tmp_path / "LATE.csv", "--output", output, "--force")
     assert result.exit_code == 1
-    assert "do not meet in time: 0 to 14.95 s was recorded, 999 to 1016.95 s simulated" in flat(result.stderr)
+    assert "do not overlap in time: 0 to 14.95 s was recorded, 999 to 1016.95 s simulated" in flat(result.stderr)
 
 
 @pytest.mark.parametrize(

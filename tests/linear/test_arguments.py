@@ -64,7 +64,7 @@ def test_counts_must_be_whole_numbers(name, value):
 def test_counts_must_be_at_least_one(name):
     for kind in taking(name):
         if (kind, name) != (LeastEntropyLike, "starts"):
-            with pytest.raises(ValueError, match=f"`{name}` to be a whole number of at least 1 but got 0; "):
+            with pytest.raises(ValueError, match=rf"`{name}` .*at least 1 .*got 0; "):
                 made(kind, **{name: 0})
 
 
@@ -85,13 +85,13 @@ def test_parameters_of_the_density_out_of_range_are_refused(kind, name, value):
         return
     with pytest.raises(ValueError, match=rf"`{name}` to be (positive|in \[0\.05, inf\]).* but got"):
         kind(**{name: value})
-    with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+    with pytest.raises(TypeError, match=rf"`{name}` .*number.*tensor.* got 'a'"):
         kind(**{name: "a"})
 
 
 def test_sigma_below_its_limit_is_refused_where_the_density_is_normalised():
     FixedPointLinear(sigma=0.01)
-    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.01; pass None to learn it"):
+    with pytest.raises(ValueError, match=r"`sigma` .*\[0\.05, inf\].* got 0\.01; .*None"):
         MKCRegression(sigma=0.01)
 
 
@@ -114,10 +114,10 @@ def test_invalid_starts_are_refused(kind, value):
 def test_a_coverage_below_one_is_refused(kind):
     assert kind(h=np.int64(20)).h == 20
     for h in (-1, 0):
-        with pytest.raises(ValueError, match=f"`h` to be a whole number of at least 1 but got {h}"):
+        with pytest.raises(ValueError, match=rf"`h` .*at least 1 .*got {h}"):
             kind(h=h)
     for h in ("a", 2.5, True):
-        with pytest.raises(TypeError, match="`h` to be a whole number but got"):
+        with pytest.raises(TypeError, match=r"`h` .*whole number.* got"):
             kind(h=h)
 
 
@@ -164,11 +164,11 @@ def test_other_arguments_are_checked_by_the_constructor(make, error, message):
 @each_estimator
 def test_errors_for_other_types_name_the_conversion(kind):
     X, y = sample(0, 30, 2), sample(1, 30)
-    with pytest.raises(TypeError, match=r"`X` .* but got list; make a tensor of it, torch\.as_tensor\(X\)"):
+    with pytest.raises(TypeError, match=r"`X` .* got list; .*torch\.as_tensor\(X\)"):
         made(kind).fit(X.tolist(), y)
-    with pytest.raises(TypeError, match=r"`Y` .* but got torch\.int64; convert it, Y\.float\(\) or Y\.double\(\)"):
+    with pytest.raises(TypeError, match=r"`Y` .* got torch\.int64; .*Y\.float\(\)"):
         made(kind).fit(X, y.long())
-    with pytest.raises(TypeError, match="`sample_weight` to be a tensor or an array but got list; make a tensor"):
+    with pytest.raises(TypeError, match=r"`sample_weight` .*tensor.*array.* got list; .*tensor"):
         made(kind).fit(X, y, [1.0] * 30)
     with pytest.raises(TypeError, match=r"share dtype and device .*; use Y"):
         made(kind).fit(X, y.float())
@@ -202,14 +202,12 @@ def test_prediction_takes_what_the_fit_took(kind):
         fit.predict(X.tolist())
     with pytest.raises(TypeError, match=r"`X` of the dtype .* of the fit, torch\.float64 .* but got torch\.float32"):
         fit.predict(X.float())
-    with pytest.raises(ValueError, match="`X` with 2 columns in its last dimension but got 3; pass those of the fit"):
+    with pytest.raises(ValueError, match=r"`X` .*2 columns.* got 3; "):
         fit.predict(sample(0, 30, 3))
 
 
 def test_prediction_of_other_batch_dimensions_is_refused():
     fit = LeastSquares().fit(sample(0, 4, 30, 2), sample(1, 4, 30))
     assert fit.predict(sample(2, 4, 7, 2)).shape == (4, 7)
-    with pytest.raises(
-        ValueError, match=r"batch dimensions of `X` and `coef_` that broadcast but got \(3,\) and \(4,\)"
-    ):
+    with pytest.raises(ValueError, match=r"`X` and `coef_` .*broadcast.* got \(3,\) and \(4,\)"):
         fit.predict(sample(2, 3, 7, 2))

@@ -43,7 +43,7 @@ def test_frames_give_what_tensors_give_and_their_columns_are_remembered(kind, li
     assert got.feature_names_in_ == NAMES
     assert torch.equal(got.predict(frame), want.predict(X))
     assert torch.equal(got.predict(X), want.predict(X))
-    with pytest.raises(ValueError, match="columns of the fit, `a`, `b`, but got `b`, `a`"):
+    with pytest.raises(ValueError, match=r"columns .*`a`, `b`.* got `b`, `a`"):
         got.predict(frame[["b", "a"]])
     assert "feature_names_in_" not in vars(got.fit(X, y))
     with pytest.raises(NotFittedError):
@@ -92,7 +92,7 @@ def test_missing_values_of_a_frame_are_reported_by_column():
     X, y, _ = data()
     frame = framed(pd.DataFrame, X).astype("Float64")
     frame.loc[3:5, "b"] = pd.NA
-    with pytest.raises(ValueError, match=r"column `b` of argument `X` to have a value .* 3 missing of 30"):
+    with pytest.raises(ValueError, match=r"column `b` .*`X` .* 3 missing of 30"):
         LeastSquares().fit(frame, y)
     with pytest.raises(TypeError, match=r"column `kind` of argument `X` .* text, .*'x'"):
         LeastSquares().fit(framed(pd.DataFrame, X).assign(kind="x"), y)
@@ -112,7 +112,7 @@ def test_parameters_are_given_and_changed_by_name(kind):
 def test_parameters_are_checked_and_change_together_or_not_at_all():
     estimator = MEstimator().set_params(psi="tukey", max_iter=7)
     assert (estimator.psi, estimator.max_iter) == ("tukey", 7)
-    with pytest.raises(ValueError, match="`max_iter` to be a whole number of at least 1"):
+    with pytest.raises(ValueError, match=r"`max_iter` .*at least 1"):
         estimator.set_params(psi="huber", max_iter=0)
     assert (estimator.psi, estimator.max_iter) == ("tukey", 7)
 
@@ -124,5 +124,5 @@ def test_parameters_of_a_nested_estimator_are_reached():
     assert "start__max_iter" not in outer.get_params(deep=False)
     outer.set_params(start__max_iter=7, threshold=3.0)
     assert (outer.start.max_iter, outer.threshold, inner.max_iter) == (7, 3.0, 500)
-    with pytest.raises(ValueError, match="`start` to be an estimator, to change its seed, but got 'lts'"):
+    with pytest.raises(ValueError, match=r"`start` .*estimator.*seed.* got 'lts'"):
         outer.set_params(start="lts", start__seed=1)

@@ -568,9 +568,7 @@ def test_a_start_of_invalid_coefficients_is_refused(start):
 
 def test_a_domain_too_narrow_for_the_residuals_is_refused():
     X, y = torch.ones(50, 1).double(), torch.linspace(-1, 1, 50).double()
-    with pytest.raises(
-        ValueError, match=r"`bound` to be at least two robust scales of the residuals, 1\.\d+, but got 0.1"
-    ):
+    with pytest.raises(ValueError, match=r"`bound` .*two robust scales.* 1\.\d+, .*got 0\.1"):
         MKCRegression(bound=0.1).fit(X, y)
 
 

@@ -403,7 +403,7 @@ def test_a_zero_column_is_refused():
 
 
 def test_fewer_values_than_coefficients_are_refused():
-    with pytest.raises(ValueError, match="at least 4 values for 4 coefficients but got 3"):
+    with pytest.raises(ValueError, match=r"at least 4 .*4 coefficients.* got 3"):
         FixedPointLinear().fit(sample(0, 3, 4), sample(1, 3))
 
 

@@ -296,7 +296,7 @@ def test_a_table_is_of_one_problem():
     fit = SRegression(starts=50).fit(*line(28, 40, 3, 2, 2))
     assert fit.summary(problem=(1, -1)).coefficients[0].value == float(fit.coef_[1, 1, 0])
     for problem in ((), (1,), (2, 0)):
-        with pytest.raises(IndexError, match=r"index of one problem of the batch \(2, 2\)"):
+        with pytest.raises(IndexError, match=r"batch \(2, 2\)"):
             fit.summary(problem=problem)
 
 
@@ -348,7 +348,7 @@ def test_no_constant_column_and_the_share_is_around_zero():
     "estimator", [MMRegression, SRegression, MEstimator, LeastTrimmedSquares, ReweightedLeastSquares]
 )
 def test_arguments(estimator):
-    with pytest.raises(ValueError, match="`covariance` to be 'sandwich', 'hac' or 'homoscedastic' but got 'iid'"):
+    with pytest.raises(ValueError, match=r"`covariance` .*'sandwich', 'hac' or 'homoscedastic'.* got 'iid'"):
         estimator(covariance="iid")
     with pytest.raises(ValueError, match="`bandwidth`"):
         estimator(bandwidth=-1.0)

@@ -456,7 +456,7 @@ def test_negative_weights_and_a_narrow_bound_are_refused():
     weight[5] = -1.0
     with pytest.raises(ValueError, match="`sample_weight` to be >= 0"):
         MKCRegression().fit(X, y, weight)
-    with pytest.raises(ValueError, match="`bound` to be at least two robust scales"):
+    with pytest.raises(ValueError, match=r"`bound` .*two robust scales"):
         MKCRegression(bound=0.1).fit(X, y)
 
 

@@ -308,9 +308,9 @@ def test_input_without_an_answer_is_refused():
     X, y = problem(17)
     with pytest.raises(RankDeficientError):
         LeastEntropyLike().fit(torch.cat([X, X[:, :1]], 1), y)
-    with pytest.raises(ValueError, match="at least 5 values for 3 coefficients but got 4"):
+    with pytest.raises(ValueError, match=r"at least 5 .*3 coefficients.* got 4"):
         LeastEntropyLike().fit(X[:4], y[:4])
-    with pytest.raises(ValueError, match="at least 5 values for 3 coefficients but got 4"):
+    with pytest.raises(ValueError, match=r"at least 5 .*3 coefficients.* got 4"):
         LeastEntropyLike().fit(X, y, (torch.arange(60) < 4).double())
     with pytest.raises(ValueError, match="count repetitions"):
         LeastEntropyLike().fit(X, y, torch.full((60,), 1 / 60).double())

@@ -157,7 +157,7 @@ def test_rows_in_a_hyperplane_do_no_harm():
 
 @pytest.mark.parametrize("h", [1, 3, 41])
 def test_a_quantile_out_of_range_is_refused(h):
-    with pytest.raises(ValueError, match=r"`h` between 4 and the 40 samples but got"):
+    with pytest.raises(ValueError, match=r"`h` .*4 .*40 samples.* got"):
         LeastMedianOfSquares(h).fit(sample(0, 40, 3), sample(1, 40))
 
 

@@ -161,7 +161,7 @@ def test_ridge_of_channels_and_batches():
 
 @pytest.mark.parametrize("alpha", [-1.0, float("nan")])
 def test_ridge_refuses_a_bad_alpha(alpha):
-    with pytest.raises(ValueError, match=f"`alpha` to be >= 0 and finite but got {alpha}"):
+    with pytest.raises(ValueError, match=rf"`alpha` .*>= 0.*finite.* got {alpha}"):
         Ridge(alpha=alpha)
 
 
@@ -187,7 +187,7 @@ def test_predict_on_another_number_of_samples():
 
 def test_predict_refuses_another_number_of_columns():
     fit = LeastSquares().fit(sample(0, 30, 4), sample(1, 30))
-    with pytest.raises(ValueError, match="`X` with 4 columns in its last dimension but got 3"):
+    with pytest.raises(ValueError, match=r"`X` .*4 columns.* got 3"):
         fit.predict(sample(0, 30, 3))
 
 

@@ -118,7 +118,7 @@ def test_the_least_coverage_is_one_sample_more_than_coefficients():
     assert int(LeastTrimmedSquares(h=3).fit(X, y).weights_.sum()) == 3
     assert int(LeastTrimmedSquares(h=9).fit(X, y).weights_.sum()) == 9
     for h in (2, 10):
-        with pytest.raises(ValueError, match=f"`h` between 3 and the 9 samples but got {h}"):
+        with pytest.raises(ValueError, match=rf"`h` .*3 .*9 samples.* got {h}"):
             LeastTrimmedSquares(h=h).fit(X, y)
 
 
@@ -295,7 +295,7 @@ def test_a_channel_fitted_exactly_does_not_hide_the_others():
 
 @pytest.mark.parametrize("h", [1, 3, 41])
 def test_a_coverage_out_of_range_is_refused(h):
-    with pytest.raises(ValueError, match=r"`h` between 4 and the 40 samples but got"):
+    with pytest.raises(ValueError, match=r"`h` .*4 .*40 samples.* got"):
         LeastTrimmedSquares(h=h).fit(*contaminated_line(0))
 
 

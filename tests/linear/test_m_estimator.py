@@ -134,9 +134,7 @@ def test_too_few_iterations_are_not_called_converged():
 
 def test_a_median_of_fewer_than_twice_the_coefficients_is_refused():
     X, y = sample(0, 7, 4), sample(1, 7)
-    with pytest.raises(
-        ValueError, match="at least 8 samples for `scale='mad'` with 4 coefficients a channel but got 7"
-    ):
+    with pytest.raises(ValueError, match=r"at least 8 samples .*`scale='mad'`.*4 coefficients.* got 7"):
         MEstimator().fit(X, y)
     weight = torch.ones(9).double()
     weight[7:] = 0.0

@@ -198,7 +198,7 @@ def test_columns_dependent_on_the_samples_in_use_are_named():
 def test_zero_column_is_named():
     X = sample(0, 20, 3)
     X[:, 1] = 0.0
-    with pytest.raises(RankDeficientError, match="Column 1 of `X` is zero on every sample in use; remove it"):
+    with pytest.raises(RankDeficientError, match=r"Column 1 of `X` .*zero.*; remove"):
         linear_problem(X, sample(1, 20))
 
 
@@ -206,7 +206,7 @@ def test_column_that_is_zero_on_the_samples_in_use_is_named():
     X = sample(0, 20, 3)
     X[5:, 2] = 0.0
     weight = (torch.arange(20) >= 5).double()
-    with pytest.raises(RankDeficientError, match="Column 2 of `X` is zero on every sample in use"):
+    with pytest.raises(RankDeficientError, match=r"Column 2 of `X` .*zero"):
         linear_problem(X, sample(1, 20), weight)
 
 
@@ -217,7 +217,7 @@ def test_fewer_weighted_samples_than_coefficients_raise():
 
 
 def test_fewer_values_than_coefficients_raise():
-    with pytest.raises(ValueError, match="at least 4 values for 4 coefficients but got 3 samples x 1; add samples"):
+    with pytest.raises(ValueError, match=r"at least 4 .*4 coefficients.* got 3 samples x 1; add samples"):
         linear_problem(sample(0, 3, 4), sample(1, 3))
 
 
@@ -230,11 +230,11 @@ def test_values_that_are_not_finite_are_named_with_their_index(value):
     X, Y, weight = sample(0, 20, 3), sample(1, 20), torch.ones(20).double()
     bad_X, bad_Y, bad_weight = X.clone(), Y.clone(), weight.clone()
     bad_X[4, 0, ...] = bad_Y[7] = bad_weight[9] = value
-    with pytest.raises(ValueError, match=rf"`X` to be finite but got {value} at index \(4, 0, 0\) \(1 such values\)"):
+    with pytest.raises(ValueError, match=rf"`X` .*finite.* got {value} at index \(4, 0, 0\)"):
         linear_problem(bad_X.unsqueeze(-2), Y.unsqueeze(-1))
-    with pytest.raises(ValueError, match=rf"`Y` to be finite but got {value} at index \(7, 0\) \(1 such values\)"):
+    with pytest.raises(ValueError, match=rf"`Y` .*finite.* got {value} at index \(7, 0\)"):
         linear_problem(X.unsqueeze(-2), bad_Y.unsqueeze(-1))
-    with pytest.raises(ValueError, match=rf"`sample_weight` to be finite but got {value} at index \(9, 0\)"):
+    with pytest.raises(ValueError, match=rf"`sample_weight` .*finite.* got {value} at index \(9, 0\)"):
         linear_problem(X, Y, bad_weight)
 
 
@@ -248,12 +248,12 @@ def test_integer_dtype_raises(name):
 
 
 def test_other_types_raise():
-    with pytest.raises(TypeError, match="`Y` to be a real floating-point tensor but got list"):
+    with pytest.raises(TypeError, match=r"`Y` .*tensor.* got list"):
         linear_problem(sample(0, 2, 1), [1.0, 2.0])
 
 
 def test_different_dtypes_raise():
-    with pytest.raises(TypeError, match=r"share dtype and device but got torch\.float64 on cpu and torch\.float32"):
+    with pytest.raises(TypeError, match=r"dtype and device .*torch\.float64 on cpu and torch\.float32"):
         linear_problem(sample(0, 20, 3), sample(1, 20).float())
 
 
@@ -278,9 +278,9 @@ def test_shapes_that_do_not_fit_are_shown(x_shape, y_shape, shown):
 
 
 def test_empty_input_raises():
-    with pytest.raises(ValueError, match="at least one sample and one column"):
+    with pytest.raises(ValueError, match=r"one sample and one column"):
         linear_problem(sample(0, 0, 3), sample(1, 0))
-    with pytest.raises(ValueError, match="at least one sample and one column"):
+    with pytest.raises(ValueError, match=r"one sample and one column"):
         linear_problem(sample(0, 20, 0), sample(1, 20))
 
 
@@ -293,12 +293,12 @@ def test_weight_of_a_bad_shape_raises(shape):
 def test_negative_weight_raises():
     weight = torch.ones(20).double()
     weight[3] = -0.5
-    with pytest.raises(ValueError, match=r"`sample_weight` to be >= 0 but got -0\.5"):
+    with pytest.raises(ValueError, match=r"`sample_weight` .*>= 0.* got -0\.5"):
         linear_problem(sample(0, 20, 3), sample(1, 20), weight)
 
 
 def test_weights_all_zero_in_a_channel_raise():
     weight = torch.ones(20, 2).double()
     weight[:, 1] = 0.0
-    with pytest.raises(ValueError, match="`sample_weight` to be positive somewhere in every channel"):
+    with pytest.raises(ValueError, match=r"`sample_weight` .*positive.*every channel"):
         linear_problem(sample(0, 20, 2, 3), sample(1, 20, 2), weight)

@@ -247,5 +247,5 @@ def test_what_cannot_be_fitted_is_refused(case, device):
     if case.name not in DETERMINED_BY_PRIOR:
         with pytest.raises(RankDeficientError, match="linearly dependent"):
             estimator.fit(torch.cat([X, X[:, :1]], 1), y)
-        with pytest.raises(ValueError, match="at least 3 values for 3 coefficients"):
+        with pytest.raises(ValueError, match=r"at least 3 .*3 coefficients"):
             estimator.fit(X[:2], y[:2])

@@ -237,7 +237,7 @@ def test_the_scale_is_zero_only_where_the_exact_fit_holds_for_enough():
 
 @pytest.mark.parametrize("breakdown", [0.0, 0.51])
 def test_a_breakdown_point_out_of_range_is_refused(breakdown):
-    with pytest.raises(ValueError, match=rf"`breakdown` to be in \[0\.01, 0\.5\] but got {breakdown}"):
+    with pytest.raises(ValueError, match=rf"`breakdown` .*\[0\.01, 0\.5\].* got {breakdown}"):
         SRegression(breakdown=breakdown)
 
 

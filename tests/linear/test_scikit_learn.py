@@ -162,11 +162,11 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(NotFittedError):
         ScikitLearnRegressor().predict(X)
     for estimator in (LinearRegression(), "mm", MMRegression):
-        with pytest.raises(TypeError, match=r"`estimator` to be an estimator of mkc_torch\.linear but got"):
+        with pytest.raises(TypeError, match=r"`estimator` .*mkc_torch\.linear.* got"):
             ScikitLearnRegressor(estimator).fit(X, y)
     with pytest.raises(ValueError, match="minimum of 2 is required"):
         ScikitLearnRegressor().fit(X[:1], y[:1])
-    with pytest.raises(ValueError, match="at least 4 values for 4 coefficients but got 3 samples"):
+    with pytest.raises(ValueError, match=r"at least 4 .*4 coefficients.* got 3 samples"):
         ScikitLearnRegressor().fit(X[:3], y[:3])
     X[:, 1] = 2.0
     with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] .* Column 3 is the constant column"):

@@ -354,14 +354,14 @@ def test_a_state_resumes_only_with_its_data_and_parameters(tmp_path):
         StreamedMKCRegression(pilot=200).fit(cut(X[1:], Y[1:]), checkpoint=path)
     other = Y.clone()
     other[7] += 1.0
-    with pytest.raises(StreamChangedError, match="the same values in every pass"):
+    with pytest.raises(StreamChangedError, match=r"same values.*every pass"):
         StreamedMKCRegression(pilot=200).fit(cut(X, other), checkpoint=path)
-    with pytest.raises(ValueError, match="every batch like the first, 3 columns without weights"):
+    with pytest.raises(ValueError, match=r"batch.*first, 3 columns without weights"):
         StreamedMKCRegression(pilot=200).fit(cut(X[:, :2], Y), checkpoint=path)
-    with pytest.raises(ValueError, match="`pilot` as in the saved state, 200, but got 300"):
+    with pytest.raises(ValueError, match=r"`pilot` .*200, .*got 300"):
         StreamedMKCRegression(pilot=300).fit(cut(X, Y), checkpoint=path)
     path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="`checkpoint` to be a checkpoint of StreamedMKCRegression"):
+    with pytest.raises(ValueError, match=r"`checkpoint` .*StreamedMKCRegression"):
         StreamedMKCRegression(pilot=200).fit(cut(X, Y), checkpoint=path)
     with pytest.raises(ValueError, match="Expected a state of StreamedMKCRegression"):
         StreamedMKCRegression().load_state_dict({"format": 0})
@@ -412,12 +412,12 @@ def test_bad_values_are_named_by_batch_and_row():
     X, Y = problem(0)
     for name, where in (("X", X[:, 1]), ("Y", Y)):
         value, where[210] = where[210].clone(), math.nan
-        with pytest.raises(ValueError, match=f"`{name}` to be finite but got nan in row 16 of batch 2"):
+        with pytest.raises(ValueError, match=rf"`{name}` .*finite.* got nan in row 16 of batch 2"):
             StreamedMKCRegression().fit(cut(X, Y))
         where[210] = value
     weight = torch.ones(len(X)).double()
     weight[300] = -1.0
-    with pytest.raises(ValueError, match=r"`weight` to be finite and >= 0 but got -1.0 in row 9 of batch 3"):
+    with pytest.raises(ValueError, match=r"`weight` .*finite.*>= 0.* got -1\.0 in row 9 of batch 3"):
         StreamedMKCRegression().fit(cut(X, Y, weight))
 
 
@@ -425,7 +425,7 @@ def test_batches_that_do_not_fit():
     X, Y = problem(0)
     pairs = cut(X, Y)
     fit = StreamedMKCRegression()
-    with pytest.raises(ValueError, match="3 columns without weights, but got 2 columns without weights in batch 5"):
+    with pytest.raises(ValueError, match=r"3 columns without weights.* got 2 columns without weights in batch 5"):
         fit.fit([*pairs, (X[:, :2], Y)])
     with pytest.raises(ValueError, match="3 columns with weights in batch 5"):
         fit.fit([*pairs, (X, Y, Y.abs())])
@@ -444,7 +444,7 @@ def test_batches_that_do_not_fit():
     for nothing in ([], [(X[:0], Y[:0])]):
         with pytest.raises(ValueError, match="to have rows but got none"):
             fit.fit(nothing)
-    with pytest.raises(ValueError, match="Expected at least 3 values for 3 coefficients"):
+    with pytest.raises(ValueError, match=r"at least 3 .*3 coefficients"):
         fit.fit([(X[:2], Y[:2])])
     with pytest.raises(ValueError, match="weights to be positive somewhere"):
         fit.fit([(X, Y, torch.zeros_like(Y))])

@@ -88,11 +88,11 @@ def test_a_missing_value_is_named(tmp_path):
 
     gap = pa.table({"a": [1.0, 2.0, None, 4.0], "y": [1, 2, 3, 5], "name": list("wxyz")})
     write_table(gap, tmp_path / "gap.parquet")
-    with pytest.raises(ValueError, match="`X` to be finite but got nan in row 2 of batch 0"):
+    with pytest.raises(ValueError, match=r"`X` .*finite.* got nan in row 2 of batch 0"):
         StreamedMKCRegression().fit(from_parquet(tmp_path / "gap.parquet", ["a"], "y"))
-    with pytest.raises(TypeError, match=r"column `name` of .* to hold real numbers but got string"):
+    with pytest.raises(TypeError, match=r"column `name` .*real numbers.* got string"):
         from_parquet(tmp_path / "gap.parquet", ["name"], "y")
-    with pytest.raises(ValueError, match="to have a column `b` but got `a`, `y`, `name`"):
+    with pytest.raises(ValueError, match=r"column `b` .*got `a`, `y`, `name`"):
         from_parquet(tmp_path / "gap.parquet", ["b"], "y")
 
 
@@ -109,7 +109,7 @@ def test_columns_that_do_not_fit(tmp_path):
     path = tmp_path / "table.parquet"
     with pytest.raises(TypeError, match=r"write \('a',\)"):
         from_parquet(path, "a", "y")
-    with pytest.raises(TypeError, match="a list of names for each of the 1 targets"):
+    with pytest.raises(TypeError, match=r"names .*1 targets"):
         from_parquet(path, ["a"], ["y"])
     with pytest.raises(ValueError, match="2 lists of equal length"):
         from_parquet(path, [["a"], ["a", "b"]], ["y", "z"])
@@ -133,9 +133,9 @@ def test_without_pyarrow_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_arrays_that_do_not_fit(table):
-    with pytest.raises(TypeError, match="`Y` to be a NumPy array or memmap"):
+    with pytest.raises(TypeError, match=r"`Y` .*NumPy array.*memmap"):
         from_memmap(table, torch.ones(3))
-    with pytest.raises(ValueError, match="`Y` of as many rows as `X`, 1000, but got 999"):
+    with pytest.raises(ValueError, match=r"`Y` .*rows.*`X`, 1000, .*got 999"):
         from_memmap(table[:, :3], table[1:, 3])
     with pytest.raises(ValueError, match="`rows`"):
         from_memmap(table[:, :3], table[:, 3], rows=0)

@@ -176,7 +176,7 @@ def test_the_picture_of_an_error_added_to_a_batch():
 @pytest.mark.parametrize(
     ("batch", "error", "message"),
     [
-        (torch.zeros(5), ValueError, "`batch` to hold an error that is not 0 but got zeros alone"),
+        (torch.zeros(5), ValueError, "`batch` .* not 0 but got only zeros"),
         (torch.zeros(0), ValueError, "`batch` to hold an error that is not 0 but got none"),
         (torch.tensor([1.0, math.nan]), ValueError, "`batch` .*finite"),
         ([1.0], TypeError, "`batch` to be"),

@@ -50,7 +50,7 @@ def test_a_relative_path(file, monkeypatch):
     ("source", "words"),
     [
         ("my.py", "defines 2 simulations; give --simulation my.py:Decay or"),
-        ("my.txt:Decay", "names no simulation"),
+        ("my.txt:Decay", "does not name a simulation"),
         ("other.py:Decay", "there is no such file"),
         ("my.py:Missing", "defines no `Missing`; simulations in it: Decay, ready."),
         ("my.py:NUMBER", "`NUMBER` is not a simulation"),

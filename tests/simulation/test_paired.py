@@ -168,7 +168,7 @@ def test_columns_that_are_the_same_are_inputs():
     assert prepared.channels == ("y",)
     assert "torque" in prepared.recording
     assert "`torque` is the same in both tables" in prepared.warnings[0]
-    with pytest.raises(SimulationError, match="are the same in the recording and in what was simulated"):
+    with pytest.raises(SimulationError, match="are the same in the recording and the simulated table"):
         Paired(same).prepare(same)
 
 
@@ -200,7 +200,9 @@ def test_samples_outside_the_simulated_times_are_excluded():
 
 
 def test_tables_without_common_times_or_columns_are_refused():
-    with pytest.raises(SimulationError, match=r"REC and SIM do not meet in time: 0 to 19.95 s was recorded, 100 to "):
+    with pytest.raises(
+        SimulationError, match=r"REC and SIM do not overlap in time: 0 to 19.95 s was recorded, 100 to "
+    ):
         Paired(simulator(first=100.0, last=120.0)).prepare(recorded(signal(times())))
     with pytest.raises(SimulationError, match=r"no column in common to compare: z there, y here. Rename"):
         Paired(simulator()).prepare(Recording({"time": times(), "z": times()}, name="REC"))
@@ -220,7 +222,7 @@ def test_tables_without_common_times_or_columns_are_refused():
         Paired(simulator()).prepare("REC.csv")
     with pytest.raises(TypeError, match=r"`outputs`.*tuple of names of columns.*got 'y'; write \('y',\)"):
         Paired(simulator(), outputs="y")
-    with pytest.raises(ValueError, match=r"`outputs` to name a column.*got none; None takes all in common"):
+    with pytest.raises(ValueError, match=r"`outputs` to name a column.*got none; None compares all common columns"):
         Paired(simulator(), outputs=())
-    with pytest.raises(SimulationError, match="run of one moment"):
+    with pytest.raises(SimulationError, match="run of one sample"):
         Paired(Recording({"time": torch.zeros(1), "y": torch.zeros(1)})).prepare(recorded(signal(times())))

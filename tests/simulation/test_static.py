@@ -111,7 +111,7 @@ def test_parameters_that_the_data_cannot_determine_are_named():
             return {"voltage": p.upper / p.lower * u.current}
 
     warnings = " ".join(Divider().prepare(recording()).warnings)
-    assert "does not determine `upper` and `lower`, but only what they are together" in warnings
+    assert "does not determine `upper` and `lower` separately" in warnings
     assert "direction 0.71 upper + 0.71 lower" in warnings
     assert "does not determine `unused`" in warnings
     assert Thermistor().prepare(recording()).warnings == ()

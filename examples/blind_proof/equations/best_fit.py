@@ -12,13 +12,7 @@ from torch import Generator
 from examples.blind_proof.draws import normal
 from examples.blind_proof.equations.integrate import between
 from examples.blind_proof.equations.plant import Array, Plant, Rate, RunSet
-from examples.blind_proof.equations.simulations import (
-    WRONG_SIGN,
-    class_of,
-    parameters_of,
-    right_source,
-    wrong_source,
-)
+from examples.blind_proof.equations.simulations import WRONG_SIGN, class_of, parameters_of, right_source, wrong_source
 
 _TRIED = 8
 """Number of starts, which are fitted in parallel."""

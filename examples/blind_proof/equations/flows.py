@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from examples.blind_proof.equations.forces import added
+from examples.blind_proof.equations.forces import acting, added
 from examples.blind_proof.equations.plant import Array, RateChange
 
 ZERO = 273.15
@@ -36,15 +36,12 @@ def forchheimer(head: Array, bend: float) -> Array:
 def exchange(first: int, second: int, flow: Callable[[Array], Array], ratio: float) -> RateChange:
     """A flow from the higher state to the lower, by their difference; the second changes by ``-ratio`` times it."""
 
-    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
+    def force(x: Array, _: Array, size: Array) -> Sequence[Array]:
         away = x[second] - x[first]
         passed = size * np.sign(away) * flow(np.abs(away))
-        rates = known.copy()
-        rates[first] += passed
-        rates[second] -= ratio * passed
-        return rates, z
+        return passed, -ratio * passed
 
-    return change
+    return acting((first, second), force)
 
 
 def tap(row: int, head: float) -> RateChange:

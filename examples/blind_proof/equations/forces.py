@@ -100,10 +100,7 @@ def hardening(row: int, position: int, reach: float) -> RateChange:
 
 def felt(row: int, position: int, reach: float, power: float) -> RateChange:
     """A spring of felt: a power of the deflection, linear below a tenth of ``reach``."""
-    return added(
-        row,
-        lambda x, _: -x[position] / reach * ((x[position] / reach) ** 2 + 0.01) ** (0.5 * (power - 1.0)),
-    )
+    return added(row, lambda x, _: -x[position] / reach * ((x[position] / reach) ** 2 + 0.01) ** (0.5 * (power - 1.0)))
 
 
 def contact(row: int, position: int, place: float, ways: tuple[float, ...]) -> RateChange:

@@ -41,22 +41,17 @@ def rate_of(state: str) -> str:
 @drawn_for
 def dry_friction(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
     form = bristles(scene.plant.row(speed), uniform(g, 0.008, 0.015) * scene.largest(position), scene.typical(speed))
-    return HiddenTerm(
-        "coulomb_friction", "LuGre without a rise", (rate_of(speed),), 0.5 * scene.pace(speed), form, own=1
-    )
+    large = 0.5 * scene.pace(speed)
+    return HiddenTerm("coulomb_friction", "LuGre without a rise", (rate_of(speed),), large, form, own=1)
 
 
 @drawn_for
 def sticking_friction(g: Generator, scene: SystemScene, speed: str, position: str) -> HiddenTerm:
-    form = bristles(
-        scene.plant.row(speed),
-        uniform(g, 0.008, 0.015) * scene.largest(position),
-        uniform(g, 0.3, 0.8) * scene.typical(speed),
-        rise=uniform(g, 1.0, 2.5),
-    )
-    return HiddenTerm(
-        "stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), 0.4 * scene.pace(speed), form, own=1
-    )
+    deflection = uniform(g, 0.008, 0.015) * scene.largest(position)
+    slow = uniform(g, 0.3, 0.8) * scene.typical(speed)
+    form = bristles(scene.plant.row(speed), deflection, slow, rise=uniform(g, 1.0, 2.5))
+    large = 0.4 * scene.pace(speed)
+    return HiddenTerm("stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), large, form, own=1)
 
 
 @drawn_for
@@ -87,16 +82,10 @@ def bumper(g: Generator, scene: SystemScene, speed: str, position: str) -> Hidde
 
 @drawn_for
 def magnets(g: Generator, scene: SystemScene, speed: str, angle: str, orders: tuple[int, ...]) -> HiddenTerm:
-    form = forces.cogging(
-        scene.plant.row(speed),
-        scene.plant.row(angle),
-        choose(g, orders),
-        uniform(g, 0.0, 2.0 * math.pi),
-        uniform(g, 0.1, 0.25),
-    )
-    return HiddenTerm(
-        "position_periodic_force", "cogging, second harmonic", (rate_of(speed),), 0.7 * scene.pace(speed), form
-    )
+    order, phase, second = choose(g, orders), uniform(g, 0.0, 2.0 * math.pi), uniform(g, 0.1, 0.25)
+    form = forces.cogging(scene.plant.row(speed), scene.plant.row(angle), order, phase, second)
+    large = 0.7 * scene.pace(speed)
+    return HiddenTerm("position_periodic_force", "cogging, second harmonic", (rate_of(speed),), large, form)
 
 
 @drawn_for
@@ -117,20 +106,23 @@ def _at_input(scene: SystemScene, name: str, effect: str, form: str, large: floa
     return HiddenTerm(effect, form, (f"input {name}",), large, inputs=changed)
 
 
+def late(g: Generator) -> tuple[str, SignalChange]:
+    """Draw the form of a delay, and the change that it makes."""
+    if happens(g, 0.5):
+        return "transport", transducers.transport
+    return "four lags in series", transducers.lags(4)
+
+
 @drawn_for
 def late_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
-    pipe = happens(g, 0.5)
-    change = transducers.transport if pipe else transducers.lags(4)
-    return _at_input(
-        scene, name, "input_delay", "transport" if pipe else "four lags in series", 0.05 * scene.length, change
-    )
+    form, change = late(g)
+    return _at_input(scene, name, "input_delay", form, 0.05 * scene.length, change)
 
 
 @drawn_for
 def slow_actuator(g: Generator, scene: SystemScene, name: str) -> HiddenTerm:
-    return _at_input(
-        scene, name, "input_lag", "two lags, of which one is short", 0.05 * scene.length, transducers.follower
-    )
+    form = "two lags, of which one is short"
+    return _at_input(scene, name, "input_lag", form, 0.05 * scene.length, transducers.follower)
 
 
 @drawn_for
@@ -199,13 +191,8 @@ def second_mass(g: Generator, scene: SystemScene, speed: str, name: str) -> Hidd
 
 @drawn_for
 def slow_sensor(g: Generator, scene: SystemScene) -> HiddenTerm:
-    return HiddenTerm(
-        "sensor_lag",
-        "two lags in series",
-        scene.plant.outputs,
-        0.03 * scene.length,
-        outputs=transducers.housing,
-    )
+    large, outputs = 0.03 * scene.length, scene.plant.outputs
+    return HiddenTerm("sensor_lag", "two lags in series", outputs, large, outputs=transducers.housing)
 
 
 @drawn_for
@@ -221,9 +208,8 @@ def full_vessel(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
 def gravel_leak(g: Generator, scene: SystemScene, level: str) -> HiddenTerm:
     typical = scene.typical(level)
     form = flows.seepage(scene.plant.row(level), uniform(g, 0.0, 0.3) / typical)
-    return HiddenTerm(
-        "linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), scene.pace(level) / typical, form
-    )
+    large = scene.pace(level) / typical
+    return HiddenTerm("linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), large, form)
 
 
 @drawn_for

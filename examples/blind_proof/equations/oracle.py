@@ -10,7 +10,7 @@ is twice the log-likelihood gain of the own form over the rival, in nats.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -75,10 +75,11 @@ def tangents(scene: SystemScene, errors: Whitening, *, rivals: bool) -> Whitened
         rivals: whether to include the rival forms.
     """
     plant, trial, x, u = scene.plant, scene.trial, scene.course.states, scene.course.inputs
-    if plant.reads is not None:
+    if (reads := plant.reads) is not None:
         read = readings(scene) if rivals else []
         forms = [(form, errors.whitened(form.outputs)) for form in read if form.outputs is not None]
-        return WhitenedTangents(errors.whitened(_readings_by_parameters(plant, u)), forms)
+        columns = _differences(lambda parameters: reads(u, parameters), plant.values)
+        return WhitenedTangents(errors.whitened(np.stack(columns, -1)[:, :: plant.fine]), forms)
     n, p, runs = len(plant.states), len(plant.parameters), trial.runs
     found = rival_forms(scene, _by_inputs(plant, x, u)) if rivals else []
     forced = [form.forcing for form in found if form.forcing is not None]
@@ -103,49 +104,30 @@ def tangents(scene: SystemScene, errors: Whitening, *, rivals: bool) -> Whitened
 
 
 def jacobian_by_states(plant: Plant, x: Array, u: Array) -> Array:
-    """Return the Jacobian (n, n, F, R) of the rates, by central differences."""
-    p = plant.values
-    scale = np.abs(x).max((1, 2)) + 1e-9
-    columns = []
-    for k in range(len(x)):
-        away = np.zeros_like(x)
-        away[k] = 1e-6 * scale[k]
-        columns.append((plant.rate(x + away, u, p) - plant.rate(x - away, u, p)) / (2e-6 * scale[k]))
-    return np.stack(columns, 1)
+    """Return the Jacobian (n, n, F, R) of the rates."""
+    return np.stack(_differences(lambda states: plant.rate(states, u, plant.values), x), 1)
 
 
 def _by_inputs(plant: Plant, x: Array, u: Array) -> Array:
-    """Return the derivatives of the rates by the inputs (n, k, F, R), by central differences."""
-    if not len(u):
-        return np.zeros((len(x), *u.shape))
-    columns = []
-    for k in range(len(u)):
-        away = np.zeros_like(u)
-        away[k] = step = 1e-6 * (np.abs(u[k]).max() + 1e-9)
-        columns.append((plant.rate(x, u + away, plant.values) - plant.rate(x, u - away, plant.values)) / (2.0 * step))
-    return np.stack(columns, 1)
+    """Return the derivatives of the rates by the inputs (n, k, F, R)."""
+    columns = _differences(lambda inputs: plant.rate(x, inputs, plant.values), u)
+    return np.stack(columns, 1) if columns else np.zeros((len(x), *u.shape))
 
 
 def _by_parameters(plant: Plant, x: Array, u: Array) -> Array:
-    """Return the derivatives of the rates by the parameters (n, F, R, p), by central differences."""
-    p = plant.values
-    columns = []
-    for k in range(len(p)):
-        away = np.zeros_like(p)
-        away[k] = 1e-6 * (abs(p[k]) + 1e-9)
-        columns.append((plant.rate(x, u, p + away) - plant.rate(x, u, p - away)) / (2.0 * away[k]))
+    """Return the derivatives of the rates by the parameters (n, F, R, p)."""
+    columns = _differences(lambda parameters: plant.rate(x, u, parameters), plant.values)
     return np.stack(columns, -1) if columns else np.zeros((*x.shape, 0))
 
 
-def _readings_by_parameters(plant: Plant, u: Array) -> Array:
-    """Return output derivatives (m, T, R, p) of a system without states, by central differences."""
-    assert plant.reads is not None
-    p, columns = plant.values, []
-    for k in range(len(p)):
-        away = np.zeros_like(p)
-        away[k] = 1e-6 * (abs(p[k]) + 1e-9)
-        columns.append((plant.reads(u, p + away) - plant.reads(u, p - away)) / (2.0 * away[k]))
-    return np.stack(columns, -1)[:, :: plant.fine]
+def _differences(function: Callable[[Array], Array], at: Array) -> list[Array]:
+    """Return the derivative of a function by each row of its argument, by central differences."""
+    columns = []
+    for k in range(len(at)):
+        away = np.zeros_like(at)
+        away[k] = step = 1e-6 * (np.abs(at[k]).max() + 1e-9)
+        columns.append((function(at + away) - function(at - away)) / (2.0 * step))
+    return columns
 
 
 def power(plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: Whitening) -> EffectPower:

@@ -163,7 +163,8 @@ def draw(scenario: str, seed: int, index: int, hidden: bool, number: int) -> Cas
         errors = replace(errors, slow=_slow(stream("slow"), plant, trial))
     disturbance = _disturbance(stream, scenario, index, hidden, scene, errors)
     rates = None if disturbance is None else disturbance.rates
-    name, simulation = f"{system}_{number:05d}", _simulation(stream, scenario, system)
+    name = f"{system}_{number:05d}"
+    simulation = right_source(class_of(system), far_starts(stream("starts")) if scenario == "far_starts" else None)
     if not hidden:
         course = scene.course if rates is None else simulate(plant, trial, disturbance=rates)
         return _case(stream, scenario, index, name, scene, course, errors, disturbance, simulation)
@@ -222,17 +223,11 @@ def _setting(stream: Callable[[str], Generator], scenario: str) -> tuple[str, Se
 
 
 def _trial(stream: Callable[[str], Generator], scenario: str, system: str, setting: Setting) -> RunSet:
-    if scenario == "runs":
-        g = stream("runs")
-        runs = draws.whole(g, *RUNS)
-        samples = setting.trial.samples * setting.trial.runs // runs
-        return SYSTEMS[system].trial(g, setting.plant, runs, samples)
-    if scenario in (LASTING_ALONE, LASTING_RUNS):
-        runs = 1 if scenario == LASTING_ALONE else LASTING_COUNT
-        return SYSTEMS[system].trial(
-            stream("runs"), setting.plant, runs, setting.trial.samples * setting.trial.runs // runs
-        )
-    return replace(setting.trial, held=scenario == "held")
+    if scenario not in ("runs", LASTING_ALONE, LASTING_RUNS):
+        return replace(setting.trial, held=scenario == "held")
+    g = stream("runs")
+    runs = draws.whole(g, *RUNS) if scenario == "runs" else 1 if scenario == LASTING_ALONE else LASTING_COUNT
+    return SYSTEMS[system].trial(g, setting.plant, runs, setting.trial.samples * setting.trial.runs // runs)
 
 
 def _errors(stream: Callable[[str], Generator], scenario: str, outputs: Array) -> Errors:
@@ -282,10 +277,6 @@ def _unrelated(g: Generator, system: str, scene: SystemScene) -> Array:
         for _ in range(trial.runs)
     ]
     return np.stack([middle[:, None] + path.numpy().T * reach[:, None] for path in paths], -1)
-
-
-def _simulation(stream: Callable[[str], Generator], scenario: str, system: str) -> str:
-    return right_source(class_of(system), far_starts(stream("starts")) if scenario == "far_starts" else None)
 
 
 def _case(

@@ -121,9 +121,8 @@ def draw(duration: float, seed: int, index: int, hidden: bool = True, number: in
 
     scene = draw_scene(stream("scene"), duration)
     kind, effects = draw_effects(stream("effect"), scene)
-    withheld = frozenset(
-        e.driver for e in effects if _can_be_withheld(e) and draws.happens(stream("withheld"), WITHHELD_SHARE)
-    )
+    can_be_withheld = [effect for effect in effects if effect.effect in ("temperature_offset", "current_field")]
+    withheld = frozenset(e.driver for e in can_be_withheld if draws.happens(stream("withheld"), WITHHELD_SHARE))
     needed = frozenset(effect.driver for effect in effects if effect.driver) - withheld
     noise, outliers = draw_noise(stream("noise"), len(scene.time), RATE), draw_outliers(stream("outliers"))
     plan = draw_plan(stream("plan"), needed, withheld)
@@ -279,10 +278,6 @@ def total_of(effects: Sequence[Hidden], sizes: Sequence[float], scene: Scene) ->
 def _into_range(values: Tensor, like: Tensor) -> Tensor:
     share = (values - values.min()) / (values.max() - values.min()).clamp(min=1e-12)
     return like.min() + (like.max() - like.min()) * share
-
-
-def _can_be_withheld(effect: Hidden) -> bool:
-    return effect.effect in ("temperature_offset", "current_field")
 
 
 def _drivers(effect: Hidden, plan: Plan) -> tuple[str, ...]:

@@ -123,7 +123,6 @@ def current_field(g: Generator, scene: Scene) -> Hidden:
     def trace(at: Scene) -> Tensor:
         return at.current[:, None] * (unit @ at.sensor.soft.mT)
 
-    del scene
     return Hidden("current_field", "two-wire loop", trace, 60.0, driver="current")
 
 
@@ -205,7 +204,6 @@ def cubic_nonlinearity(g: Generator, scene: Scene) -> Hidden:
         core = at.field @ at.sensor.soft.mT
         return -share * loss(core + at.sensor.hard if magnet else core, knee) / scale
 
-    del scene
     return Hidden("cubic_nonlinearity", f"{form}, {'with' if magnet else 'without'} the hard iron", trace, 3.0)
 
 
@@ -227,7 +225,6 @@ def mains_interference(g: Generator, scene: Scene) -> Hidden:
     def trace(at: Scene) -> Tensor:
         return torch.cos(2.0 * math.pi * frequency * at.time + phase)[:, None] * way
 
-    del scene
     return Hidden("mains_interference", "sinusoid", trace, 5.0)
 
 
@@ -240,7 +237,6 @@ def hysteresis(g: Generator, scene: Scene) -> Hidden:
         core = at.field @ at.sensor.soft.mT + at.sensor.hard
         return share * (play(core, width) - core) / width
 
-    del scene
     return Hidden("hysteresis", "play operator", trace, 3.0)
 
 

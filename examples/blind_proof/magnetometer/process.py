@@ -126,33 +126,6 @@ def whitened(
     return torch.from_numpy(out.reshape(-1, columns))
 
 
-def dense_covariance(
-    white: Float[Tensor, "N c"], gains: Float[Tensor, "N c s"], processes: Sequence[Process]
-) -> Float[Tensor, "N*c N*c"]:
-    """Return the covariance, for short series."""
-    count = len(white)
-    total = torch.diag(white.reshape(-1))
-    for k, process in enumerate(processes):
-        series = torch.from_numpy(_series_covariance(process, count))
-        g = gains[..., k]
-        total = total + torch.einsum("nc,nm,md->ncmd", g, series, g).reshape(total.shape)
-    return total
-
-
-def _series_covariance(process: Process, count: int) -> np.ndarray:
-    f, p = process.transition(), process.start()
-    drive = np.zeros_like(p)
-    drive[0, 0] = process.innovation**2
-    c = np.zeros((count, count))
-    for k in range(count):
-        ahead = p
-        for j in range(k, count):
-            c[k, j] = c[j, k] = ahead[0, 0]
-            ahead = f @ ahead
-        p = f @ p @ f.T + drive
-    return c
-
-
 def _stacked(processes: Sequence[Process]) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
     """Return the transition, the process noise, the initial covariance, and the place of each process in the state."""
     size = sum(len(process.coefficients) for process in processes)

@@ -73,8 +73,7 @@ def draw_sensor(g: Generator) -> SensorTruth:
 
 def draw_field(g: Generator) -> Float[Tensor, " 3"]:
     """Draw a field of 25-65 µT in any direction."""
-    size = uniform(g, 25.0, 65.0)
-    return size * torch.nn.functional.normalize(normal(g, 3), dim=0)
+    return uniform(g, 25.0, 65.0) * direction(g)
 
 
 def draw_temperature(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:

@@ -21,8 +21,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["chosen_by_place"]
-
 _MOST_OFF = 3.0 * SOFT_IRON
 """Largest relative difference of the circle's radius from the horizontal field of the place: three standard deviations
 of gains and soft iron."""

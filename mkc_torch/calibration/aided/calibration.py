@@ -37,8 +37,6 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["GYRO", "QUATERNION", "aided_calibration", "aids"]
-
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
 ACCEL = ("accel_x", "accel_y", "accel_z")
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")

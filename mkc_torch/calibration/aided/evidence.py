@@ -16,8 +16,6 @@ from mkc_torch.nonlinear import fit as nonlinear_fit
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedResponse", "judged"]
-
 _LEAST_INFLATION = 1.0
 """Smallest inflation of the samples' errors by autocorrelation."""
 
@@ -31,7 +29,6 @@ class FittedResponse:
         fit: the maximum likelihood fit of the MKC density, with the prior.
         covariance: covariance of the parameters, (p, p), by the autocorrelated errors of the samples and by the prior.
             Parameters that the samples do not determine have the variance of the prior.
-        prior_covariance: covariance of the prior, (p, p); very large for parameters without a prior.
         inflation: factor by which autocorrelation reduces the effective number of samples.
         evidence: log evidence, the log probability of the measurements averaged over the prior, in nats, by Laplace's
             approximation. Only comparable at equal bounds.
@@ -40,7 +37,6 @@ class FittedResponse:
     model: Model
     fit: NonlinearFit
     covariance: Float[Tensor, "p p"]
-    prior_covariance: Float[Tensor, "p p"]
     inflation: float
     evidence: float
 
@@ -104,11 +100,4 @@ def judged(
     # parameters without a prior are free in every response, and cancel
     volume = torch.linalg.slogdet(precision)[1] - torch.linalg.slogdet(counted)[1]
     evidence = likelihood - 0.5 * float(far @ precision @ far) + 0.5 * float(volume)
-    return FittedResponse(
-        model,
-        fit,
-        sampled + times**2 * inverse @ precision @ inverse,
-        torch.linalg.inv(precision),
-        found,
-        evidence,
-    )
+    return FittedResponse(model, fit, sampled + times**2 * inverse @ precision @ inverse, found, evidence)

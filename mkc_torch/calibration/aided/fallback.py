@@ -15,27 +15,21 @@ from mkc_torch.calibration.result import Calibration
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.recording.recording import Recording, RecordingError
 
-__all__ = ["with_aid"]
-
 _GROUND = 0.01
-"""Standard deviation of the local anomaly by rock and buildings: of the field, as a share, and of its inclination, in
-rad."""
+"""Standard deviation of the local anomaly of rock and buildings: of the field's length, relative; and of its
+inclination, in rad."""
 
 _MANY = 0.2
-"""Share of rejected samples above which a warning questions the model of a constant sensor."""
+"""Share of rejected samples above which there is a warning that the sensor may have changed."""
 
 _OTHER = 0.15
 """Relative difference from the place's field above which there is a warning; gains differ by a few per cent."""
 
 
 def with_aid(
-    usable: Recording,
-    refusal: NotIdentifiableError,
-    *,
-    field_strength: float | None = None,
-    earth: Field | None = None,
+    usable: Recording, refusal: NotIdentifiableError, *, field_strength: float | None = None, earth: Field | None = None
 ) -> Calibration:
-    """Calibrate by an attitude, a gyroscope or the place's field, with a warning that gives the reason.
+    """Calibrate by an attitude, a gyroscope or the field of the place; a note gives the reason.
 
     Args:
         usable: recording as prepared for a calibration.
@@ -91,7 +85,7 @@ def _taken(place: PlaceField) -> str:
 
 
 def _rejected(found: Calibration) -> tuple[str, ...]:
-    """A warning about many samples that the turns do not explain."""
+    """A warning if many samples do not fit the turns of the vehicle."""
     if found.rejected_share <= _MANY:
         return ()
     return (

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "z")
 
-__all__ = ["LAG", "Fault", "attitude_fault", "gyroscope_fault"]
-
 HALVES = 0.5
 """Largest residual after a correction, as a share of the residual before."""
 

@@ -13,8 +13,6 @@ from mkc_torch.calibration.aided.response import Model
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["heading_errors", "turning_axis"]
-
 _STEPS = 36
 """Number of headings of the level turn."""
 

@@ -17,8 +17,6 @@ from mkc_torch.nonlinear import GaussianPrior
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Circle", "LengthModel", "circle"]
-
 LEVEL = 0.035
 """Standard deviation of the angle between the axis of a vehicle's turns and the vertical, in rad: roads and rivers
 mostly slope by less than 3.5 %, and a boat leans as much in a turn."""

@@ -12,8 +12,6 @@ from mkc_torch._support.order_statistic import robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["misfit_of_attitude", "misfit_of_gyroscope", "robust_size", "stretches"]
-
 STRETCH = 20.0
 """Length in s of a stretch with its own offset, so that changes of the sensor's offset do not count as misfit."""
 

@@ -15,8 +15,6 @@ from mkc_torch.calibration.aided.turns import Turns
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Mounting", "exchanged", "mounting", "turned_by"]
-
 EXPLAINED = 0.08
 """Largest residual per axis, as a share of the field, of correct axes: twice that of soft iron of 10 %."""
 

@@ -7,8 +7,6 @@ import math
 import re
 from typing import NamedTuple
 
-__all__ = ["Field", "earth_field", "parsed_date", "parsed_place"]
-
 _FIRST = datetime.date(2015, 1, 1)
 """First date of the models in ahrs: those of 2015, 2020 and 2025, valid for five years each."""
 

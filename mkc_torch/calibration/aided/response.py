@@ -15,8 +15,6 @@ from mkc_torch.nonlinear import GaussianPrior
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ERRORS", "GYRO_BIAS", "SOFT_IRON", "Model", "ModelName", "PlaceField", "steady"]
-
 ModelName = Literal["offset", "offset and scale", "full matrix"]
 
 SOFT_IRON = 0.1

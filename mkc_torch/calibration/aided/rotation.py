@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["from_quaternion", "gaps", "rotated", "rotation_since", "turns"]
-
 _GAP = 5.0
 """Longest interval over which rates are integrated, in median intervals."""
 

@@ -20,8 +20,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["NAMES", "SelectedResponse", "rows_of", "select_response"]
-
 _MOST = 3000
 """Most samples of a fit, taken evenly; they determine the offset to a hundredth of the noise, and noise is not what
 limits it."""

@@ -12,8 +12,6 @@ from mkc_torch.calibration.aided.turns import Turns
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["offset_by_turns"]
-
 _ABSOLUTE = 15
 """Iterations of least absolute distances."""
 
@@ -29,10 +27,6 @@ def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float
 
     The measured field minus the offset is constant once it is rotated back, which gives linear equations for the
     offset. If the sensor only turns about a single axis, the offset along that axis is undetermined and set to 0.
-
-    Args:
-        measured: measurements in any unit.
-        turns: turns of the body.
 
     Returns:
         Offset (3,), length of the field, and median residual of a constant field, in the unit of the measurement.

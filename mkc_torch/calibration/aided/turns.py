@@ -15,8 +15,6 @@ from mkc_torch.calibration.aided.rotation import from_quaternion, gaps, rotation
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Turns", "still", "turns_of_attitude", "turns_of_gyroscope"]
-
 WINDOW = 10.0
 """Longest window of integrated rates, in s; the gyroscope's noise causes an error of 0.1° in it."""
 

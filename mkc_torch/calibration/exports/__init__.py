@@ -17,15 +17,7 @@ from mkc_torch.calibration.exports.json import JSON
 from mkc_torch.calibration.exports.px4 import PX4
 from mkc_torch.calibration.exports.ros_yaml import ROS_YAML
 
-__all__ = [
-    "EXPORTS",
-    "CurrentCoefficients",
-    "Destination",
-    "Export",
-    "ExportError",
-    "Exported",
-    "SensorCorrection",
-]
+__all__ = ["EXPORTS", "CurrentCoefficients", "Destination", "Export", "ExportError", "Exported", "SensorCorrection"]
 
 EXPORTS: dict[str, Export] = {export.name: export for export in (PX4, ARDUPILOT, C_HEADER, ROS_YAML, IMU_CALIB, JSON)}
 """All exports by their name on the command line."""

@@ -15,18 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mkc_torch.calibration.exports.base import (
-    MADE_BY,
-    Destination,
-    Export,
-    Exported,
-    ExportError,
-    SensorCorrection,
-)
+from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, ExportError, SensorCorrection
 from mkc_torch.calibration.exports.numbers import one_line, single, symmetric
 from mkc_torch.calibration.exports.units import Converted, converted
-
-__all__ = ["ARDUPILOT"]
 
 _INSTANCES = 3
 _SCALE = (1.0 / 1.5, 1.5)

@@ -10,8 +10,6 @@ from mkc_torch.calibration.field_covariance import field_covariance
 from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.result import Calibration
 
-__all__ = ["MADE_BY", "CurrentCoefficients", "Destination", "Export", "ExportError", "Exported", "SensorCorrection"]
-
 MADE_BY = "Made by mkc_torch"
 """Marker in every exported file, by which a later export recognises a file that it may replace."""
 

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, SensorCorrection
 from mkc_torch.calibration.exports.numbers import SMALLEST, not_held, one_line, single
 
-__all__ = ["C_HEADER"]
-
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
     """Write a correction as a header in its own units, for C99 and C++.

@@ -14,8 +14,6 @@ from mkc_torch._support.unit_text import ratio
 from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, ExportError, SensorCorrection
 from mkc_torch.calibration.exports.numbers import one_line, yaml_double
 
-__all__ = ["IMU_CALIB"]
-
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
     """Write the correction of an accelerometer.

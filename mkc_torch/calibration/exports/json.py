@@ -6,8 +6,6 @@ import json
 
 from mkc_torch.calibration.exports.base import Destination, Export, Exported, SensorCorrection
 
-__all__ = ["JSON", "SCHEMA"]
-
 SCHEMA = "mkc-export/1"
 
 

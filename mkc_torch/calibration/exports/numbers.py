@@ -8,8 +8,6 @@ import numpy as np
 
 from mkc_torch.calibration.exports.base import ExportError
 
-__all__ = ["SMALLEST", "not_held", "one_line", "single", "symmetric", "yaml_double"]
-
 SMALLEST = float(np.finfo(np.float32).tiny)
 """Smallest normal number of 32 bits."""
 

@@ -15,18 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mkc_torch.calibration.exports.base import (
-    MADE_BY,
-    Destination,
-    Export,
-    Exported,
-    ExportError,
-    SensorCorrection,
-)
+from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, ExportError, SensorCorrection
 from mkc_torch.calibration.exports.numbers import one_line, single, symmetric
 from mkc_torch.calibration.exports.units import converted
-
-__all__ = ["PX4"]
 
 _REAL32, _INT32 = 9, 6  # MAV_PARAM_TYPE
 _INSTANCES = 4

@@ -22,8 +22,6 @@ from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exp
 from mkc_torch.calibration.exports.numbers import one_line, yaml_double
 from mkc_torch.calibration.exports.units import converted
 
-__all__ = ["ROS_YAML"]
-
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
     """Write a correction as parameters.

@@ -9,8 +9,6 @@ import numpy as np
 from mkc_torch._support.unit_text import ratio
 from mkc_torch.calibration.exports.base import ExportError, SensorCorrection
 
-__all__ = ["Converted", "converted", "is_known", "unit_ratio"]
-
 _SPELT = {
     "gauss": ("gs", "ga", "gauß"),
     "mG": ("mgauss", "milligauss", "mga"),

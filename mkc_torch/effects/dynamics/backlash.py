@@ -14,8 +14,6 @@ from mkc_torch.effects.waveforms import played
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Backlash"]
-
 GAPS = (0.03, 0.06, 0.1, 0.2, 0.3)
 """Half the width of the gap, as shares of the largest input."""
 

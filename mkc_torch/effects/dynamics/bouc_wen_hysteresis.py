@@ -16,8 +16,6 @@ from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["BoucWenHysteresis", "hysteretic_path"]
-
 YIELDS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Deflections at which the force yields, as shares of the largest deflection."""
 

@@ -50,10 +50,7 @@ class ConstantForce(RateEffect):
             "There is a constant inflow or outflow.",
             "Look for a leak, an inflow that is not recorded, or a sensor's zero.",
         ),
-        "voltage": (
-            "A constant current charges or discharges.",
-            "Look for a bias current, a leak or a sensor's zero.",
-        ),
+        "voltage": ("A constant current charges or discharges.", "Look for a bias current, a leak or a sensor's zero."),
         "current": ("A constant voltage acts.", "Look for an offset voltage or a sensor's zero."),
         "pressure": (
             "There is a constant inflow or outflow.",

@@ -18,8 +18,6 @@ from mkc_torch.effects.runs import first_of_runs, linear_recurrence
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["HiddenMode", "spring_force"]
-
 PERIODS = 10
 """Number of periods to search, in a geometric series up to :data:`LONGEST`."""
 

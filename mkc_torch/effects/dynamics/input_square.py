@@ -14,8 +14,6 @@ from mkc_torch.effects.share import ShareEffect
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["InputSquare"]
-
 _SCALE = "scale_of_input"
 
 

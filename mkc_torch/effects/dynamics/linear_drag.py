@@ -50,14 +50,8 @@ class LinearDrag(RateEffect):
             "The charge leaks in proportion to the voltage.",
             "Add a resistor in parallel with this coefficient, 1 / (R C).",
         ),
-        "current": (
-            "The current dies away in proportion to itself.",
-            "Add a resistance with this coefficient, R / L.",
-        ),
-        "pressure": (
-            "The pressure falls in proportion to itself, as by a leak.",
-            "Add a leak with this coefficient.",
-        ),
+        "current": ("The current dies away in proportion to itself.", "Add a resistance with this coefficient, R / L."),
+        "pressure": ("The pressure falls in proportion to itself, as by a leak.", "Add a leak with this coefficient."),
     }
     source = "Stokes' law at small Reynolds numbers; viscous friction of bearings"
 

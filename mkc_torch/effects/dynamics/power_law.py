@@ -41,15 +41,15 @@ class PowerLaw(RateEffect):
     vessel empties with the square root of its level; drag between Stokes' and Rayleigh's has an exponent between 1 and
     2. Drag, dry friction and a cubic spring are preferred where they explain the recording as well.
 
-    Simulation: adds ``−γ |y/c|ᵖ sign y`` to the rate of a state, where y is the state itself, its difference from an
-        input that is its surroundings, the excess of a temperature over its lowest value in the recording where no
-        input is its surroundings, or the position whose speed it is; for |y| below c / 1000 the curve is linear.
+    Simulation: adds ``−γ |y/c|ᵖ sign y`` to the rate of a state. By ``of``, y is the state itself; its difference from
+        the input that is its surroundings; the excess of a temperature over its lowest value in the recording, if no
+        input is its surroundings; or, for a speed, the position. For |y| below c / 1000 the curve is linear.
     Drivers: the state and its surroundings only.
     Units: γ, the size at y = c, in the state's unit per s; the scale c, the largest y, in the unit of y; the exponent p
         is a number.
     Plausible: γ ≥ 0, except for a spring: a negative γ softens it.
-    Source: Churchill & Chu, International Journal of Heat and Mass Transfer 18 (1975), of natural convection;
-        Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), of drag.
+    Source: Churchill & Chu, International Journal of Heat and Mass Transfer 18 (1975), natural convection;
+        Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), drag.
 
     Args:
         of: base of the power, ``own``, ``difference``, ``excess`` or ``position``.
@@ -82,7 +82,7 @@ class PowerLaw(RateEffect):
             ),
         ),
     }
-    source = "Churchill & Chu (1975), of natural convection; Torricelli's law; Clift, Grace & Weber (1978), of drag"
+    source = "Churchill & Chu (1975), natural convection; Torricelli's law; Clift, Grace & Weber (1978), drag"
 
     def __init__(self, of: str = "own") -> None:
         self.of = of

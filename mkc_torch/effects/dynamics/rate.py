@@ -14,8 +14,6 @@ from mkc_torch.effects.context import Context, Quantity, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SURROUNDINGS", "RateEffect", "beyond"]
-
 SURROUNDINGS = "surroundings"
 """The part that is the input of a state's surroundings; in a shape it marks an effect of the difference from them."""
 

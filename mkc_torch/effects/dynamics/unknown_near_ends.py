@@ -15,8 +15,6 @@ from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["NUMBERS", "UnknownNearEnds", "curve_within"]
-
 DEGREE = 3
 """Degree of the polynomial."""
 
@@ -40,7 +38,7 @@ class UnknownNearEnds(UnknownRate):
     Drivers: the position only.
     Units: γ in the speed's unit per s; the ends of the range in the unit of the position.
     Plausible: any size, either sign.
-    Source: none; it is a curve, not physics. De Boor, "A Practical Guide to Splines" (2001), ch. VIII, of truncated
+    Source: none; it is a curve, not physics. De Boor, "A Practical Guide to Splines" (2001), ch. VIII: truncated
         powers.
     """
 

@@ -12,8 +12,6 @@ from mkc_torch.effects.runs import run_numbers
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["shifted"]
-
 
 def shifted(
     values: Float[Tensor, " N"],

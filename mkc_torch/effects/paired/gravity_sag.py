@@ -15,8 +15,6 @@ from mkc_torch.effects.context import SEVERAL, Context, Quantity, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["GravitySag", "SeveralSag"]
-
 _PER_DEGREE = math.pi / 180.0
 
 

@@ -37,7 +37,7 @@ class Offset(GainEffect):
             "The measured angle differs from the simulated angle by a constant, as from a wrong zero or a load.",
             "Check the joint's zero. Under a load gravity deflects a servo like this: compare with the load's "
             "torque over the joint's stiffness.",
-        ),
+        )
     }
     recurrence = "an offset is also there without a signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"

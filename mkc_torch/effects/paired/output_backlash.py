@@ -16,8 +16,6 @@ from mkc_torch.effects.waveforms import in_contact
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["OutputBacklash", "SeveralBacklash"]
-
 _START = 1e-9
 """Half gap, as a share of the largest output, at which the derivative at γ = 0 is taken; at 0 it does not exist."""
 

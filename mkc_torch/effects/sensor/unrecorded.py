@@ -15,8 +15,6 @@ from mkc_torch.effects.context import Context, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["COURSE", "Unrecorded"]
-
 COURSE = "course_"
 """Prefix of the names of the waveform's coefficients, before their number."""
 

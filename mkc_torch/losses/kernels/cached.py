@@ -9,8 +9,6 @@ import torch
 import triton
 from torch import Tensor
 
-__all__ = ["CachedKernel"]
-
 _INT32 = 2**31
 _BY_POSITION = tuple(int(part) for part in triton.__version__.split(".")[:2]) >= (3, 3)
 """Whether a compiled kernel takes its constants as arguments: from Triton 3.3 on."""

@@ -7,8 +7,6 @@ import triton.language as tl
 
 from mkc_torch.losses.kernels.formulas import initial, log_partition
 
-__all__ = ["TABLE", "channel_kernel"]
-
 TABLE = (
     "kappa",
     "d",

@@ -7,8 +7,6 @@ import triton.language as tl
 
 from mkc_torch.losses.kernels.formulas import energy, energy_by_kappa, initial
 
-__all__ = ["elements_kernel", "finish_kernel", "rescale_kernel"]
-
 
 @triton.jit
 def finish(sum_network, sum_energy, sum_kappa, sum_d, weight, table, channel, mask, m, divisor,

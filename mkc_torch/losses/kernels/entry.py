@@ -16,8 +16,6 @@ from mkc_torch.losses.kernels.operators import operator_loss
 from mkc_torch.losses.kernels.sample_loss import EachSample, ReducedSamples, SamplePass, arranged_samples
 from mkc_torch.losses.kernels.sample_operators import operator_sample_loss
 
-__all__ = ["kernel_loss", "label_loss", "sample_loss", "takes_labels"]
-
 INT32 = 2**31
 """Limit of counts in signed 32-bit integers."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-__all__ = ["energy", "energy_by_kappa", "initial", "log_partition"]
-
 
 @triton.jit
 def series(minus_x, WIDE: tl.constexpr):

@@ -15,16 +15,6 @@ from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.labels import count_kernel, labels_kernel
 from mkc_torch.losses.kernels.launch import WARPS, multiprocessors, power_of_two, rescale
 
-__all__ = [
-    "EachLabel",
-    "LabelPass",
-    "ReducedLabels",
-    "arranged_labels",
-    "label_slopes",
-    "label_values",
-    "reduce_labels",
-]
-
 TILE = 1024
 """Logits per tile of several rows."""
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from mkc_torch.losses._checks import at_least_float32
 from mkc_torch.losses.kernels.label_loss import arranged_labels, label_slopes, label_values, reduce_labels
 
-__all__ = ["operator_label_loss"]
-
 
 @torch.library.custom_op("mkc_torch::label_loss", mutates_args=())
 def reduced_label_loss(

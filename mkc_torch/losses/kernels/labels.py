@@ -7,8 +7,6 @@ import triton.language as tl
 
 from mkc_torch.losses.kernels.formulas import series
 
-__all__ = ["count_kernel", "labels_kernel"]
-
 
 @triton.jit
 def weight_of(target, class_weight, row, mask, ignored, like, CLASSES: tl.constexpr, HAS_WEIGHT: tl.constexpr):

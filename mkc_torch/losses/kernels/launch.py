@@ -18,20 +18,6 @@ from mkc_torch.losses.residual_scale import RANGE_ROWS
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "Arranged",
-    "Options",
-    "Running",
-    "arranged",
-    "kernels_are_interpreted",
-    "make_table",
-    "pass_over",
-    "power_of_two",
-    "reduce_batch",
-    "rescale",
-    "weight_sums",
-]
-
 TILE = 512
 """Elements of a tile of a large batch; of half precision where registers are few, twice as many."""
 

@@ -24,8 +24,6 @@ from mkc_torch.losses.kernels.launch import (
 )
 from mkc_torch.losses.residual_scale import ScaleState, average_over_processes, is_distributed, synchronized_state
 
-__all__ = ["gradients_of_each", "options_of", "prepared", "request_of", "updated_table"]
-
 
 class ChannelPass(NamedTuple):
     """State of a forward pass for its backward pass, in addition to the saved tensors."""

@@ -14,17 +14,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.losses.kernels.channels import TABLE
-from mkc_torch.losses.kernels.launch import (
-    Options,
-    Running,
-    arranged,
-    pass_over,
-    reduce_batch,
-    weight_sums,
-)
+from mkc_torch.losses.kernels.launch import Options, Running, arranged, pass_over, reduce_batch, weight_sums
 from mkc_torch.losses.kernels.loss import KernelRequest, gradients_of_each, options_of, request_of, updated_table
-
-__all__ = ["operator_loss"]
 
 _STATE = ("recent", "position", "batches", "log_scale", "half_range", "floor", "steps", "log_bandwidth", "share")
 

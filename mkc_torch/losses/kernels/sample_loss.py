@@ -15,8 +15,6 @@ from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.launch import RESCALED, WARPS, multiprocessors
 from mkc_torch.losses.kernels.samples import rescale_samples_kernel, samples_kernel
 
-__all__ = ["EachSample", "ReducedSamples", "SamplePass", "arranged_samples"]
-
 BLOCK = 512
 """Elements per block; a thread holds four, a single load."""
 

@@ -20,8 +20,6 @@ from mkc_torch.losses.kernels.sample_loss import (
     without_gaps,
 )
 
-__all__ = ["operator_sample_loss"]
-
 
 @torch.library.custom_op("mkc_torch::sample_loss", mutates_args=())
 def reduced_sample_loss(
@@ -143,13 +141,7 @@ sample_values.register_autograd(_backward, setup_context=_save)
 
 
 def operator_sample_loss(
-    loss: Any,
-    input: Tensor,
-    target: Tensor,
-    sigma: Tensor,
-    d: Tensor,
-    weight: Tensor | None,
-    axis: int,
+    loss: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, weight: Tensor | None, axis: int
 ) -> Tensor:
     """Forward pass of a loss through the operators."""
     given = (input, target, sigma, d, weight, loss.bound, axis)

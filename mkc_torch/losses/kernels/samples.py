@@ -8,8 +8,6 @@ import triton.language as tl
 from mkc_torch.density.head_table import DEGREE, INTERVALS, RATE
 from mkc_torch.losses.kernels.formulas import energy, energy_by_kappa
 
-__all__ = ["rescale_samples_kernel", "samples_kernel"]
-
 
 @triton.jit
 def head_by_table(

@@ -19,15 +19,7 @@ from mkc_torch.recording.formats.rosbag1 import ROSBAG1
 from mkc_torch.recording.formats.rosbag2 import ROSBAG2
 from mkc_torch.recording.formats.ulog import ULOG
 
-__all__ = [
-    "FORMATS",
-    "MissingColumnError",
-    "RecordingError",
-    "Topic",
-    "check_ending",
-    "encoded",
-    "read_topics",
-]
+__all__ = ["FORMATS", "MissingColumnError", "RecordingError", "Topic", "check_ending", "encoded", "read_topics"]
 
 FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET, ULOG, DATAFLASH, MCAP, ROSBAG1, ROSBAG2, MAT, HDF5, MDF)
 """All formats; the ending of a file selects the format."""

@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-
-__all__ = [
-    "FileFormat",
-    "MissingColumnError",
-    "RecordingError",
-    "Table",
-    "Topic",
-    "counted",
-    "is_number",
-    "listed",
-    "polars",
-]
 
 MISSING_WORDS = [
     "na", "n/a", "null", "none", "nil", "<na>", "#n/a", "#na", "#value!", "#num!", "#div/0!", "1.#qnan", "-1.#ind",
@@ -100,11 +89,21 @@ class FileFormat(NamedTuple):
 
 def polars() -> Any:
     """Import polars, or raise an ImportError that names its installation."""
+    return optional("polars", "Tables", "cli")
+
+
+def optional(module: str, files: str, extra: str) -> Any:
+    """Import a module of an optional package.
+
+    Raises:
+        ImportError: it is not installed; the message names the files that it reads, and the extra to install.
+    """
     try:
-        import polars as package
+        return import_module(module)
     except ImportError as error:
-        raise ImportError('Tables are read with polars; install it with `pip install "mkc-torch[cli]"`.') from error
-    return package
+        raise ImportError(
+            f'{files} are read with {module.partition(".")[0]}; install it with `pip install "mkc-torch[{extra}]"`.'
+        ) from error
 
 
 def is_number(text: str) -> bool:

@@ -21,8 +21,6 @@ from mkc_torch.recording.formats.base import (
     polars,
 )
 
-__all__ = ["as_numbers", "missing_warning", "numbered", "renamed", "text_error"]
-
 
 def renamed(
     table: Table, columns: Mapping[str, str], path: Path | str, what: str = "file"
@@ -39,7 +37,7 @@ def renamed(
     for new, old in sources.items():
         if old not in present:
             raise MissingColumnError(
-                f"{path}: there is no column `{old}` to be `{new}`; the {what} has {listed(present)}."
+                f"{path}: there is no column `{old}` to use as `{new}`; the {what} has {listed(present)}."
             )
     names: dict[str, Any] = {}
     for name, series in present.items():

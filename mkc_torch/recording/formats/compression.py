@@ -7,8 +7,6 @@ import io
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["inflated"]
-
 _PIECE = 2**20
 """Bytes decompressed at once."""
 

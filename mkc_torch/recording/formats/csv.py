@@ -18,8 +18,6 @@ from mkc_torch.recording.formats.text_layout import layout_of
 from mkc_torch.recording.formats.text_lines import Line, lines_of
 from mkc_torch.recording.formats.text_numbers import without_thousands, without_units
 
-__all__ = ["CSV"]
-
 _COMMA = r"^\s*[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?\s*$"
 _POINT = r"^\s*[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?\s*$"
 _THOUSANDS = r"^\s*[+-]?[1-9]\d{0,2},\d{3}\s*$"

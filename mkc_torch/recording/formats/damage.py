@@ -11,8 +11,6 @@ from pathlib import Path
 
 from mkc_torch.recording.formats.base import RecordingError, Topic, counted
 
-__all__ = ["guarded", "lost_warning", "no_rows", "quiet_terminal", "with_warnings"]
-
 
 @contextlib.contextmanager
 def guarded(path: Path, what: str) -> Iterator[None]:

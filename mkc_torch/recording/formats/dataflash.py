@@ -10,8 +10,6 @@ from mkc_torch.recording.formats.dataflash_binary import read_binary
 from mkc_torch.recording.formats.dataflash_text import read_text
 from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 
-__all__ = ["DATAFLASH"]
-
 _WHAT = "ArduPilot DataFlash log"
 _HEAD = 4096
 """Bytes at the beginning of a text log that are searched for a message definition."""

@@ -18,8 +18,6 @@ from mkc_torch.recording.formats.damage import lost_warning
 from mkc_torch.recording.formats.dataflash_messages import MESSAGE_FORMAT, MessageFormat, c_text, definition
 from mkc_torch.recording.formats.dataflash_topics import DEFINITIONS, statements, topics_of_message
 
-__all__ = ["read_binary"]
-
 _MAGIC = b"\xa3\x95"
 _FMT = 0x80
 _FILLING = (b"\x00", b"\xff")

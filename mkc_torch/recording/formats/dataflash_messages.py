@@ -14,8 +14,6 @@ import numpy as np
 
 from mkc_torch.recording.formats.base import UsualUnit
 
-__all__ = ["MESSAGE_FORMAT", "MessageFormat", "instance_column", "message_format", "units_of"]
-
 
 class MessageFormat(NamedTuple):
     """The layout of a kind of message.

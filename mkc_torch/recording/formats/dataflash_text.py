@@ -12,8 +12,6 @@ from mkc_torch.recording.formats.damage import with_warnings
 from mkc_torch.recording.formats.dataflash_messages import MESSAGE_FORMAT, TEXT, WHOLE, MessageFormat, message_format
 from mkc_torch.recording.formats.dataflash_topics import DEFINITIONS, statements, topics_of_message
 
-__all__ = ["read_text"]
-
 
 def read_text(path: Path) -> tuple[list[Topic], list[str]]:
     """Read the topics of a log, and warnings about its lost parts; memory is about ten times the file's size.

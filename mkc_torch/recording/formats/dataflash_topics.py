@@ -11,8 +11,6 @@ from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.formats.dataflash_messages import MessageFormat, c_text, instance_column, units_of
 from mkc_torch.recording.formats.topics import topic_of
 
-__all__ = ["DEFINITIONS", "Statements", "statements", "topics_of_message"]
-
 DEFINITIONS = frozenset({"FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG", "FILE"})
 """Messages that hold no measurements."""
 

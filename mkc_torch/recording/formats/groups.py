@@ -19,8 +19,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic, listed
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
 
-__all__ = ["Group", "group_topics"]
-
 _TIME = re.compile(r"(?i)(^|[._])(t|tout|time|times|timestamp|timestamps|time_?stamp|stamp)([._].*)?$|^time")
 
 

@@ -5,29 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mkc_torch.recording.formats.base import FileFormat, Topic
+from mkc_torch.recording.formats.base import FileFormat, Topic, optional
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
 from mkc_torch.recording.formats.hdf5_objects import hdf5_group
 from mkc_torch.recording.formats.magic_numbers import wrong_format_error
 from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
-__all__ = ["HDF5", "h5py", "hdf5_root"]
-
-
 _TRIAL = Path(__file__).with_name("hdf5_objects.py").read_text(encoding="utf-8")
-"""Source that a process of its own runs first: a damaged file can end the process that reads it."""
-
-
-def h5py(extra: str) -> Any:
-    """Import h5py, or raise an ImportError that names the extra to install."""
-    try:
-        import h5py as package
-    except ImportError as error:
-        raise ImportError(
-            f'HDF5 files are read with h5py; install it with `pip install "mkc-torch[{extra}]"`.'
-        ) from error
-    return package
+"""Source that a separate process runs first, because a damaged file can crash the process that reads it."""
 
 
 def read(path: Path) -> list[Topic]:
@@ -40,7 +26,7 @@ def read(path: Path) -> list[Topic]:
         RecordingError: the file is not an HDF5 file, is damaged, or has no table of two rows.
         ImportError: h5py is not installed.
     """
-    package = h5py("hdf5")
+    package = optional("h5py", "HDF5 files", "hdf5")
     if not package.is_hdf5(str(path)):
         raise wrong_format_error(path, "HDF5 file")
     topics = group_topics(hdf5_root(path, package, "HDF5 file", upright=True))

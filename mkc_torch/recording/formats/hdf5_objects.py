@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["hdf5_group"]
-
 Make = Callable[[str, dict[str, Any], dict[str, Any], dict[str, Any], list[str]], Any]
 
 _UNITS = ("units", "unit", "UNITS", "Units", "Unit")

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from mkc_torch.recording.formats.base import RecordingError
 
-__all__ = ["begins_with", "check_begins", "is_of_another_kind", "wrong_format_error"]
-
 _BEGINS: tuple[tuple[bytes, str, str], ...] = (
     (b"ULog\x01\x12\x35", "a PX4 ULog", ".ulg"),
     (b"\xa3\x95", "an ArduPilot DataFlash log", ".bin"),

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.note import Note
-from mkc_torch.recording.formats.base import FileFormat, Topic
+from mkc_torch.recording.formats.base import FileFormat, Topic, optional
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
-from mkc_torch.recording.formats.hdf5 import h5py, hdf5_root
+from mkc_torch.recording.formats.hdf5 import hdf5_root
 from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
-
-__all__ = ["MAT"]
 
 _TABLES = (
     "tables, timetables, timeseries and other objects of MATLAB are not read: save `table2struct(T, 'ToScalar', true)` "
@@ -50,7 +48,7 @@ def _all_warnings(group: Group) -> list[str]:
 
 
 def _of_hdf5(path: Path) -> Group:
-    return _dotted(hdf5_root(path, h5py("mat"), "MATLAB file of version 7.3", upright=False))
+    return _dotted(hdf5_root(path, optional("h5py", "HDF5 files", "mat"), "MATLAB file of version 7.3", upright=False))
 
 
 def _dotted(group: Group) -> Group:
@@ -67,23 +65,17 @@ def _dotted(group: Group) -> Group:
 
 
 def _of_scipy(path: Path) -> Group:
-    try:
-        from scipy.io import loadmat
-        from scipy.io.matlab import matfile_version
-    except ImportError as error:
-        raise ImportError(
-            'MATLAB files are read with scipy; install it with `pip install "mkc-torch[mat]"`.'
-        ) from error
+    package = optional("scipy.io.matlab", "MATLAB files", "mat")
     with path.open("rb") as file:
         head = file.read(128)
     if head[124:128] not in (b"\x00\x01IM", b"\x01\x00MI") and not _is_version_4(head):
         raise wrong_format_error(path, "MATLAB file")
     with guarded(path, "MATLAB file"):
         try:
-            matfile_version(str(path))
+            package.matfile_version(str(path))
         except Exception as error:  # ValueError, MatReadError, …
             raise wrong_format_error(path, "MATLAB file") from error
-        found = loadmat(str(path), chars_as_strings=True, struct_as_record=True)
+        found = package.loadmat(str(path), chars_as_strings=True, struct_as_record=True)
         return _group("", {name: value for name, value in found.items() if not name.startswith("__")}, 0)
 
 

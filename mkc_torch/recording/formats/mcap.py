@@ -21,8 +21,6 @@ from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.message_rows import Cell
 from mkc_torch.recording.formats.ros_messages import RosReader, known_definitions, parsed_definitions, type_name
 
-__all__ = ["MCAP", "gather_mcap"]
-
 _MAGIC = b"\x89MCAP0\r\n"
 _INSTALL = 'MCAP files are read with mcap and rosbags; install them with `pip install "mkc-torch[mcap]"`.'
 

@@ -29,8 +29,6 @@ from mkc_torch.recording.formats.damage import no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
 
-__all__ = ["MDF"]
-
 _WHAT = "ASAM MDF file"
 _BEGINS = b"MDF     ", b"UnFinMF "
 _SCRIPT = Path(__file__).with_name("mdf_process.py")

@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Group", "groups"]
-
 Group = dict[str, Any]
 """Keys: ``name``, ``columns`` (name to values, rows along the first axis), ``units`` and ``warnings``."""
 

@@ -9,8 +9,6 @@ from typing import Any
 from mkc_torch.recording.formats.message_rows import Cell
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS
 
-__all__ = ["json_values", "protobuf_reader"]
-
 _DEEPEST = 16
 _TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 

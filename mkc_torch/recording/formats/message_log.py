@@ -9,8 +9,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic, counted
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE, Cell, MessageRows
 
-__all__ = ["MessageLog"]
-
 LOG_TIME = "log_time"
 _PUBLISH_TIME = "publish_time"
 _STAMP = "header.stamp"
@@ -34,12 +32,7 @@ class MessageLog:
         return key in self._readers
 
     def open(
-        self,
-        key: object,
-        topic: str,
-        kind: str,
-        read: Callable[[bytes], Mapping[str, Cell]],
-        units: Mapping[str, str],
+        self, key: object, topic: str, kind: str, read: Callable[[bytes], Mapping[str, Cell]], units: Mapping[str, str]
     ) -> None:
         """Register the topic, type, reader and units of the messages under ``key``."""
         known = {**units, LOG_TIME: "ns", _PUBLISH_TIME: "ns"}

@@ -11,8 +11,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, topic_of
 
-__all__ = ["LARGEST_MESSAGE", "Cell", "MessageRows"]
-
 Cell = float | int | str | tuple[float | int, ...]
 """A value of a message: a number, a text, or the numbers of an array."""
 

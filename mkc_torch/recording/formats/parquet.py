@@ -17,8 +17,6 @@ from mkc_torch.recording.formats.damage import quiet_terminal
 from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
-__all__ = ["PARQUET"]
-
 _TRIAL = "import io, sys, polars; polars.read_parquet(io.BytesIO(open(sys.argv[1], 'rb').read()))"
 
 

@@ -10,8 +10,6 @@ from collections.abc import Iterable
 
 from mkc_torch.recording.formats.base import UsualUnit
 
-__all__ = ["px4_units"]
-
 _BODY_RATE = dict.fromkeys("xyz", "rad/s")
 _ACCELERATION = dict.fromkeys("xyz", "m/s²")
 

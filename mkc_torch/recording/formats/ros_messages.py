@@ -17,8 +17,6 @@ from mkc_torch.recording.formats.message_rows import Cell
 from mkc_torch.recording.formats.ros_units import ROS_UNITS
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS
 
-__all__ = ["Definitions", "RosReader", "known_definitions", "parsed_definitions"]
-
 Definitions = Mapping[str, Any]
 """Message type to its constants and fields, in the form of rosbags."""
 

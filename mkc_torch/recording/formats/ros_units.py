@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-__all__ = ["ROS_UNITS"]
-
 
 def _axes(name: str, unit: str) -> dict[str, str]:
     return {f"{name}.{axis}": unit for axis in "xyz"}

@@ -14,14 +14,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, optional
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.ros_messages import RosReader, parsed_definitions, type_name
-
-__all__ = ["ROSBAG1"]
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CONNECTION = b"\x02", b"\x03", b"\x05", b"\x07"
@@ -47,12 +45,7 @@ def read(path: Path) -> list[Topic]:
         ImportError: rosbags is not installed.
     """
     check_begins(path, "ROS 1 bag of version 2.0", _MAGIC)
-    try:
-        import rosbags.typesys  # noqa: F401 - tests whether it is installed
-    except ImportError as error:
-        raise ImportError(
-            'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'
-        ) from error
+    optional("rosbags.typesys", "ROS bags", "rosbag")
     log = MessageLog()
     warnings = []
     with (
@@ -139,7 +132,7 @@ def _take(record: _Record, log: MessageLog) -> None:
 
 
 def _open(record: _Record, log: MessageLog) -> None:
-    fields = _header_of_connection(record.data)
+    fields = _header(_LENGTH.pack(4) + b"op=\0" + record.data) or {}
     topic = record.header.get(b"topic", b"").decode("utf-8", "replace")
     kind = fields.get(b"type", b"").decode("utf-8", "replace")
     text = fields.get(b"message_definition", b"").decode("utf-8", "replace")
@@ -150,10 +143,6 @@ def _open(record: _Record, log: MessageLog) -> None:
         log.leave_out(topic, f"its messages, of {kind or 'no type'}, cannot be read ({lines[0][:100]})")
     else:
         log.open(record.header.get(b"conn"), topic, kind, reader.read, reader.units)
-
-
-def _header_of_connection(data: bytes) -> dict[bytes, bytes]:
-    return _header(_LENGTH.pack(4) + b"op=\0" + data) or {}
 
 
 ROSBAG1 = FileFormat((".bag",), read)

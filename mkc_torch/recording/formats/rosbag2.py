@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, listed
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, listed, optional
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
@@ -22,8 +22,6 @@ from mkc_torch.recording.formats.mcap import gather_mcap
 from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE
 from mkc_torch.recording.formats.ros_messages import RosReader, known_definitions, parsed_definitions, type_name
-
-__all__ = ["ROSBAG2"]
 
 _MAGIC = b"SQLite format 3\0"
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -41,12 +39,7 @@ def read(path: Path) -> list[Topic]:
         RecordingError: not a ROS 2 bag, a bag compressed as a whole, or a bag without a readable message.
         ImportError: rosbags is not installed, or mcap for a bag of MCAP files.
     """
-    try:
-        import rosbags.typesys  # noqa: F401 - tests whether it is installed
-    except ImportError as error:
-        raise ImportError(
-            'ROS bags are read with rosbags; install it with `pip install "mkc-torch[rosbag]"`.'
-        ) from error
+    optional("rosbags.typesys", "ROS bags", "rosbag")
     log = MessageLog()
     warnings: list[str] = []
     files = _files(path, warnings) if path.is_dir() else [path]

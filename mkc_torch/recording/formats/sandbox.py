@@ -8,8 +8,6 @@ from pathlib import Path
 
 from mkc_torch.recording.formats.base import RecordingError
 
-__all__ = ["broken", "reads_without_crash"]
-
 _PATIENCE = 20.0, 0.5
 """Time limit: seconds, plus seconds per MB of the file."""
 

@@ -10,18 +10,6 @@ from collections.abc import Sequence
 from mkc_torch.recording.formats.base import MISSING
 from mkc_torch.recording.formats.text_numbers import is_written_number
 
-__all__ = [
-    "SEPARATORS",
-    "WHITE",
-    "cells_of",
-    "count_of",
-    "is_date",
-    "is_stamp",
-    "is_time_of_day",
-    "is_value",
-    "separator_of",
-]
-
 WHITE = " "
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", WHITE: "space"}
 

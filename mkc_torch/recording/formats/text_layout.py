@@ -13,8 +13,6 @@ from mkc_torch.recording.formats.text_cells import SEPARATORS, WHITE, cells_of, 
 from mkc_torch.recording.formats.text_lines import Line
 from mkc_torch.recording.unit_words import is_unit
 
-__all__ = ["Layout", "layout_of"]
-
 _MARKS = ("#", "%", "//", ";")
 _DIGITS = frozenset("0123456789+-.")
 _CUT_NUMBER = re.compile(r"[+-]?(\d*[.,]?\d*([eE][+-]?)?|na?|in?)")

@@ -11,8 +11,6 @@ from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import RecordingError, counted
 from mkc_torch.recording.formats.magic_numbers import is_of_another_kind, wrong_format_error
 
-__all__ = ["Line", "lines_of"]
-
 _SAMPLE = 4096
 """Bytes or characters at the beginning that are examined."""
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from mkc_torch.recording.unit_words import is_unit
 
-__all__ = ["is_written_number", "without_thousands", "without_units"]
-
 _POINTS = r"^\s*[+-]?\d{1,3}(?:\.\d{3})+,\d+\s*$"
 _COMMAS = r"^\s*[+-]?\d{1,3}(?:,\d{3})+\.\d+\s*$"
 _OTHERS = r"^\s*[+-]?\d{1,3}(?:['’\u00a0\u202f\u2009 ]\d{3})+(?:[.,]\d+)?\s*$"

@@ -11,8 +11,6 @@ import numpy as np
 from mkc_torch._support.note import Note
 from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 
-__all__ = ["MOST_ELEMENTS", "spread", "topic_of"]
-
 MOST_ELEMENTS = 64
 """Most elements of an array per row; larger arrays are images, spectra or maps, not sets of channels."""
 

@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from mkc_torch._support.note import Note
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted, optional
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
 from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.px4_units import px4_units
 from mkc_torch.recording.formats.topics import topic_of
-
-__all__ = ["ULOG"]
 
 _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
@@ -48,12 +46,7 @@ def read(path: Path) -> list[Topic]:
         ImportError: pyulog is not installed.
     """
     check_begins(path, "PX4 ULog", _MAGIC)
-    try:
-        import pyulog
-    except ImportError as error:
-        raise ImportError(
-            'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
-        ) from error
+    pyulog = optional("pyulog", "ULog files", "ulog")
     with guarded(path, "PX4 ULog"), _LoopGuard(path.open("rb", buffering=0)) as file:
         walk = _walk(path)
         log = pyulog.ULog(file)
@@ -88,7 +81,7 @@ def _topic(data: Any) -> Topic | None:
 
 
 def _with_unique_names(topics: list[Topic]) -> list[Topic]:
-    """Give a topic that was logged again after it had ended a name of its own."""
+    """Number topics that have the same name because they ended and were logged again."""
     seen: Counter[str] = Counter()
     named = []
     for topic in topics:

@@ -20,8 +20,6 @@ from mkc_torch.report.rendering import render
 from mkc_torch.report.words.comparison import difference_rows, difference_sentences
 from mkc_torch.report.words.verdict import calibration_verdict, is_doubtful
 
-__all__ = ["Comparison", "calibration_report", "refusal_report"]
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -95,10 +93,6 @@ def calibration_report(
 
 def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
     """Return the page of a recording that determines no calibration, with the missing directions.
-
-    Args:
-        recording: the refused recording.
-        error: the refusal.
 
     Example:
         >>> import torch

@@ -13,27 +13,11 @@ from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
-__all__ = [
-    "explained",
-    "goodness_of_fit_table",
-    "input_hold_sentence",
-    "noise_lines",
-    "offset_sentences",
-    "output_lines",
-    "process_noise_sentence",
-    "process_noise_table",
-    "remainder",
-]
-
 _MOST_OUTPUTS = 6
 _STILL = 2.0
 """Variation, in noise floors, up to which an output hardly varies."""
 _MOST_DECIMALS = 4
-_SOURCES = {
-    "declared": "declared",
-    "samples": "estimated",
-    "quantisation": "resolution of the recording",
-}
+_SOURCES = {"declared": "declared", "samples": "estimated", "quantisation": "resolution of the recording"}
 _BETWEEN = {
     "held": "`{input}` is constant between samples",
     "linear": "`{input}` is linear between samples",
@@ -174,12 +158,7 @@ def process_noise_table(environment: NoiseEnvironment) -> Table | None:
         )
         for process in environment.process_noise
     )
-    columns = (
-        "acts on",
-        "standard deviation",
-        "correlation time",
-        "log-likelihood gain, nats",
-    )
+    columns = ("acts on", "standard deviation", "correlation time", "log-likelihood gain, nats")
     return Table(
         "Process noise and drift",
         columns,

@@ -10,8 +10,6 @@ from typing import Any
 from mkc_torch._words.typesetting import typeset
 from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult, Extrapolation
 
-__all__ = ["SECTIONS", "Row", "Section", "Table", "of_driver", "rows", "tables"]
-
 _DRIVEN_BY = "driven by"
 """Label of rows that are shown with the driver's name."""
 

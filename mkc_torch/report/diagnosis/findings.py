@@ -15,26 +15,6 @@ from mkc_torch.report.diagnosis.numbers import TimeFormat, largest, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
-__all__ = [
-    "acts_on",
-    "driven_by",
-    "finding_name",
-    "fitted_sizes",
-    "grade",
-    "inseparable",
-    "label_name",
-    "references_of",
-    "region",
-    "rivals",
-    "role",
-    "shape",
-    "shares_of_runs",
-    "unrecorded",
-    "where",
-    "with_drivers",
-    "with_names",
-]
-
 _MOST_RUNS = 6
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "acts on {channels}, the sensor's axes",
@@ -317,13 +297,8 @@ def fitted_sizes(alternative: Alternative) -> str:
 
 def _rival(alternative: Alternative, finding: Finding) -> str:
     """Return the name of an alternative; at the finding's port, the name depends on the kind of quantity."""
-    at = _elsewhere(alternative, finding)
+    at = "" if _at(alternative.port, finding) else alternative.port
     return with_drivers(alternative.effect, alternative.drivers, at, "" if at else finding.kind)
-
-
-def _elsewhere(alternative: Alternative, finding: Finding) -> str:
-    """Return the port of an alternative if it differs from the finding's."""
-    return "" if _at(alternative.port, finding) else alternative.port
 
 
 def _at(place: str, finding: Finding) -> bool:

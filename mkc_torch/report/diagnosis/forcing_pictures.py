@@ -11,8 +11,6 @@ from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curv
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.report.panels import Panels, title
 
-__all__ = ["of_forcing", "of_shape"]
-
 _MOST_CURVES = 9
 """Most states and inputs over which a disturbance is drawn."""
 

@@ -9,22 +9,11 @@ from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
 
-__all__ = [
-    "channel_notes",
-    "held_out_rows",
-    "noise_model",
-    "noise_parameters",
-    "smooth_fit",
-]
-
 _CLEARLY = 0.99
 """Ratio of residuals below which the smaller is reported."""
 
 _KINDS = {"white": "white", "ar": "autoregressive", "random_walk": "random walk"}
-_NOISE = {
-    "drift": "drift of the offset",
-    "drift_period": "cut-off of the drift",
-}
+_NOISE = {"drift": "drift of the offset", "drift_period": "cut-off of the drift"}
 _CHANNELS = {
     "norm": "norm: measured length of the field minus the simulated length",
     "along": "along: residual along the ambient field, which its length shows too",

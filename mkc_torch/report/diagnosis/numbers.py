@@ -11,21 +11,6 @@ from mkc_torch._words.typesetting import plain, superscript
 from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
 
-__all__ = [
-    "TimeFormat",
-    "behind",
-    "clock_of",
-    "evidence",
-    "gain",
-    "improvement",
-    "largest",
-    "measured",
-    "named_lines",
-    "parameter_lines",
-    "parameter_name",
-    "probability",
-]
-
 _FEWEST_LARGE = 1e6
 """Smallest size that is written with a power of ten."""
 

@@ -29,8 +29,6 @@ from mkc_torch.report.drawing import themed
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 
-__all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
-
 _MOST_SHOWN = 12
 _MOST_FORCINGS = 3
 _FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, orthogonal
@@ -71,7 +69,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         *(partial(forcing_pictures.of_shape, d, i) for i in range(count)),
         *(partial(forcing_pictures.of_forcing, d, i) for i in range(driven)),
     ]
-    time_figure, *drawn = (_markup(svg) for svg in shared(works))
+    time_figure, *drawn = (None if svg is None else Markup(svg) for svg in shared(works))
     page = render(
         "diagnosis.html.j2",
         d=d,
@@ -104,10 +102,6 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         most=_MOST_SHOWN,
     )
     return unbroken(page)
-
-
-def _markup(svg: str | None) -> Markup | None:
-    return None if svg is None else Markup(svg)
 
 
 def bars(candidates: tuple[CandidateScore, ...]) -> list[Bar]:

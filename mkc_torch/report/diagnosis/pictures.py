@@ -22,8 +22,6 @@ from mkc_torch.diagnosis.plot.residual import (
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.panels import Margins, Panels, title
 
-__all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
-
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
 _CLOSE = 0.03
 """Distance, as a share of the axis, below which numbers would overlap."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from mkc_torch._words.typesetting import plain
 
-__all__ = ["recording_called"]
-
 
 def recording_called(number: int, name: str) -> str:
     """Return the number of a recording and, if it has one, its name.

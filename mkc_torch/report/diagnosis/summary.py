@@ -16,8 +16,6 @@ from mkc_torch.report.diagnosis.unseen import better, diverged, residual_of_all,
 from mkc_torch.report.diagnosis.verdict import reasons
 from mkc_torch.report.words.numbers import size
 
-__all__ = ["Row", "chance", "residual_alone", "summary"]
-
 Row = tuple[str, tuple[str, ...]]
 """Label and lines of a row; backticks mark code."""
 

@@ -11,8 +11,6 @@ from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
 
-__all__ = ["better", "diverged", "residual_of_all", "residuals"]
-
 _BETTER = {
     "surely": "surely better on held-out blocks",
     "probably": "probably better on held-out blocks, not surely",

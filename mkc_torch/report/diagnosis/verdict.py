@@ -18,21 +18,6 @@ from mkc_torch.report.diagnosis.unseen import residual_of_all
 from mkc_torch.report.words.numbers import share, size
 from mkc_torch.report.words.verdict import disturbed
 
-__all__ = [
-    "RunPaths",
-    "Tone",
-    "apply_command",
-    "headline",
-    "notices_first",
-    "reasons",
-    "to_do",
-    "tone",
-    "unexplained",
-    "unexplained_place",
-    "warned",
-]
-
-
 _MOST_REJECTED = "Most samples were rejected"
 """Beginning of the warning about a disturbed measurement."""
 

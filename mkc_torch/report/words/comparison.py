@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from mkc_torch.calibration.differences import LEVEL, Difference, Differences
 from mkc_torch.report.words.numbers import decimals, in_power, number, power, share, size, with_errors
 
-__all__ = ["difference_rows", "difference_sentences"]
-
 _NAMED = 3
 _ROUNDING = 9
 

@@ -6,8 +6,6 @@ import re
 
 from markupsafe import Markup, escape
 
-__all__ = ["marked", "unbroken"]
-
 
 def marked(text: str) -> Markup:
     """Escape a text and set the text between backticks as code.

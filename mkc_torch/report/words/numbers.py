@@ -210,11 +210,7 @@ def rest_bias(found: RestBias) -> str:
     )
 
 
-_RESPONSES = {
-    "offset": "offset alone",
-    "offset and scale": "offset and scale",
-    "full matrix": "offset and full matrix",
-}
+_RESPONSES = {"offset": "offset alone", "offset and scale": "offset and scale", "full matrix": "offset and full matrix"}
 """Keys of the responses of an aided calibration."""
 
 

@@ -9,8 +9,6 @@ from mkc_torch.calibration.result import Calibration
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.report.words.numbers import change, share, when
 
-__all__ = ["calibration_verdict", "disturbed", "is_doubtful", "result_in_a_word"]
-
 
 def calibration_verdict(calibration: Calibration) -> str:
     """Return the headline: doubtful with its reasons, or calibrated; then the disturbed intervals."""

@@ -12,8 +12,6 @@ from mkc_torch.simulation.ports import SignalTimes
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["inputs_between", "smooth_between"]
-
 _POINTS = 6
 """Samples that the interpolating polynomial goes through."""
 

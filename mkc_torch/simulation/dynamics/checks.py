@@ -15,8 +15,6 @@ from mkc_torch.simulation.parameter import SimulationError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["SampledStates", "check_functions"]
-
 
 class SampledStates(NamedTuple):
     """Times in s with the states, the inputs and the number of the run at each."""

@@ -16,8 +16,6 @@ from mkc_torch.simulation.ports import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["DynamicsCorrection"]
-
 _HORIZONS = (0.1, 0.3, 1.0)
 """Shares of the longest run, from its start, to which the initial states are fitted in turn."""
 

@@ -15,8 +15,6 @@ from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter, SimulationError
 
-__all__ = ["Dynamics"]
-
 
 class Dynamics:
     """A system of ordinary differential equations; subclasses define names, parameters and ``derivative``.

@@ -10,8 +10,6 @@ from torch import Tensor
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter
 
-__all__ = ["Equations"]
-
 
 class Equations(Protocol):
     """Names, parameters and functions of a system; see :class:`mkc_torch.simulation.Dynamics`.

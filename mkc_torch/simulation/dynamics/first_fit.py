@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["floor_of", "multiple_shooting_start", "strong_observer", "with_strong_observer", "without_noise"]
-
 _CORRECTIONS = (100.0, 10.0)
 """Process noise that the observers assume, in units of the size at which it moves an output by its noise floor."""
 

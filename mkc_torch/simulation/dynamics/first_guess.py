@@ -14,8 +14,6 @@ from mkc_torch.simulation.dynamics.equations import Equations
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["despiked", "first_guess"]
-
 _WIDTH = 5
 """Samples of the window for local lines."""
 

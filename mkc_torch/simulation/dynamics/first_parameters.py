@@ -16,8 +16,6 @@ from mkc_torch.simulation.dynamics.trajectory import defect
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["first_parameters"]
-
 _WINDOW = 4
 """Intervals over which defects are summed, so that noise of the states mostly cancels."""
 

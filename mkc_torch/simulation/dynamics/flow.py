@@ -18,9 +18,6 @@ from mkc_torch.simulation.ports import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-
-__all__ = ["flow_along", "flow_of", "plausible_sizes"]
-
 _LEAST_STATE_ERROR = 0.1
 """Smallest assumed error of a state, as a share of its standard deviation."""
 
@@ -61,12 +58,7 @@ def plausible_sizes(
     return largest
 
 
-def flow_of(
-    prepared: Observable,
-    theta: Float[Tensor, " p"],
-    changes: Changes,
-    near: Nearby | None,
-) -> Flow | None:
+def flow_of(prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None) -> Flow | None:
     """Linearise a trajectory, in open loop or with an observer; None where no trajectory is found.
 
     Args:

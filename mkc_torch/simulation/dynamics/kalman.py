@@ -20,20 +20,6 @@ from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = [
-    "FilterEnd",
-    "FilterModels",
-    "FilterStart",
-    "Filtered",
-    "Flow",
-    "FlowParts",
-    "filtered",
-    "robust_likelihood",
-    "run_filter",
-    "smoothed",
-    "start_of",
-]
-
 _CLIP = 4.0
 """Standard deviations at which an innovation is clipped."""
 

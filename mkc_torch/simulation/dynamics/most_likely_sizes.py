@@ -17,8 +17,6 @@ from mkc_torch.simulation.dynamics.peak import peak
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["most_likely_sizes"]
-
 _NEAR = math.log(30.0)
 """Largest distance of the maximum from the grid point, in the logarithm of each number."""
 

@@ -29,8 +29,6 @@ from mkc_torch.simulation.ports import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["DisturbancePath", "StateSpaceNoise", "disturbance_paths", "most_likely_noise", "noise_of", "sized_noise"]
-
 
 @dataclass(frozen=True)
 class StateSpaceNoise:

@@ -12,8 +12,6 @@ from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, longest_run
 from mkc_torch.simulation.dynamics.noise_selection import usual_size
 
-__all__ = ["NoiseGrid", "key_of"]
-
 _SIZES = (0.1, 1.0, 10.0, 100.0)
 """Sizes tried, in units of the size at which a disturbance moves an output by its white noise."""
 

@@ -10,8 +10,6 @@ import numpy as np
 from mkc_torch.simulation.dynamics.kalman import FilterModels, Flow
 from mkc_torch.simulation.dynamics.observer import Disturbance
 
-__all__ = ["NoiseModel", "filter_models", "longest_run", "place_of"]
-
 
 @dataclass(frozen=True)
 class NoiseModel:

@@ -21,16 +21,6 @@ from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "SelectedNoise",
-    "models_of",
-    "observer_of",
-    "rescale_noise_model",
-    "select_noise_model",
-    "usual_size",
-    "with_most_likely_sizes",
-]
-
 _SIZES = (0.1, 1.0, 10.0, 100.0)
 """Sizes tried, in units of the size at which a disturbance moves an output by its white noise."""
 

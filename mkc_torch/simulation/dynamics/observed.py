@@ -20,8 +20,6 @@ from mkc_torch.simulation.ports import Changes, FreeChange, Port, SignalTimes
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ObservedDynamics"]
-
 
 class ObservedDynamics:
     """Base class of a prepared system for use with an observer; further attributes as in :class:`Observable`.

@@ -22,8 +22,6 @@ from mkc_torch.simulation.ports import Answer, Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["CLIP", "Disturbance", "Observable", "Observer", "ObserverJump", "clipped", "clipped_slope"]
-
 CLIP = 4.0
 """Standard deviations that the correction by an innovation saturates at, since it may be an outlier."""
 

@@ -16,8 +16,6 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["OtherStarts", "other_starts"]
-
 _BETWEEN = (0.25, 0.5, 0.75)
 """Points between the user's values (0) and the failed start (1)."""
 

@@ -14,8 +14,6 @@ from mkc_torch.simulation.parameter import Parameter
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["equations_with_offsets"]
-
 
 class _Offset:
     """A system with output offsets as further parameters after its own; everything else is delegated to the system.

@@ -28,8 +28,6 @@ from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["filtered_whole"]
-
 _STRETCH = 150
 """Samples of a stretch: several times as many as a filter needs to converge."""
 

@@ -10,8 +10,6 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["peak"]
-
 _FIRST = 0.05
 """Width of the first differences, in each number."""
 

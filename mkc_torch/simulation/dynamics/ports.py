@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Port, SignalSizes, SignalTimes
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["RATES", "PortContext", "common_unit", "memory_at"]
-
 _MEMORIES: Mapping[str, Mapping[str, bool]] = {
     "hysteretic rate": {"memory_of": False},
     "lagged rate": {"lagged": True},
@@ -174,10 +172,6 @@ class PortContext:
 
 def memory_at(kind: str, state: str) -> dict[str, str]:
     """Internal states at the rate of a state, with the state that each starts equal to; empty to start at 0.
-
-    Args:
-        kind: kind of the port.
-        state: the state.
 
     Example:
         >>> memory_at("resonant rate", "speed"), memory_at("rate", "speed")

@@ -40,8 +40,6 @@ from mkc_torch.simulation.undetermined import undetermined
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["PreparedDynamics"]
-
 _PATIENT = 2
 """Stride of the growing horizon, in grid times, for trajectories that are hard to solve."""
 
@@ -280,12 +278,7 @@ class PreparedDynamics(ObservedDynamics):
         return at | {"output": outputs}
 
     def trajectory(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
-        *,
-        patient: bool = False,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None, *, patient: bool = False
     ) -> Trajectory:
         """Solve for the states at all grid times, with the changes by effects.
 

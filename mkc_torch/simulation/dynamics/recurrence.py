@@ -11,8 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Recurrence"]
-
 _FEW = 256
 """Number of grid times up to which products over 1, 2, 4 ... intervals are cheaper than halving."""
 

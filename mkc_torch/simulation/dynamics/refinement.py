@@ -11,8 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FINEST", "enough_parts"]
-
 FINEST = 8
 """Integration steps between two samples at most."""
 

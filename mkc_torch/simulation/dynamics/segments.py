@@ -14,8 +14,6 @@ from mkc_torch.simulation.parameter import SimulationError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
 
-__all__ = ["beginnings", "refuse_few"]
-
 _FEWEST = 3
 """Samples of a trajectory at least."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["HALVINGS", "HORIZON", "MOST_STEPS", "QUICK", "ROUGHLY", "ROUNDING", "SETTLED", "STALLED"]
-
 MOST_STEPS = 30
 """Newton steps at most."""
 

@@ -13,8 +13,6 @@ from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 
-__all__ = ["surroundings"]
-
 _SHIFT = 0.7
 """Common shift of state and input in the test."""
 

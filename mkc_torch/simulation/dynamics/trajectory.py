@@ -34,21 +34,6 @@ from mkc_torch.simulation.dynamics.settings import (
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "Grid",
-    "Jump",
-    "Linear",
-    "Rate",
-    "Trajectory",
-    "defect",
-    "linearised_later",
-    "marched",
-    "slopes",
-    "solve",
-    "stations",
-    "transition_matrices",
-]
-
 Rate = Callable[[Tensor], Tensor]
 """Rate of change of the states at the stations of a grid, (S, n) → (S, n)."""
 

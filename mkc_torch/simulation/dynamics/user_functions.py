@@ -15,8 +15,6 @@ from mkc_torch.simulation.parameter import Parameter, SimulationError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["check_names", "check_value", "kinematic", "namespace"]
-
 
 def check_names(system: Equations) -> None:
     """Raise where names of the system are missing, repeated or not valid as attributes."""

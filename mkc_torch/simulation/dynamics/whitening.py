@@ -22,8 +22,6 @@ from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FilterGains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
-
 _CELLS = 24_000_000
 """Numbers of whitened series held in memory at once: 192 MB."""
 
@@ -77,12 +75,7 @@ def joined(*series: SeriesAlong) -> SeriesAlong:
 
 
 def gains_of(flow: Flow, models: FilterModels) -> FilterGains:
-    """Compute the gains of Kalman filters along a flow.
-
-    Args:
-        flow: the linearised trajectory.
-        models: B noise models.
-    """
+    """Compute the gains of Kalman filters along a flow."""
     n, D = flow.transition.shape[1], models.place.shape[1]
     N, m = flow.new.shape
     P = filtered_whole(flow, models, keep=True).prior[:, 0]
@@ -116,13 +109,7 @@ def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"
 
 
 def whitened(flow: Flow, gains: FilterGains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
-    """Whiten series under each noise model; yields the index of the model and innovations of variance 1.
-
-    Args:
-        flow: the linearised trajectory.
-        gains: the filters of the models.
-        series: K series.
-    """
+    """Whiten series under each noise model; yields the index of the model and innovations of variance 1."""
     N, m, K = series.new.shape
     B = len(gains.models)
     block = max(1, min(B, _CELLS // max(N * m * K, 1)))

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Binary"]
-
 _WARNING = 1
 """Status of a warning; with a higher status there is no value."""
 
@@ -96,7 +94,8 @@ class Binary:
     def first_states(self) -> Array:
         """The initial states, (n,)."""
         states = np.zeros(len(self.description.states))
-        _call(self._get_states, self.model.component, states.ctypes.data, len(states))
+        if self._get_states(self.model.component, states.ctypes.data, len(states)) > _WARNING:
+            raise SimulationError("The FMU does not return its states; export it again.")
         return states
 
     def values(self, outputs: bool, time: Array, states: Array, inputs: Array) -> Array:
@@ -335,11 +334,6 @@ def _addresses(rows: Array) -> range:
     """The address of each row of a contiguous table."""
     start, step = rows.ctypes.data, 8 * max(1, rows[0].size) if len(rows) else 8
     return range(start, start + step * len(rows), step)
-
-
-def _call(function: Any, *arguments: Any) -> None:
-    if function(*arguments) > _WARNING:
-        raise SimulationError("The FMU does not return its states; export it again.")
 
 
 def _platform(version: int) -> str:

@@ -17,8 +17,6 @@ from mkc_torch.simulation.parameter import SimulationError
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Simulated"]
-
 
 class Simulated:
     """An FMU with its own solver, driven by a recording's inputs; its parameters are not fitted.

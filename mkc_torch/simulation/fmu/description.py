@@ -14,8 +14,6 @@ from typing import Any
 from mkc_torch.simulation.fmu.units import unit_of
 from mkc_torch.simulation.parameter import Parameter
 
-__all__ = ["Description", "FmuError", "FmuVariable", "read_description", "the_library"]
-
 _REAL = ("Real", "Float64")
 _EXTRA = 'FMUs are read by FMPy, which is not installed; install it with `pip install "mkc-torch[fmu]"`.'
 
@@ -155,7 +153,9 @@ def _read(path: Path) -> Any:
     except FmuError:
         raise
     except zipfile.BadZipFile:
-        raise FmuError(f"{path}: this is no FMU, or a damaged one: it is no zip archive. Export it again.") from None
+        raise FmuError(
+            f"{path}: this is not an FMU, or it is damaged: it is not a zip archive. Export it again."
+        ) from None
     except OSError:
         raise
     except Exception as error:  # any error of the parser
@@ -170,7 +170,7 @@ def _version(path: Path) -> str:
     with zipfile.ZipFile(path) as archive:
         if "modelDescription.xml" not in archive.namelist():
             raise FmuError(
-                f"{path}: this is no FMU, or a damaged one: it has no modelDescription.xml. Export it again."
+                f"{path}: this is not an FMU, or it is damaged: it has no modelDescription.xml. Export it again."
             )
         with archive.open("modelDescription.xml") as file:
             head = file.read(4096).decode("utf-8", errors="replace")

@@ -22,8 +22,6 @@ from mkc_torch.simulation.parameter import SimulationError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["FmuDynamics", "fmu_class", "is_of_an_fmu", "load_fmu"]
-
 _PROBES = 7
 """Number of points at which an FMU is tested."""
 

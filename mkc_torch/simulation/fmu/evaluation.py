@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["GROUPS", "Evaluation", "EvaluationPoints", "Group"]
-
 Group = Literal["states", "inputs", "parameters"]
 GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
 

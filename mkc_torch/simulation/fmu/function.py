@@ -17,8 +17,6 @@ from torch import Tensor
 from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, EvaluationPoints, Group
 
-__all__ = ["evaluated"]
-
 
 def evaluated(
     evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["unit_of"]
-
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _NAMES = {"1": "", "-": "", "degC": "°C", "deg": "°", "Ohm": "Ω"}
 _POWER = re.compile(r"(?<=[A-Za-zΩµ°])\^?\(?(-?\d+)\)?")

@@ -25,8 +25,6 @@ from mkc_torch.simulation.ports import Changes, Nearby, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["AttitudeView", "with_attitude"]
-
 _MISFIT = 0.3
 """Median error, as a share of the field, from which the attitude is checked."""
 
@@ -194,11 +192,11 @@ def with_attitude(recording: Recording) -> Recording:
     if not bool(has.any()):
         where = f"{recording.name}: " if recording.name else ""
         raise RecordingError(
-            f"{where}all quaternions {', '.join(QUATERNION)} are zero, which is no attitude. Leave out these columns, "
+            f"{where}all quaternions {', '.join(QUATERNION)} are zero: there is no attitude. Leave out these columns, "
             "or record the attitude."
         )
     zero = int((~has).sum())
-    return known.rows(has, f"Left out {zero} of {len(known)} samples whose quaternion is zero, which is no attitude.")
+    return known.rows(has, f"Left out {zero} of {len(known)} samples whose quaternion is zero: they have no attitude.")
 
 
 def _matrix_prior(count: int) -> GaussianPrior:

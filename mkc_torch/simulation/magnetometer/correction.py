@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-__all__ = ["MagnetometerCorrection"]
-
 _PARAMETERS = {"norm": 9, "gyro": 15, "attitude": 14}
 """Number of parameters of each view."""
 

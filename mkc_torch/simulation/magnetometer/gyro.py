@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Changes, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["GyroView"]
-
 WINDOW = 2.0
 """Length in s of the windows within which a gyroscope is integrated; each has its own unknown field direction."""
 
@@ -67,10 +65,7 @@ class GyroView(View):
             offset = self._offset_by_turns(error)
             self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
             self._full = torch.cat([offset, torch.eye(3).to(offset).flatten(), offset.new_zeros(3)])
-            self.warnings = (
-                *self.warnings,
-                f"The gyroscope replaces missing turns: {error}",
-            )
+            self.warnings = (*self.warnings, f"The gyroscope replaces missing turns: {error}")
         else:
             self.strength = float(fit.radius_)
             self._full = self._theta(fit)
@@ -80,7 +75,7 @@ class GyroView(View):
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
 
     def _offset_by_turns(self, error: NotIdentifiableError) -> Tensor:
-        """The offset for which the field of each window is constant, by reweighted least squares; the matrix is 1.
+        """The offset, with matrix 1, that makes the field of each window constant, by reweighted least squares.
 
         Raises:
             NotIdentifiableError: ``error``, where the turns do not determine the offset either.

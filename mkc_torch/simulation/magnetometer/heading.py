@@ -13,8 +13,6 @@ from mkc_torch.calibration.aided.rotation import gaps, turns
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["HeadingJump", "heading_jumps"]
-
 LEAST = 3.0
 """Smallest jump in °."""
 

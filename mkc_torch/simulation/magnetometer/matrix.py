@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["MATRIX_OF_VIEW", "SOFT_IRON", "SYMMETRIC"]
-
 SOFT_IRON = 0.1
 """Prior standard deviation of the matrix about the identity, by soft iron, gains and misalignment. It is weak for a
 sensor that turns through all directions, and selects the identity for a vehicle that never tilts."""

@@ -19,14 +19,12 @@ from mkc_torch.simulation.ports import Changes, Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["NormView"]
-
 
 class NormView(View):
     """Field strength: one channel, the first-order distance from the ellipsoid, in the measurement's unit.
 
-    Where all samples together determine no ellipsoid, a part of the recording may determine it: a fit starts from that
-    part, and the sensor is fitted together with the change of it.
+    If all samples together do not determine an ellipsoid, a part of the recording may: the fit starts from that part,
+    and the sensor is fitted together with its change.
 
     Args:
         recording: the prepared recording.
@@ -40,18 +38,12 @@ class NormView(View):
     view = "norm"
     channels = ("norm",)
     independent: tuple[bool, ...] = (True,)
-    parameter_names = (
-        *(f"offset_{a}" for a in AXES),
-        *(f"matrix_{AXES[i]}{AXES[j]}" for i, j in SYMMETRIC),
-    )
+    parameter_names = (*(f"offset_{a}" for a in AXES), *(f"matrix_{AXES[i]}{AXES[j]}" for i, j in SYMMETRIC))
     prior: GaussianPrior | None = None
 
     def __init__(self, recording: Recording, *, sphere: bool = False) -> None:
         super().__init__(recording)
-        self.ports = {
-            "sensor": Port(AXES, self.unit, allows_drift=True),
-            "field": Port(("strength",), self.unit),
-        }
+        self.ports = {"sensor": Port(AXES, self.unit, allows_drift=True), "field": Port(("strength",), self.unit)}
         self.alone = True
         """Whether the field strength determines the sensor without a change of it."""
         try:
@@ -119,6 +111,6 @@ def _start_warning(surface: Surface, view: View, error: NotIdentifiableError) ->
         begin, end = float(view.time[surface.first]), float(view.time[surface.last - 1])
         what = f"the ellipsoid of the samples from {begin:.4g} to {end:.4g} s"
     return (
-        f"All samples together determine no ellipsoid; offset and matrix start from {what}, and are valid together "
-        f"with the change of the sensor. {error}"
+        f"All samples together do not determine an ellipsoid; offset and matrix start from {what}, and are valid "
+        f"together with the change of the sensor. {error}"
     )

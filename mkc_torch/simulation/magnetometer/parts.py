@@ -1,4 +1,4 @@
-"""Start surfaces if all samples together determine no ellipsoid: the ellipsoid of a part, or the nearest sphere."""
+"""Start surfaces if all samples do not determine an ellipsoid: the ellipsoid of a part, or the nearest sphere."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from mkc_torch.linear import LeastTrimmedSquares, RankDeficientError
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
-
-__all__ = ["Surface", "ellipsoid_of_a_part", "sphere_of_all"]
 
 INFORMATION = 0.02
 """Smallest information of a part's directions, as a share of even coverage: below it, noise shrinks the ellipsoid to a

@@ -15,8 +15,6 @@ from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import ACCEL, AXES, GYRO, QUATERNION
 from mkc_torch.simulation.magnetometer.view_selection import chosen_view, requested_view
 
-__all__ = ["Magnetometer"]
-
 
 @dataclass(frozen=True)
 class Magnetometer:

@@ -23,8 +23,6 @@ from mkc_torch.simulation.protocol import ClosedForm
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["ACCEL", "AXES", "GYRO", "INDEPENDENT", "QUATERNION", "VECTOR", "View", "length_of", "thinned"]
-
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
 ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -76,10 +74,7 @@ class View(ClosedForm):
         return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
 
     def signals(
-        self,
-        theta: Float[Tensor, " p"],
-        changes: Changes,
-        near: Nearby | None = None,
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "N 3"]]:
         """At the port "sensor", the simulated measurement without the offset."""
         # not the measured field: its noise is also in the residual, and would look like a nonlinearity
@@ -124,7 +119,7 @@ class View(ClosedForm):
         try:
             return ellipsoid.fit(self.measured[chosen])
         except ValueError as error:
-            raise NoFitError(f"These samples alone determine no ellipsoid. {error}") from error
+            raise NoFitError(f"These samples alone do not determine an ellipsoid. {error}") from error
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:

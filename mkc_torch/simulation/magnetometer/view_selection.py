@@ -18,8 +18,6 @@ from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import GYRO, QUATERNION, View
 
-__all__ = ["chosen_view", "requested_view"]
-
 V = TypeVar("V", bound=View)
 
 TIMES_THE_LENGTH = 3.0

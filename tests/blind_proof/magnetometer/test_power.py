@@ -16,8 +16,8 @@ from examples.blind_proof.magnetometer.families import (
 from examples.blind_proof.magnetometer.hidden import CATALOGUE
 from examples.blind_proof.magnetometer.noise import KINDS, draw_noise
 from examples.blind_proof.magnetometer.power import Metric, Question, attitude_gains, powers, range_of
-from examples.blind_proof.magnetometer.process import dense_covariance
 from examples.blind_proof.magnetometer.rotation import from_vector, product
+from tests.blind_proof.magnetometer.dense import dense_covariance
 
 SHARE = 0.1
 

@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from examples.blind_proof.draws import generator, normal
-from examples.blind_proof.magnetometer.process import Process, autoregressive, dense_covariance, resonance, whitened
+from examples.blind_proof.magnetometer.process import Process, autoregressive, resonance, whitened
+from tests.blind_proof.magnetometer.dense import dense_covariance
 
 PROCESSES = [autoregressive((0.9,), 0.5), autoregressive(resonance(0.9, 0.1), 0.7), Process((1.0,), 0.1)]
 

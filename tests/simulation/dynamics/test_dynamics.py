@@ -582,9 +582,7 @@ class TestUndetermined:
 
     def test_a_mass_and_a_spring_are_determined_as_a_quotient_only(self):
         (warning,) = Oscillator().prepare(self.recording).warnings
-        assert warning.startswith(
-            "The recording does not determine `mass` and `spring`, but only what they are together"
-        )
+        assert warning.startswith("The recording does not determine `mass` and `spring` separately")
         assert "direction 0.71 mass + 0.71 spring, relative" in warning
 
     @pytest.mark.e2e

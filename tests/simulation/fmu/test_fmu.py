@@ -137,7 +137,7 @@ STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force
 @pytest.mark.parametrize(
     ("text", "more", "words"),
     [
-        (None, (), "this is no FMU, or a damaged one: it has no modelDescription.xml"),
+        (None, (), "this is not an FMU, or it is damaged: it has no modelDescription.xml"),
         ("<fmiModelDescription fmiVersion='2.0'", (), "its modelDescription.xml cannot be parsed"),
         (description(PENDULUM, fmi="1.0"), (), "this FMU is of FMI 1.0; FMI 2.0 and 3.0 are read"),
         ("<model/>", (), "this FMU is of FMI (no version)"),
@@ -166,7 +166,7 @@ def test_unusable_fmus_are_refused_with_a_sentence(tmp_path, text, more, words):
 
 def test_other_files_are_refused(tmp_path):
     (tmp_path / "model.fmu").write_bytes(b"PK\x03\x04 cut off")
-    with pytest.raises(FmuError, match=r"damaged one: it is no zip archive"):
+    with pytest.raises(FmuError, match="damaged: it is not a zip archive"):
         load_fmu(tmp_path / "model.fmu")
     with pytest.raises(FmuError, match=r"there is no such file"):
         load_fmu(tmp_path / "other.fmu")

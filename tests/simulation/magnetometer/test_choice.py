@@ -110,7 +110,7 @@ def test_a_wrong_gyroscope_is_excluded_where_length_and_step_determine_the_senso
     assert view.view == "norm"
     assert "The gyroscope is left out" in view.warnings[0]
     assert words in view.warnings[0]
-    assert "All samples together determine no ellipsoid" in view.warnings[1]
+    assert "All samples together do not determine an ellipsoid" in view.warnings[1]
     assert view.prior is not None
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from torch import Generator
 
-from examples.blind_proof.draws import happens, uniform
+from examples.blind_proof.draws import uniform
 from examples.blind_proof.equations import forces, hidden, transducers
 from examples.blind_proof.equations.integrate import SystemScene
 from examples.blind_proof.equations.plant import (
@@ -145,9 +145,7 @@ def servo_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
 
 def late(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Delay of the bus and lag of the servo's loop."""
-    pipe = happens(g, 0.5)
-    form = "transport" if pipe else "four lags in series"
-    change = transducers.transport if pipe else transducers.lags(4)
+    form, change = hidden.late(g)
     return HiddenTerm("delay", form, SERVO_AT, 0.03 * scene.length, outputs=change, twins=("input_delay",))
 
 
@@ -186,8 +184,5 @@ def trembling(g: Generator, scene: SystemScene) -> HiddenTerm:
 
 
 SERVO = hidden.System(
-    servo_draw,
-    servo_trial,
-    inside=(late, worn, wrong_zero, load, end_of_range, slow_sensor),
-    outside=(trembling,),
+    servo_draw, servo_trial, inside=(late, worn, wrong_zero, load, end_of_range, slow_sensor), outside=(trembling,)
 )

@@ -169,9 +169,7 @@ def projectile_draw(g: Generator) -> Setting:
         fine=8,
     )
     return Setting(
-        plant,
-        projectile_trial(g, plant, THROWS, THROW_SAMPLES),
-        projectile_trial(g, plant, 1, THROW_SAMPLES),
+        plant, projectile_trial(g, plant, THROWS, THROW_SAMPLES), projectile_trial(g, plant, 1, THROW_SAMPLES)
     )
 
 

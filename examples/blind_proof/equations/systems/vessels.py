@@ -116,9 +116,7 @@ THERMAL_STEP = 5.0
 
 
 def thermal_rate(x: Array, u: Array, p: Array) -> Array:
-    return np.array(
-        [p[2] * u[0] - p[0] * (x[0] - p[4]), p[3] * u[1] - p[1] * (x[1] - p[4])],
-    )
+    return np.array([p[2] * u[0] - p[0] * (x[0] - p[4]), p[3] * u[1] - p[1] * (x[1] - p[4])])
 
 
 def thermal_draw(g: Generator) -> Setting:
@@ -157,9 +155,8 @@ def thermal_trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet
 def glow(g: Generator, scene: SystemScene, state: str) -> HiddenTerm:
     row = scene.plant.row(state)
     form = flows.radiation(row, scene.plant.parameters["room"], uniform(g, 0.0, 1e-3))
-    return HiddenTerm(
-        "thermal_loss", "radiation to the walls", (hidden.rate_of(state),), scene.pace(state) / 50.0, form
-    )
+    large = scene.pace(state) / 50.0
+    return HiddenTerm("thermal_loss", "radiation to the walls", (hidden.rate_of(state),), large, form)
 
 
 def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:

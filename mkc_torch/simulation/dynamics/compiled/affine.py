@@ -10,8 +10,6 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 
-__all__ = ["Affine", "inverted", "multiplied"]
-
 _FEW = 128
 """Number of grid times up to which products over 1, 2, 4 ... intervals replace halving."""
 

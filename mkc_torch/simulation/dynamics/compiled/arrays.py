@@ -25,8 +25,6 @@ from mkc_torch.simulation.dynamics.compiled.functions import CompiledObserverJum
 if TYPE_CHECKING:
     from mkc_torch.simulation.dynamics.compiled.traced import Traced
 
-__all__ = ["ArrayCollocation", "ArraySystem"]
-
 
 class ArraySystem:
     """A traced system on a grid.

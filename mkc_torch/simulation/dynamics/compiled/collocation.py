@@ -23,21 +23,6 @@ from mkc_torch.simulation.dynamics.settings import (
     STALLED,
 )
 
-__all__ = [
-    "ArrayGrid",
-    "Collocation",
-    "CollocationSolution",
-    "Factor",
-    "Functions",
-    "JumpFunctions",
-    "LinearisedCollocation",
-    "ParameterSources",
-    "linearised",
-    "marched",
-    "solved",
-    "solved_to",
-]
-
 
 class JumpFunctions(Protocol):
     """A jump of the states at grid times; see :class:`..trajectory.Jump`."""

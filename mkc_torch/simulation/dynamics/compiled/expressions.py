@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FUNCTIONS", "Array", "Expressions", "Node"]
-
 Array = NDArray[np.float64]
 
 CONSTANT, PARAMETER, STATE = 0, 1, 2
-"""Level of a node: the last kind of leaf that it depends on."""
+"""Level of a node: the highest kind of leaf that it depends on."""
 
 
 def _sigmoid(x: Any) -> Any:
@@ -256,10 +254,7 @@ _RULES: dict[str, tuple[_Rule, ...]] = {
     "sub": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(-1.0))),
     "mul": (_of(lambda _e, _n, _a, b: b), _of(lambda _e, _n, a, _b: a)),
     "div": (_of(lambda e, _n, _a, b: _inverse(e, b)), _of(lambda e, n, _a, b: _negative(e, _ratio(e, n, b)))),
-    "pow": (
-        _of(lambda e, _n, a, b: _power(e, a, b)),
-        _of(lambda e, n, a, _b: _logarithmic(e, n, a)),
-    ),
+    "pow": (_of(lambda e, _n, a, b: _power(e, a, b)), _of(lambda e, n, a, _b: _logarithmic(e, n, a))),
     "neg": (_of(lambda e, _n, _a: e.number(-1.0)),),
     "abs": (_of(lambda e, _n, a: e.apply("sign", a)),),
     "sqrt": (_of(lambda e, n, _a: _ratio(e, e.number(0.5), n)),),

@@ -16,8 +16,6 @@ from mkc_torch.simulation.dynamics.compiled.traced import Traceable, traced
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["is_faithful"]
-
 _FAITHFUL = 1e-9
 """Largest relative difference between traced functions and torch."""
 
@@ -26,10 +24,6 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
     """Whether a system's traced functions have the same values and derivatives as torch, near the guess.
 
     They differ where a function defines its own derivative, as a ``torch.autograd.Function`` may.
-
-    Args:
-        system: the prepared system.
-        theta: (p,), its parameters.
     """
     found = traced(system, lambda parameters: (parameters, {}), len(theta))
     if found is None:

@@ -14,8 +14,6 @@ from mkc_torch.simulation.dynamics.compiled.collocation import dense
 from mkc_torch.simulation.dynamics.compiled.expressions import Array, Expressions
 from mkc_torch.simulation.dynamics.compiled.tape import Evaluation, Tape
 
-__all__ = ["CompiledBlock", "CompiledObserverJump", "Derivatives"]
-
 
 class Derivatives:
     """Sparse derivatives of several nodes by several leaves.
@@ -28,11 +26,7 @@ class Derivatives:
     """
 
     def __init__(
-        self,
-        expressions: Expressions,
-        nodes: Sequence[int],
-        leaves: Sequence[int],
-        arranged: Callable[[Array], Array],
+        self, expressions: Expressions, nodes: Sequence[int], leaves: Sequence[int], arranged: Callable[[Array], Array]
     ) -> None:
         nothing, columns = expressions.number(0.0), {leaf: j for j, leaf in enumerate(leaves)}
         slopes = {

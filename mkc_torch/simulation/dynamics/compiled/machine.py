@@ -11,12 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkc_torch.simulation.dynamics.compiled.affine import Affine
-from mkc_torch.simulation.dynamics.compiled.collocation import (
-    ArrayGrid,
-    CollocationSolution,
-    Factor,
-    ParameterSources,
-)
+from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, CollocationSolution, Factor, ParameterSources
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock, CompiledObserverJump, Derivatives
 from mkc_torch.simulation.dynamics.compiled.program import Program, ProgramAt
@@ -25,8 +20,6 @@ from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 
 if TYPE_CHECKING:
     from mkc_torch.simulation.dynamics.compiled.traced import Traced
-
-__all__ = ["MachineCollocation", "MachineSystem", "machine_system"]
 
 
 def machine_system(

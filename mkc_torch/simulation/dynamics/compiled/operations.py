@@ -12,8 +12,6 @@ from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 from mkc_torch.simulation.dynamics.compiled.shapes import SHAPES
 from mkc_torch.simulation.dynamics.compiled.symbol import Nodes, Symbol, UntraceableError, as_nodes
 
-__all__ = ["OPERATIONS"]
-
 
 def _pointwise(build: Callable[..., int], values: Sequence[Any], dtype: torch.dtype | None = None) -> Symbol:
     """Apply an operation to each element, with torch's broadcasting."""
@@ -126,14 +124,6 @@ def _copied(values: Symbol, *, dtype: torch.dtype | None = None, **_: Any) -> Sy
     return _operation("double")(values)
 
 
-def _logical_not(values: Any) -> Symbol:
-    return _operation("logical_not", torch.bool)(values)
-
-
-def _boolean(name: str) -> Callable[..., Symbol]:
-    return _operation(name, torch.bool)
-
-
 _SAME = (
     *("neg", "abs", "sign", "sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("atan2", "sinh", "cosh", "tanh", "sigmoid", "hypot", "maximum", "minimum", "relu", "floor", "ceil", "trunc"),
@@ -145,7 +135,7 @@ OPERATIONS: Mapping[str, Callable[..., Any]] = {
     **SHAPES,
     **{name: _operation(name) for name in _SAME},
     **{
-        name: _boolean(name)
+        name: _operation(name, torch.bool)
         for name in ("gt", "ge", "lt", "le", "eq", "ne", "logical_and", "logical_or", "logical_not")
     },
     "add": _scaled("add"),

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from mkc_torch.simulation.dynamics.compiled.expressions import STATE, Array, Expressions
 from mkc_torch.simulation.dynamics.compiled.tape import Tape, needed_nodes
 
-__all__ = ["Program", "ProgramAt"]
-
 ProgramAt = tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], int]
 """A program at given parameters, see :mod:`mkc_torch.simulation.dynamics.loops.programs`."""
 

@@ -14,13 +14,7 @@ from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
 from mkc_torch.simulation.dynamics.compiled.arrays import ArraySystem
-from mkc_torch.simulation.dynamics.compiled.collocation import (
-    ArrayGrid,
-    Collocation,
-    Factor,
-    ParameterSources,
-    marched,
-)
+from mkc_torch.simulation.dynamics.compiled.collocation import ArrayGrid, Collocation, Factor, ParameterSources, marched
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.compiled.machine import MachineSystem, machine_system
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
@@ -30,8 +24,6 @@ from mkc_torch.simulation.ports import Answer, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-__all__ = ["CompiledDynamics", "compiled_dynamics"]
 
 
 def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> CompiledDynamics | None:

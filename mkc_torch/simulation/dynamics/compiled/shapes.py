@@ -14,8 +14,6 @@ from torch import Tensor
 from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 from mkc_torch.simulation.dynamics.compiled.symbol import Nodes, Symbol, UntraceableError, as_nodes
 
-__all__ = ["SHAPES"]
-
 
 def _axis(dim: int, count: int) -> int:
     return dim + count if dim < 0 else dim

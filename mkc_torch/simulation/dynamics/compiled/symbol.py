@@ -13,8 +13,6 @@ from torch import Tensor
 
 from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
 
-__all__ = ["Nodes", "Part", "Symbol", "Trace", "UntraceableError", "as_nodes", "parameter_symbol", "state_symbol"]
-
 Nodes = NDArray[np.int64]
 """Nodes in the shape of a tensor, with length 1 along its time axis."""
 

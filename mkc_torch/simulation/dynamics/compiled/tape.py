@@ -9,8 +9,6 @@ import numpy as np
 
 from mkc_torch.simulation.dynamics.compiled.expressions import CONSTANT, FUNCTIONS, PARAMETER, STATE, Array, Expressions
 
-__all__ = ["Evaluation", "Tape", "needed_nodes"]
-
 _Step = tuple[Callable[..., Any], int, tuple[int, ...]]
 
 

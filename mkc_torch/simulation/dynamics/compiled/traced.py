@@ -29,8 +29,6 @@ from mkc_torch.simulation.ports import Changes
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Traceable", "Traced", "traced"]
-
 _FEWEST = 16
 """Smallest number of samples, plus the number of parameters, that distinguishes the time axis from other axes."""
 

@@ -10,8 +10,6 @@ from mkc_torch.simulation.dynamics.loops.equations import defects, linearise_abo
 from mkc_torch.simulation.dynamics.loops.programs import jitable
 from mkc_torch.simulation.dynamics.settings import HALVINGS, MOST_STEPS, QUICK, ROUGHLY, ROUNDING, SETTLED, STALLED
 
-__all__ = ["solve_equations", "solve_roughly"]
-
 
 @jitable
 def _scale_of(states: Any, scale: Any) -> None:

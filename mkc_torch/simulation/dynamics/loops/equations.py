@@ -18,8 +18,6 @@ import numpy as np
 
 from mkc_torch.simulation.dynamics.loops.programs import BLOCK, jitable, loaded, registers, run
 
-__all__ = ["defects", "linearise_about", "linearise_equations", "parameter_sources"]
-
 _LEFT, _MIDDLE, _RIGHT = 0, 1, 2
 
 

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["filter_samples"]
-
 
 def filter_samples(
     transition: Any,

@@ -10,8 +10,6 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-__all__ = ["machine_code"]
-
 OFF = "MKC_WITHOUT_NUMBA"
 """Environment variable that disables Numba."""
 

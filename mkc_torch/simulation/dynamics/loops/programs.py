@@ -19,8 +19,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["BLOCK", "CODES", "jitable", "loaded", "registers", "run"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 jitable = cast(Callable[[F], F], register_jitable)
@@ -77,7 +75,7 @@ def run(program: Any, rows: Any, count: int) -> None:
     code = program[0]
     for i in range(len(code)):
         op, t, a, b, c = code[i, 0], code[i, 1], code[i, 2], code[i, 3], code[i, 4]
-        # only frequent operations have a loop of their own: each takes time to compile
+        # only frequent operations have their own loop, because each loop takes time to compile
         if op == _ADD:
             for k in range(count):
                 rows[t, k] = rows[a, k] + rows[b, k]

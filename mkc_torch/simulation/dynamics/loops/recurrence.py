@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["pass_on"]
-
 
 def pass_on(carries: Any, values: Any) -> None:
     """Solve ``δ[k+1] = A[k] δ[k] + v[k+1]`` in place.

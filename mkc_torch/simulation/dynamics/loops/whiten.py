@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["whiten_samples"]
-
 
 def whiten_samples(
     transition: Any,
