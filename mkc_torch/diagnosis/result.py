@@ -76,7 +76,9 @@ __all__ = [
 ]
 
 _QUICK = (
-    "Quick look: no p-values, false-alarm rate not controlled. Leave out --quick (in Python quick=True) to have both."
+    "Quick look: no p-values, false-alarm rate not controlled. Left out: surrogates, fits from further starts, slow "
+    "tests of evidence, and the states and runs in which an effect gains; for differential equations also unseen "
+    "blocks, shapes and further findings. Leave out --quick (in Python quick=True) to have all."
 )
 
 

@@ -137,7 +137,7 @@ class SearchSettings(_Stage):
         doubted: nats beyond all surrogates up to which surrogates of other plausible noise are drawn too.
         own_noise: number of leading candidates that are refitted and compared, each under its own remaining process
             noise.
-        behind: nats behind the best first fit from which a candidate is not refitted, added to
+        behind: nats behind the best first fit from which a candidate is not refitted or reshaped, added to
         behind_share: this share of the best gain. Set on a simulated cart and a servo, where such candidates ended 90
             to 430 nats behind.
         stretches: number of equal stretches in a recording.

@@ -16,7 +16,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.ports import Changes, Nearby
-from mkc_torch.simulation.protocol import ClosedForm
+from mkc_torch.simulation.protocol import ClosedForm, Jacobian
 from mkc_torch.simulation.runs import successive_runs
 
 if TYPE_CHECKING:
@@ -141,6 +141,9 @@ class Paired:
 
 class PreparedPaired(ClosedForm):
     """The output of a simulator together with a recording."""
+
+    jacobian: Jacobian = "reverse twice"
+    """Effects of outputs across samples are many small operations."""
 
     def __init__(self, system: Paired, recording: Recording, shared: tuple[str, ...], curve: _Curve) -> None:
         self.system, self.name = system, system.name

@@ -140,7 +140,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
         located: its search result.
         final: the final parameters.
         number: of the effect among the model's terms.
-        quick: True for a quick look, without surrogates and p-values.
+        quick: True for a quick look, without p-values and without the states and runs where the effect gains.
     """
     term = final.fit.model.terms[number]
     gamma, covariance = _own(final, number)
@@ -148,7 +148,7 @@ def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quic
     channels = places_of(term, context.channels)
     plausible, text = _plausibility(term, gamma, context)
     cannot_be = far_from_plausible(term, gamma, context)
-    where = attributed(final.fit, number)
+    where = None if quick else attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
     of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
     approximations = formulas(curve) if of_motion_or_driver and curve is not None else ()

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import scored
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.result import Region, StateMap
 
 if TYPE_CHECKING:
@@ -91,9 +92,10 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
     for node, weight in zip(1.0 - less**2, less * weights, strict=True):
         parameters = fit.parameters.clone()
         parameters[mine] = node * gamma
+        model = model.around(parameters)  # each evaluation starts from a solution
         there = model.signals(parameters)[term.port]
 
-        def likelihood(change: Tensor, parameters: Tensor = parameters) -> Tensor:
+        def likelihood(change: Tensor, parameters: Tensor = parameters, model: JointModel = model) -> Tensor:
             return scored(model.residual_with_change(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
 
         slope = torch.func.grad(likelihood)(there.new_zeros(len(there), width))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.settings import NoiseSettings
 
@@ -57,6 +59,33 @@ class FittedModel:
     def pseudo(self, settings: NoiseSettings) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
         """Return the pseudo-residual and its mask, (N, m) each."""
         return pseudo_residual(self.residual, self.sigma, self.d, settings.rejected_below)
+
+    @cached_property
+    def open_loop(self) -> FittedModel | None:
+        """The fit of the same joint model in open loop, for several stages; None if that loses the recording.
+
+        The more likely of a fit from these parameters and of one with a graduated start.
+        """
+        prepared = self.model.prepared.open_loop()
+        if prepared is self.model.prepared:
+            return self
+        model = JointModel(prepared, self.model.terms, self.model.near)
+        both = run_parallel(
+            [partial(_tried, model, self, graduate) for graduate in (False, True)], prepared, model.terms
+        )
+        return max((found for found in both if found is not None), key=lambda found: found.log_likelihood, default=None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the open-loop fit: another process rarely needs it."""
+        return {name: value for name, value in vars(self).items() if name != "open_loop"}
+
+
+def _tried(model: JointModel, like: FittedModel, graduate: bool) -> FittedModel | None:
+    """Fit a model from the parameters of another fit; None where the simulation has no finite result."""
+    try:
+        return fitted(model, like.parameters, like.bound, graduate=graduate)
+    except nonlinear.NoFitError:
+        return None
 
 
 def fitted(

@@ -292,20 +292,8 @@ def refit_input_hold(
 
 
 def refit_open_loop(fit: FittedModel) -> FittedModel | None:
-    """Fit the same joint model in open loop; None if that loses the recording."""
-    prepared = fit.model.prepared.open_loop()
-    if prepared is fit.model.prepared:
-        return fit
-    model = JointModel(prepared, fit.model.terms, fit.model.near)
-
-    def tried(graduate: bool) -> FittedModel | None:
-        try:
-            return fitted(model, fit.parameters, fit.bound, graduate=graduate)
-        except NoFitError:
-            return None
-
-    both = run_parallel([partial(tried, False), partial(tried, True)], prepared, fit.model.terms)
-    return max((found for found in both if found is not None), key=lambda found: found.log_likelihood, default=None)
+    """Return the open-loop fit of the same joint model; None if that loses the recording."""
+    return fit.open_loop
 
 
 def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:

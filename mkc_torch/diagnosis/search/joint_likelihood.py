@@ -125,10 +125,14 @@ class _LinearisedRecording:
     columns: Columns
     largest: Float[np.ndarray, " p+m"]
 
-    def likelihoods(self, models: Sequence[NoiseModel], draws: SeriesAlong | None = None) -> LogLikelihoods:
-        series = self.series if draws is None else joined(self.series, draws)
-        thing = "kind of noise" if draws is None else "draws under noise"
-        return log_likelihoods(self.counted, models, series, self.columns, self.largest, thing)
+    def likelihoods(self, models: Sequence[NoiseModel]) -> LogLikelihoods:
+        """Return the recording's log-likelihoods under noise models."""
+        return log_likelihoods(self.counted, models, self.series, self.columns, self.largest, "kind of noise")
+
+    def with_draws(self, near: LogLikelihoods, draws: SeriesAlong) -> LogLikelihoods:
+        """Return the log-likelihoods of the recording and of surrogates under the models of an earlier result."""
+        series, thing = joined(self.series, draws), "draws under noise"
+        return log_likelihoods(self.counted, near.models, series, self.columns, self.largest, thing, near.products)
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the whitened recording given a candidate (N, m), the candidate's sizes and the parameters' shift."""
@@ -347,12 +351,12 @@ def _surrogate_test(
     """
     gained = np.zeros((len(found.rank), 0))
     own = found.with_candidate[:, :, 0].max(0) - found.without[:, 0].max()
-    models = found.near_the_best(_FAR_BEHIND).models
+    near = found.near_the_best(_FAR_BEHIND)
     for count in (min(_FIRST_DRAWS, draws), draws - min(_FIRST_DRAWS, draws)):
         if not count:
             break
-        some = scene.likelihoods(models, _drawn(scene, found.models[kind], left, count, generator))
-        models = some.near_the_best(_HOPELESS).models
+        some = scene.with_draws(near, _drawn(scene, found.models[kind], left, count, generator))
+        near = some.near_the_best(_HOPELESS)
         drawn = some.with_candidate[:, :, 1:].max(0) - some.without[:, 1:].max(0)
         gained = np.concatenate([gained, drawn], 1)
         usual = np.quantile(gained, _USUAL, axis=1, keepdims=True)

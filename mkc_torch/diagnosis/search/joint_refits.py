@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, compress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.linearise import linearise
 from mkc_torch.diagnosis.search.problem import LinearizedSearch, refined
-from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, best_first, in_order, schwarz
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, best_first, in_order, schwarz, within_reach
 from mkc_torch.diagnosis.search.tangents import ModelTangents, tangents_of
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.nonlinear import NoFitError
@@ -74,7 +74,7 @@ def strongest(
         ]
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
-    fits = _with_fitted_shapes(fits, base)
+    fits = _with_fitted_shapes(fits, base, prefer, search)
     best_log_p = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in in_order((-best_log_p).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
@@ -170,14 +170,17 @@ def _refit_all(
     return done[len(works) :]
 
 
-def _with_fitted_shapes(fits: dict[Key, FittedModel], base: FittedModel) -> dict[Key, FittedModel]:
-    """Return the fits with their shape numbers fitted, for effects that act through a trajectory.
+def _with_fitted_shapes(
+    fits: dict[Key, FittedModel], base: FittedModel, prefer: ModelPrior, settings: SearchSettings
+) -> dict[Key, FittedModel]:
+    """Return the fits with the shape numbers of those within reach fitted, for effects that act through a trajectory.
 
     At the shapes of the grid a wide dead zone can be far less likely than a constant force, and the comparison would
     depend on the grid.
     """
     known = base.model.prepared
-    places = [key for key, fit in fits.items() if known.ports[fit.model.terms[-1].port].clock is not None]
+    near = within_reach([prefer.score(fit, base) for fit in fits.values()], settings)
+    places = [key for key in compress(fits, near) if known.ports[fits[key].model.terms[-1].port].clock is not None]
     shaped = run_parallel(
         [partial(shape_fitted, fits[key]) for key in places],
         known,
@@ -190,11 +193,13 @@ def _with_fitted_shapes(fits: dict[Key, FittedModel], base: FittedModel) -> dict
 def _leading(
     fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior, settings: SearchSettings
 ) -> list[FittedModel]:
-    """Return the leading fits, and a further fit if it is close behind."""
+    """Return the leading fits that are within reach of the first, and a further fit if it is close behind."""
     leading = settings.leading
     first = best_first(fits, base, prefer)[: leading + 1]
-    close = max(settings.third_share * prefer.score(first[0], base), settings.third_nats)
-    return [fit for place, fit in enumerate(first) if place < leading or prefer.score(fit, base) > close]
+    scores = [prefer.score(fit, base) for fit in first]
+    close = max(settings.third_share * scores[0], settings.third_nats)
+    first = [fit for place, fit in enumerate(first) if place < leading or scores[place] > close]
+    return list(compress(first, within_reach(scores, settings)))
 
 
 def _at_best_shapes(

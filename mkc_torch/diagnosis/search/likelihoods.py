@@ -25,6 +25,7 @@ from mkc_torch.simulation.dynamics.whitening import (
     joined,
     whitened,
     whitened_in_blocks,
+    whitened_transposed,
 )
 
 if TYPE_CHECKING:
@@ -70,6 +71,10 @@ class Columns:
         return slice(first, first + self.sizes[number])
 
 
+Products = list[tuple[np.ndarray, np.ndarray]]
+"""For each group of candidates of q numbers: products (c, q, q) of their tangents over the norms, and norms (c, q)."""
+
+
 @dataclass(frozen=True)
 class LogLikelihoods:
     """Log-likelihoods of Y series under B noise models, and the first series' estimates.
@@ -81,6 +86,7 @@ class LogLikelihoods:
         sizes: (B, q), of all candidates one after the other, for the first series.
         rank: (C,), number of directions of each candidate that the parameters leave.
         scale: (B, C), of the first series' noise with each candidate, relative to the model's.
+        products: of the candidates' tangents under each model; None for an impossible model.
     """
 
     models: tuple[NoiseModel, ...]
@@ -89,6 +95,7 @@ class LogLikelihoods:
     sizes: Float[np.ndarray, "B q"]
     rank: Float[np.ndarray, " C"]
     scale: Float[np.ndarray, "B C"]
+    products: tuple[Products | None, ...]
 
     def and_more(self, other: LogLikelihoods) -> LogLikelihoods:
         """Append the log-likelihoods under other models."""
@@ -99,6 +106,7 @@ class LogLikelihoods:
             np.concatenate([self.sizes, other.sizes]),
             np.maximum(self.rank, other.rank),
             np.concatenate([self.scale, other.scale]),
+            (*self.products, *other.products),
         )
 
     def near_the_best(self, within: float) -> LogLikelihoods:
@@ -112,6 +120,7 @@ class LogLikelihoods:
             self.sizes[kept],
             self.rank,
             self.scale[kept],
+            tuple(self.products[number] for number in kept),
         )
 
 
@@ -128,6 +137,7 @@ def log_likelihoods(
     columns: Columns,
     largest: Float[np.ndarray, " p+m"] | None = None,
     thing: str = "",
+    known: Sequence[Products | None] | None = None,
 ) -> LogLikelihoods:
     """Compute the log-likelihoods; -inf if a disturbance, at its most likely scale, is implausibly large.
 
@@ -138,6 +148,7 @@ def log_likelihoods(
         columns: tangents that may explain them.
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
         thing: name of a noise model in the progress.
+        known: products of the tangents under each model, from an earlier result for the same flow and tangents.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
     used = flow.counts > 0
@@ -146,6 +157,7 @@ def log_likelihoods(
     groups = _by_size(columns.sizes)
     own, candidates = _split(columns, groups)
     free = not any(models[0].known)
+    kept: list[Products | None] = [None] * B
     for number, gains, place, values in counted(_under_each(flow, models, joined(series, own)), B, thing):
         check_deadline()
         rows = values[used]
@@ -154,9 +166,12 @@ def log_likelihoods(
         y, moved = np.split(rows, [Y], 1)
         basis, log_det = _basis(moved)
         left = y - basis @ (basis.T @ y)
-        products = _products(flow, gains, place, candidates, basis, left, groups)
+        before = None if known is None else known[number]
+        products = None if before is None else _products_with(flow, gains, place, candidates, left, before)
+        products = products or _products(flow, gains, place, candidates, basis, left, groups)
         if products is None:
             continue
+        kept[number] = [(gram, norm) for gram, _, norm in products]
         n = len(rows) - basis.shape[1]
         level = -gains.log_spread[place] - log_det - PRICE * len(models[number].components)
         power = np.square(left).sum(0)
@@ -173,7 +188,7 @@ def log_likelihoods(
             sizes[number, index] = solved / norm
             rank[members] = np.maximum(rank[members], found)
             scale[number, members] = size[:, 0]
-    return LogLikelihoods(tuple(models), without, with_candidate, sizes, rank, scale)
+    return LogLikelihoods(tuple(models), without, with_candidate, sizes, rank, scale, tuple(kept))
 
 
 def _under_each(
@@ -281,6 +296,37 @@ def _products(
         if not (np.isfinite(rest).all() and np.isfinite(inner).all()):
             return None
         found.append((rest.transpose(2, 0, 1), (inner / norm).transpose(2, 1, 0), norm.T))
+    return found
+
+
+def _products_with(
+    flow: Flow,
+    gains: FilterGains,
+    number: int,
+    candidates: SeriesAlong,
+    left: Float[np.ndarray, "M Y"],
+    known: Products,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]] | None:
+    """Return the result of :func:`_products` with known products of the tangents; None where that is not possible.
+
+    The transposed whitening of the few series replaces the whitening of the many tangents.
+    """
+    innovations = np.zeros((*flow.counts.shape, left.shape[1]))
+    innovations[flow.counts > 0] = left
+    back = whitened_transposed(flow, gains, number, innovations)
+    if back is None:
+        return None
+    K, Y = candidates.count, left.shape[1]
+    inner = candidates.new.reshape(-1, K).T @ back.new.reshape(-1, Y)
+    inner += candidates.shift.reshape(-1, K).T @ back.shift.reshape(-1, Y)
+    if not np.isfinite(inner).all():
+        return None
+    found, place = [], 0
+    for gram, norm in known:
+        c, q = norm.shape
+        here = inner[place : place + q * c].reshape(q, c, Y).swapaxes(0, 1)
+        found.append((gram, here / norm[..., None], norm))
+        place += q * c
     return found
 
 

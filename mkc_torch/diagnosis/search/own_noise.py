@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["free_runs", "linear_gains", "needless_term", "priced", "with_own_noise", "without"]
+__all__ = ["FreeRuns", "free_runs", "linear_gains", "needless_term", "priced", "with_own_noise", "without"]
 
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
@@ -98,21 +98,28 @@ BEHIND_SHARE = 0.5
 """Share of the largest gain by which a dropped fit is behind."""
 
 
-def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> list[tuple[int, FittedModel]]:
+class FreeRuns(NamedTuple):
+    """Open-loop fits of candidates: for each effect the number of its initial term, and its fit.
+
+    ``behind`` are the effects whose fits are too far behind the best.
+    """
+
+    fits: list[tuple[int, FittedModel]]
+    behind: frozenset[Key] = frozenset()
+
+
+def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> FreeRuns:
     """Fit in open loop the candidates that gain most over the open-loop simulation.
 
     Args:
         free: the open-loop fit without a candidate.
         terms: candidates.
         settings: of the diagnosis.
-
-    Returns:
-        For each effect the number of its initial term, and its fit.
     """
     gains, sizes = linear_gains(free, terms, settings)
     chosen = _chosen(gains, terms)
     if not chosen:
-        return []
+        return FreeRuns([])
     known = free.model.prepared, [terms[number] for number in chosen]
     works = [partial(_fit, free, terms[number], sizes[number]) for number in chosen]
     best: dict[Key, tuple[int, FittedModel]] = {}
@@ -123,7 +130,8 @@ def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> l
     kept = _near([fit.log_likelihood - free.log_likelihood for _, fit in best.values()])
     leading = [pair for pair, near in zip(best.values(), kept, strict=True) if near]
     shaped = run_parallel([partial(shape_fitted, fit) for _, fit in leading], *known)
-    return [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
+    fits = [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
+    return FreeRuns(fits, frozenset(best) - {terms[number].key for number, _ in leading})
 
 
 def linear_gains(

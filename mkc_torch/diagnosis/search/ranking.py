@@ -14,13 +14,13 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import ANY, Driver, Key, Term, continuous
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.search.problem import LinearizedSearch
-from mkc_torch.diagnosis.settings import NamingSettings
+from mkc_torch.diagnosis.settings import NamingSettings, SearchSettings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ModelPrior", "Ranked", "alike", "best_first", "in_order", "ranked", "schwarz"]
+__all__ = ["ModelPrior", "Ranked", "alike", "best_first", "in_order", "ranked", "schwarz", "within_reach"]
 
 AKAIKE = 1.0
 """Nats per number (Akaike's criterion)."""
@@ -141,6 +141,18 @@ def best_first(fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrio
     """Return joint fits by descending score."""
     scores = [prefer.score(fit, base) for fit in fits]
     return [fits[place] for place in in_order(scores, [fit.model.terms[-1] for fit in fits])]
+
+
+def within_reach(scores: Sequence[float], settings: SearchSettings) -> list[bool]:
+    """Return whether each score is so close to the best that a refit may come near it.
+
+    Example:
+        >>> within_reach([400.0, 160.0, 140.0], SearchSettings())
+        [True, True, False]
+    """
+    best = max(scores, default=0.0)
+    least = best - settings.behind - settings.behind_share * max(best, 0.0)
+    return [score >= least for score in scores]
 
 
 @dataclass(frozen=True)

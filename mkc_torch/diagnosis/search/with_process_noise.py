@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 
 import torch
 from torch import Tensor
@@ -25,9 +26,9 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.open_loop_gain import with_open_loop_gain
-from mkc_torch.diagnosis.search.own_noise import free_runs, priced, with_own_noise
+from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
-from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, within_reach
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.significance import price
 from mkc_torch.diagnosis.search.tangents import tangents_of
@@ -123,20 +124,22 @@ def search_with_process_noise(
     keep(located)
     fits: Sequence[FittedModel] = ()
     p_value = found.p_value
-    runs = [] if quick or free is None else free_runs(free, terms, settings)
+    runs, behind = FreeRuns([]) if quick or free is None else free_runs(free, terms, settings)
     if p_value > level and _plain(base, [fit for _, fit in runs], terms, declared, settings):
         p_value = 1.0 / (1.0 + surrogates)
     if p_value <= level:
         chosen = _chosen(found, ranking, terms, settings.search.own_noise)
         common = base.model.prepared, [terms[number] for number in chosen]
         first = run_parallel([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common, _FIT)
-        chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
+        near = within_reach([prefer.score_with_shape(fit, base) for fit in first], settings.search)
+        chosen, first = list(compress(chosen, near)), list(compress(first, near))
         known = {terms[number].key: fit for number, fit in runs}
         works = []
         for number, fit in zip(chosen, first, strict=True):
             gamma, running = found.start(number).gamma, known.pop(terms[number].key, None)
+            own = None if terms[number].key in behind else free
             works.append(
-                partial(_best_start, base, free, terms[number], fit, gamma, declared, settings, running, quick=quick)
+                partial(_best_start, base, own, terms[number], fit, gamma, declared, settings, running, quick=quick)
             )
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
         works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
@@ -221,15 +224,6 @@ def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
     return torch.where(far & (torch.arange(len(parameters)) < own), base.parameters, parameters)
 
 
-def _within_reach(
-    chosen: Sequence[int], fits: Sequence[FittedModel], scores: Sequence[float], settings: Settings
-) -> tuple[list[int], list[FittedModel]]:
-    """Return the candidates, with their first fits, that are close enough to the best to come near it."""
-    least = max(scores) - settings.search.behind - settings.search.behind_share * max(max(scores), 0.0)
-    kept = [place for place, score in enumerate(scores) if score >= least]
-    return [chosen[place] for place in kept], [fits[place] for place in kept]
-
-
 def _best_start(
     base: FittedModel,
     free: FittedModel | None,
@@ -245,8 +239,8 @@ def _best_start(
     """Return the better joint fit of a candidate under its remaining noise: from its first fit or from open loop.
 
     Process noise of the first fit has absorbed part of the effect, and keeps some of it. A quick look starts from open
-    loop only if the first fit is no more likely than the simulation alone. ``running`` is the candidate's open-loop
-    fit, if known.
+    loop only if the first fit is no more likely than the simulation alone. ``free`` is None where the open loop is
+    not tried: there is none, or the candidate is far behind there. ``running`` is its open-loop fit, if known.
     """
     under = with_own_noise(fit, declared, settings)
     if free is None or not has_process_noise(under):

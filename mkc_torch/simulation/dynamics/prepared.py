@@ -263,7 +263,7 @@ class PreparedDynamics(ObservedDynamics):
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes, near)
-        inputs = self._inputs(theta, changes)
+        inputs = self.acting_inputs(theta, changes)
         jump = self.jump(theta, changes)
         at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
@@ -322,9 +322,12 @@ class PreparedDynamics(ObservedDynamics):
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         return self.with_memories(begin, memories), memories
 
-    def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
-        """The function for the rates of the states, the effects' internal states and the lasting disturbances."""
-        inputs = self._inputs(theta, changes)
+    def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+        """The function for the rates of the states, the effects' internal states and the lasting disturbances.
+
+        ``inputs`` are the acting inputs at the stations if they are known.
+        """
+        inputs = self.acting_inputs(theta, changes) if inputs is None else inputs
         remembering = self.remembering(changes)
         rows = [*self.system.states, *(name for memory in remembering.values() for name in memory)]
         lasting, n = self.lasting, len(self.system.states)
@@ -377,7 +380,8 @@ class PreparedDynamics(ObservedDynamics):
         values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
         return [v + torch.zeros_like(states[:, 0]) for v in values]
 
-    def _inputs(self, theta: Tensor, changes: Changes) -> Tensor:
+    def acting_inputs(self, theta: Tensor, changes: Changes) -> Float[Tensor, "S u"]:
+        """The inputs at the stations, with effects and the actuator."""
         if not self.system.inputs:
             return self.inputs
         columns = {

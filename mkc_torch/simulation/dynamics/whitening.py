@@ -16,7 +16,7 @@ import numpy as np
 
 from mkc_torch.simulation.dynamics.kalman import FilterModels, Flow
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
-from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
+from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples, whiten_transposed
 from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 
 if TYPE_CHECKING:
@@ -155,6 +155,33 @@ def whitened_in_blocks(
             series.new[rows], series.shift[on], start, here,
         )  # fmt: skip
         yield rows, here[0]
+
+
+def whitened_transposed(
+    flow: Flow, gains: FilterGains, number: int, innovations: Float[np.ndarray, "N m K"]
+) -> SeriesAlong | None:
+    """Apply the transpose of the whitening under one noise model; None without Numba.
+
+    The product of any whitened series with innovations is that of the series with the result, so that many series need
+    not be whitened again.
+
+    Args:
+        flow: the linearised trajectory.
+        gains: the filters of the models.
+        number: index of the model.
+        innovations: K series of innovations.
+    """
+    compiled = machine_code(whiten_transposed)
+    if compiled is None:
+        return None
+    part = slice(number, number + 1)
+    models = gains.models.part(part)
+    found = SeriesAlong(
+        np.empty_like(innovations), np.empty((len(flow.shift), flow.shift.shape[1], innovations.shape[2]))
+    )
+    known = _carried(flow, models), _seen(flow, models), gains.gain[:, part], gains.white[:, part]
+    compiled(*(np.ascontiguousarray(array[:, 0]) for array in known), innovations, found.new, found.shift)
+    return found
 
 
 def relative_to(

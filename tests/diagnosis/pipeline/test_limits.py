@@ -127,13 +127,14 @@ def test_a_quick_look_finds_the_same_without_surrogates(monkeypatch, case, effec
     monkeypatch.setattr("mkc_torch.diagnosis.search.run.surrogate_p_value", refuse)
     monkeypatch.setattr("mkc_torch.diagnosis.search.run.surrogate_p_value", refuse)
     monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood._drawn", refuse)
+    monkeypatch.setattr("mkc_torch.diagnosis.findings.finding.attributed", refuse)
     result = diagnose(*case(), quick=True)
     (finding,) = result.findings
     assert (finding.effect, finding.grade, finding.p_value) == (effect, grade, None)
     assert (result.quick, result.p_value, result.surrogates, result.stop) == (True, None, 0, None)
     content = json.loads(diagnosis_to_json(result))
     assert (content["p_value"], content["search"]["quick"], content["search"]["surrogates"]) == (None, True, 0)
-    assert content["warnings"][0].startswith("Quick look: no p-values, false-alarm rate not controlled.")
+    assert content["warnings"][0].startswith("Quick look: no p-values, false-alarm rate not controlled. Left out: ")
     page = diagnosis_report(result)
     assert page.index("Quick look: no p-values") < page.index("<h1")
     assert result.advice[0] == "Confirm it by a full diagnosis."

@@ -1,6 +1,7 @@
 """Candidates that act through a trajectory are compared at fitted shapes, not at those of the grid."""
 
 import functools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from mkc_torch.diagnosis.model.fit import fitted, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
-from mkc_torch.diagnosis.search.joint_refits import _with_fitted_shapes, strongest
+from mkc_torch.diagnosis.search.joint_refits import _leading, _with_fitted_shapes, strongest
 from mkc_torch.diagnosis.search.ranking import ModelPrior
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
@@ -59,9 +60,24 @@ def test_a_wide_dead_zone_gains_by_its_fitted_width():
     model = alone().model.with_term(term)
     start = torch.cat([alone().parameters, torch.full((1,), 0.5).double()])
     fit = fitted_with_effect(alone(), model, start, graduate=False)
-    (shaped,) = _with_fitted_shapes({term.key: fit}, alone()).values()
+    prefer = ModelPrior(candidates(), alone().model.prepared, Settings().naming)
+    (shaped,) = _with_fitted_shapes({term.key: fit}, alone(), prefer, Settings().search).values()
     assert shaped.model.terms[-1].shape["width"] == pytest.approx(WIDTH, rel=0.05)
     assert shaped.log_likelihood > fit.log_likelihood + 100.0
+
+
+def test_fits_far_behind_keep_their_shapes_and_do_not_lead():
+    term = next(term for term in candidates() if term.effect.id == "dead_zone")
+    model, prepared = alone().model.with_term(term), alone().model.prepared
+    prefer, settings = ModelPrior(candidates(), prepared, Settings().naming), Settings().search
+    first = fitted_with_effect(alone(), model, torch.cat([alone().parameters, torch.full((1,), 0.5).double()]))
+    far = replace(first, log_likelihood=first.log_likelihood - 1e4)
+    fits = _with_fitted_shapes({"first": first, "far": far}, alone(), prefer, settings)
+    assert fits["far"] is far
+    assert fits["first"] is not first
+    (leader,) = _leading([first, far], alone(), prefer, settings)
+    assert leader is first
+    assert len(_leading([first, replace(first)], alone(), prefer, settings)) == 2
 
 
 def test_a_wide_dead_zone_leads_over_a_constant_force():

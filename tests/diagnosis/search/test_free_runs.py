@@ -55,7 +55,7 @@ def all_terms(fit):
 def test_missing_drag_leads_and_is_sized():
     fit = free_fit(DRAG)
     terms = all_terms(fit)
-    runs = free_runs(fit, terms, Settings())
+    runs, _ = free_runs(fit, terms, Settings())
     number, best = max(runs, key=lambda run: run[1].log_likelihood)
     by_effect = {terms[n].effect.id: run for n, run in runs}
     assert "quadratic_drag" in by_effect
@@ -100,7 +100,11 @@ def test_drag_of_the_wrong_sign_gains_nothing():
 
 def test_fits_far_behind_are_dropped():
     fit = free_fit(DRAG)
-    gains = [run.log_likelihood - fit.log_likelihood for _, run in free_runs(fit, all_terms(fit), Settings())]
+    terms = all_terms(fit)
+    fits, behind = free_runs(fit, terms, Settings())
+    assert behind
+    assert behind.isdisjoint(terms[number].key for number, _ in fits)
+    gains = [run.log_likelihood - fit.log_likelihood for _, run in fits]
     assert min(gains) >= min(max(gains) - BEHIND_NATS, (1.0 - BEHIND_SHARE) * max(gains)) - 1e-6
 
 

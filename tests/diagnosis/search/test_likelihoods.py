@@ -7,6 +7,7 @@ import pytest
 
 from mkc_torch.diagnosis.search import likelihoods
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
+from mkc_torch.simulation.dynamics import whitening
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong
 from tests.simulation.dynamics.test_whitening import oscillator
@@ -72,6 +73,24 @@ def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
     blocks = log_likelihoods(flow, [WHITE, disturbed], series(y), columns)
     for name in ("without", "with_candidate", "sizes", "rank", "scale"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_known_products_of_the_tangents_change_nothing(compiled, monkeypatch):
+    disturbed = NoiseModel((0.5,), ((0, 0.7, 1.0), (1, 0.3, 2.0)), (False,))
+    flow, y, _, _, columns = scene(sizes=(1, 3, 1, 2), one_sided=(False, False, True, False))
+    random = np.random.default_rng(5)
+    columns = replace(columns, series=replace(columns.series, shift=0.1 * random.normal(size=(79, 2, 9))))
+    models = [WHITE, disturbed]
+    first = log_likelihoods(flow, models, series(y[:, :1]), columns)
+    whole = log_likelihoods(flow, models, series(y), columns)
+    if compiled:  # then no tangent is whitened again
+        monkeypatch.setattr(likelihoods, "_products", None)
+    else:
+        monkeypatch.setattr(whitening, "machine_code", lambda _: None)
+    again = log_likelihoods(flow, models, series(y), columns, known=first.products)
+    for name in ("without", "with_candidate", "sizes", "rank", "scale"):
+        np.testing.assert_allclose(getattr(again, name), getattr(whole, name), rtol=1e-9, atol=1e-11)
 
 
 def test_models_far_behind_without_and_with_every_candidate_are_left_out():

@@ -7,7 +7,8 @@ import types
 import pytest
 import torch
 
-from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, _within_reach, search_with_process_noise
+from mkc_torch.diagnosis.search.ranking import within_reach
+from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, search_with_process_noise
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
@@ -67,11 +68,10 @@ def test_a_diverging_trajectory_raises(monkeypatch):
 
 
 def test_candidates_far_behind_are_not_refitted():
-    fits, behind = ("best", "near", "far"), Settings(search=dataclasses.replace(SearchSettings(), behind=50.0))
-    scores = [400.0, 151.0, 149.0]
-    assert _within_reach([7, 3, 5], fits, scores, behind) == ([7, 3], ["best", "near"])
+    settings = dataclasses.replace(SearchSettings(), behind=50.0)
+    assert within_reach([400.0, 151.0, 149.0], settings) == [True, True, False]
     # a candidate without a gain sets no share for the others
-    assert _within_reach([7, 3, 5], fits, [-10.0, -59.0, -61.0], behind) == ([7, 3], ["best", "near"])
+    assert within_reach([-10.0, -59.0, -61.0], settings) == [True, True, False]
 
 
 @pytest.mark.e2e

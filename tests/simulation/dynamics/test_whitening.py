@@ -12,6 +12,7 @@ from mkc_torch.simulation.dynamics.whitening import (
     relative_to,
     whitened,
     whitened_in_blocks,
+    whitened_transposed,
 )
 
 STEP = 0.1
@@ -126,6 +127,19 @@ def test_blocks_equal_a_single_pass(length, way, monkeypatch):
         blocks = [values.copy() for _, values in whitened_in_blocks(flow, gains, number, series, length)]
         assert len(blocks) == -(-120 // length)
         np.testing.assert_array_equal(np.concatenate(blocks), whole)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_products_with_innovations_equal_those_of_the_transposed_whitening(number):
+    flow = oscillator(N=40, runs=2)
+    gains = gains_of(flow, MODELS)
+    random = np.random.default_rng(4)
+    series = SeriesAlong(random.normal(size=(40, 1, 3)), random.normal(size=(39, 2, 3)))
+    innovations = random.normal(size=(40, 1, 2))
+    back = whitened_transposed(flow, gains, number, innovations)
+    expected = np.einsum("nmk,nmy->ky", dict(whitened(flow, gains, series))[number], innovations)
+    found = np.einsum("nmk,nmy->ky", series.new, back.new) + np.einsum("nik,niy->ky", series.shift, back.shift)
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
 def test_triangular_inverses_match_numpy():

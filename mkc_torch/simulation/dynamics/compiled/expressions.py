@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,9 +73,36 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 """The NumPy function of each operation."""
 
 
+class ColumnsByParameters(Protocol):
+    """Columns that depend on the parameters alone; see :class:`..courses.Courses`."""
+
+    def column(self, parameters: Sequence[float], number: int, by: int | None) -> Array: ...
+
+
+class Course(NamedTuple):
+    """A column that depends on the parameters alone, or its derivative by a parameter.
+
+    Attributes:
+        columns: the columns, as functions of the parameters.
+        number: of the column.
+        by: index of the parameter; None for the column itself.
+    """
+
+    columns: ColumnsByParameters
+    number: int
+    by: int | None = None
+
+    def at(self, parameters: Sequence[float]) -> Array:
+        """Return the values for each station, (S,)."""
+        return self.columns.column(parameters, self.number, self.by)
+
+
 @dataclass(frozen=True)
 class Node:
-    """An operation on other nodes, or a leaf: "number", "column", "parameter" or "state" with its ``value``."""
+    """An operation on other nodes, or a leaf with its ``value``.
+
+    Leaves are "number", "column", "course", "parameter" and "state".
+    """
 
     operation: str
     arguments: tuple[int, ...] = ()
@@ -98,6 +125,7 @@ class Expressions:
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self.columns: list[Array] = []
+        self.courses: list[Course] = []
         self.levels: list[int] = []
         self._leaves: list[frozenset[int]] = []
         self._known: dict[Node, int] = {}
@@ -111,6 +139,13 @@ class Expressions:
         """A column of constants, a value for each station, (S,)."""
         self.columns.append(values)
         return self._node(Node("column", (), len(self.columns) - 1))
+
+    def course(self, course: Course, parameters: Iterable[int]) -> int:
+        """A column that depends on these parameters alone, given by their nodes."""
+        self.courses.append(course)
+        node = self._node(Node("course", (), len(self.courses) - 1))
+        self._leaves[node] = frozenset(parameters)
+        return node
 
     def leaf(self, kind: str, index: int) -> int:
         """The parameter or state of this index; ``kind`` is "parameter" or "state"."""
@@ -150,6 +185,9 @@ class Expressions:
 
     def _derived(self, node: int, leaf: int) -> int:
         operation, arguments = self.nodes[node].operation, self.nodes[node].arguments
+        if operation == "course":
+            course = self.courses[int(self.nodes[node].value)]
+            return self.course(course._replace(by=int(self.nodes[leaf].value)), ())
         if operation in _FLAT:
             return self.number(0.0)
         if operation == "where":
@@ -166,9 +204,9 @@ class Expressions:
         if node not in self._known:
             self._known[node] = index = len(self.nodes)
             self.nodes.append(node)
-            own = {"parameter": PARAMETER, "state": STATE}.get(node.operation, CONSTANT)
+            own = {"parameter": PARAMETER, "course": PARAMETER, "state": STATE}.get(node.operation, CONSTANT)
             self.levels.append(max([own, *(self.levels[argument] for argument in node.arguments)]))
-            leaves = frozenset((index,)) if own != CONSTANT else frozenset()
+            leaves = frozenset((index,)) if node.operation in ("parameter", "state") else frozenset()
             self._leaves.append(leaves.union(*(self._leaves[argument] for argument in node.arguments)))
         return self._known[node]
 

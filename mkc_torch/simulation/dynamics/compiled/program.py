@@ -21,7 +21,7 @@ class Program:
         expressions: the expressions that hold the nodes.
         outputs: the nodes to compute.
         states: leaves of the states.
-        shape: (A, L), arrangements and places; a column of constants has L A values.
+        shape: (A, L), arrangements and places; a column has L A values.
         codes: the code of each operation.
 
     Example:
@@ -48,7 +48,7 @@ class Program:
         varies: dict[int, bool] = {}
         for node in needed_nodes(expressions, known):
             own = nodes[node]
-            varies[node] = own.operation == "column" or any(varies[argument] for argument in own.arguments)
+            varies[node] = own.operation in ("column", "course") or any(varies[argument] for argument in own.arguments)
         self._tape = Tape(expressions, known, lambda column: column.reshape(shape[::-1]).T)
         self._columns = [place for place, node in enumerate(known) if varies[node]]
         self._numbers = [place for place, node in enumerate(known) if not varies[node]]

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mkc_torch.simulation.dynamics.compiled.expressions import Expressions
+from mkc_torch.simulation.dynamics.compiled.courses import Courses
+from mkc_torch.simulation.dynamics.compiled.expressions import Course, Expressions
 
 Nodes = NDArray[np.int64]
 """Nodes in the shape of a tensor, with length 1 along its time axis."""
@@ -109,6 +110,14 @@ def state_symbol(trace: Trace, length: int, count: int) -> Symbol:
     """The states, (length, count)."""
     nodes = np.array([[trace.expressions.leaf("state", k) for k in range(count)]], dtype=np.int64)
     return Symbol(trace, nodes, (length, count), 0)
+
+
+def course_symbol(function: Callable[[Tensor], Tensor], parameters: Symbol, length: int, count: int) -> Symbol:
+    """Columns, (length, count), that a function of the parameters computes by torch, without a trace."""
+    trace, courses = parameters.tracing, Courses(function)
+    known = parameters.nodes.tolist()
+    nodes = [trace.expressions.course(Course(courses, k), known) for k in range(count)]
+    return Symbol(trace, np.array([nodes], dtype=np.int64), (length, count), 0)
 
 
 class Part(NamedTuple):

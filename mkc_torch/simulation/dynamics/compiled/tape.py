@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from mkc_torch.simulation.dynamics.compiled.expressions import CONSTANT, FUNCTIONS, PARAMETER, STATE, Array, Expressions
+from mkc_torch.simulation.dynamics.compiled.expressions import (
+    CONSTANT,
+    FUNCTIONS,
+    PARAMETER,
+    STATE,
+    Array,
+    Course,
+    Expressions,
+)
 
 _Step = tuple[Callable[..., Any], int, tuple[int, ...]]
 
@@ -20,7 +28,7 @@ class Tape:
     Args:
         expressions: the expressions that hold the nodes.
         outputs: the nodes to return.
-        arranged: reshapes a column of constants to the shape of the states.
+        arranged: reshapes a column to the shape of the states.
 
     Example:
         >>> e = Expressions()
@@ -36,6 +44,7 @@ class Tape:
         self.outputs = [place[node] for node in outputs]
         self._fixed: list[Any] = [None] * len(needed)
         self._parameters: list[tuple[int, int]] = []
+        self._courses: list[tuple[int, Course]] = []
         self._states: list[tuple[int, int]] = []
         steps: tuple[list[_Step], ...] = ([], [], [])
         for node, k in place.items():
@@ -44,6 +53,8 @@ class Tape:
                 self._fixed[k] = own.value
             elif own.operation == "column":
                 self._fixed[k] = arranged(expressions.columns[int(own.value)])
+            elif own.operation == "course":
+                self._courses.append((k, expressions.courses[int(own.value)]))
             elif own.operation == "parameter":
                 self._parameters.append((k, int(own.value)))
             elif own.operation == "state":
@@ -53,6 +64,7 @@ class Tape:
                 steps[expressions.levels[node]].append((FUNCTIONS[own.operation], k, arguments))
         with np.errstate(all="ignore"):
             _run(steps[CONSTANT], self._fixed)
+        self._arranged = arranged
         self._by_parameters, self._by_states = steps[PARAMETER], steps[STATE]
 
     def at(self, parameters: Sequence[float]) -> Evaluation:
@@ -60,6 +72,8 @@ class Tape:
         slots = list(self._fixed)
         for k, index in self._parameters:
             slots[k] = parameters[index]
+        for k, course in self._courses:
+            slots[k] = self._arranged(course.at(parameters))
         _run(self._by_parameters, slots)
 
         def evaluated(states: Array) -> list[Any]:

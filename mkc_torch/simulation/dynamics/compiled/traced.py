@@ -19,6 +19,7 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
     Trace,
     UntraceableError,
     as_nodes,
+    course_symbol,
     parameter_symbol,
     state_symbol,
 )
@@ -42,6 +43,7 @@ class Traceable(Protocol):
         begins: (N,), True where a run starts.
         measured: (N, m), the recorded outputs.
         guess: (G, n), a first guess of the states.
+        inputs: (S, u), the recorded inputs at the stations.
         observer: the observer that corrects the states; None in open loop.
     """
 
@@ -50,11 +52,13 @@ class Traceable(Protocol):
     begins: Bool[Tensor, " N"]
     measured: Float[Tensor, "N m"]
     guess: Float[Tensor, "G n"]
+    inputs: Float[Tensor, "S u"]
     observer: Observer | None
 
     def first_states(self, theta: Tensor, changes: Changes) -> tuple[Tensor, list[str]]: ...
     def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
-    def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]: ...
+    def acting_inputs(self, theta: Tensor, changes: Changes) -> Tensor: ...
+    def rate(self, theta: Tensor, changes: Changes, inputs: Tensor | None = None) -> Callable[[Tensor], Tensor]: ...
     def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None: ...
     def outputs_by_states(self, theta: Tensor, changes: Changes, states: Tensor) -> Tensor: ...
 
@@ -122,7 +126,7 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     def at_samples() -> Symbol:
         return state_symbol(trace, samples, width)
 
-    rates = system.rate(theta, changes)(state_symbol(trace, stations, width))
+    rates = system.rate(theta, changes, _inputs(system, meaning, parameters))(state_symbol(trace, stations, width))
     jump = system.jump(theta, changes)
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
     try:
@@ -138,6 +142,15 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
         outputs,
         () if jump is None else jump.places,
     )
+
+
+def _inputs(system: Traceable, meaning: Meaning, parameters: Symbol) -> Tensor:
+    """The acting inputs at the stations; computed by torch where they cannot be traced, as behind a delay."""
+    try:
+        return system.acting_inputs(*meaning(parameters))
+    except Exception:  # a function may raise anything on a symbol
+        stations, width = len(system.grid.stations), system.inputs.shape[1]
+        return course_symbol(lambda values: system.acting_inputs(*meaning(values)), parameters, stations, width)
 
 
 def _as_is(column: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The whitening of :func:`mkc_torch.simulation.dynamics.whitening.whitened`, sample by sample."""
+"""The whitening of :func:`mkc_torch.simulation.dynamics.whitening.whitened`, sample by sample, and its transpose."""
 
 from __future__ import annotations
 
@@ -86,3 +86,51 @@ def whiten_samples(
                     moved[n + d, s] = w * state[n + d, s]
             state, moved = moved, state
         start[b] = state
+
+
+def whiten_transposed(carry: Any, seen: Any, gain: Any, white: Any, innovations: Any, new: Any, shift: Any) -> None:
+    """Apply the transpose of the whitening of one noise model to K innovations; writes into ``new`` and ``shift``.
+
+    Args:
+        carry: (N-1, k, k), transition of states and lasting disturbances to the next sample.
+        seen: (N, m, k), derivative of the outputs by them.
+        gain, white: (N, k, m) and (N, m, m), of the filter.
+        innovations: (N, m, K).
+        new, shift: (N, m, K) and (N-1, n, K).
+    """
+    N, m, K = innovations.shape
+    k, n = seen.shape[2], shift.shape[1]
+    state, moved = np.zeros((k, K)), np.zeros((k, K))
+    for row in range(N - 1, -1, -1):
+        if row < N - 1:
+            for i in range(n):
+                for s in range(K):
+                    shift[row, i, s] = -state[i, s]
+            for j in range(k):
+                for s in range(K):
+                    moved[j, s] = 0.0
+                for i in range(k):
+                    w = carry[row, i, j]
+                    if w != 0.0:
+                        for s in range(K):
+                            moved[j, s] += w * state[i, s]
+        for output in range(m):
+            for s in range(K):
+                new[row, output, s] = 0.0
+            for other in range(output, m):
+                w = white[row, other, output]
+                for s in range(K):
+                    new[row, output, s] += w * innovations[row, other, s]
+            for i in range(k):
+                w = gain[row, i, output]
+                if w != 0.0:
+                    for s in range(K):
+                        new[row, output, s] += w * moved[i, s]
+        for i in range(k):
+            for s in range(K):
+                state[i, s] = moved[i, s]
+            for output in range(m):
+                w = seen[row, output, i]
+                if w != 0.0:
+                    for s in range(K):
+                        state[i, s] -= w * new[row, output, s]

@@ -7,6 +7,7 @@ import torch
 
 from mkc_torch._support.forward_mode import forward_tangents
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shapes import ShapedModel
 from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.effects.base import Effect, GainEffect
 from mkc_torch.effects.context import Quantity
@@ -240,6 +241,21 @@ def test_residuals_with_each_effect_match_torch(corrected):
             assert_like_torch(model, parameters, further=False)
     kinds = {kind for _, kind in seen}
     assert {"rate", "input", "output", "resonant rate", "lagged rate", "hysteretic rate"} <= kinds
+
+
+@pytest.mark.parametrize("first", ["dead_zone", "input_delay"])
+@pytest.mark.parametrize("corrected", [False, True])
+def test_residuals_with_fitted_shapes_of_input_effects_match_torch(corrected, first):
+    prepared = Driven().prepare(recorded(2))
+    prepared = observed(prepared) if corrected else prepared
+    terms = [term for term in candidates(prepared) if term.port == "input torque"]
+    before = next(term for term in terms if term.effect.id == first)
+    for term in terms:
+        model = ShapedModel.of(JointModel(prepared, (before, term)))
+        gamma = 0.02 * torch.ones(model.joint - model.base, dtype=torch.float64)
+        parameters = model.start(torch.cat([prepared.given, gamma]))
+        assert model._compiled is not None, term.effect.id
+        assert_like_torch(model, parameters, further=False)
 
 
 @pytest.mark.parametrize("system", [Branching(), Declared()])
