@@ -38,6 +38,7 @@ class PositionPeriodicForce(RateEffect):
     plot_axis = "angle"
     equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
     explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
+    advice = "Add a force with this number of periods a turn."
     form_parameters = ("order",)
     source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
 
@@ -51,7 +52,7 @@ class PositionPeriodicForce(RateEffect):
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         if shape["order"] == 1.0:
             return "Add a force with one period a turn: gravity on an unbalanced load, or an eccentric load."
-        return f"Add a force with {sized(shape['order'])} periods a turn."
+        return self.advice
 
     def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"order": float(order)} for order in ORDERS)
