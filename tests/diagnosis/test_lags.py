@@ -58,7 +58,7 @@ def held(rate, start, inputs, step):
 def thermometer():
     """A block at 5 s; the thermometer follows it with 25 s."""
     random = np.random.default_rng(3)
-    power = np.repeat([60.0, 0.0, 100.0, 30.0, 100.0], 48)
+    power = np.repeat(random.choice([0.0, 30.0, 60.0, 100.0], 5), 48)
     temp = held(lambda x, u: np.array([(u - 0.9 * (x[0] - 22.0)) / 180.0, (x[0] - x[1]) / 25.0]), [22, 22], power, 5.0)
     temp = temp + random.normal(0.0, 0.1, len(temp))
     return Recording({"time": np.arange(len(temp)) * 5.0, "power": power, "temp": temp})

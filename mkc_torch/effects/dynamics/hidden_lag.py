@@ -80,7 +80,7 @@ class HiddenLag(RateEffect):
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return (
             f"There is {self.store(gamma, shape, context)}, that is not in the equations. Its size holds if it was in "
-            "balance with the state at the start of each run; a store that was not, as a cold cup, has another size."
+            "balance with the state at the start of each run; otherwise it has another size."
         )
 
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
