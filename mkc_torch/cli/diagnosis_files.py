@@ -26,6 +26,7 @@ from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magn
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts
 from mkc_torch.diagnosis.io.python_source import SourceError
+from mkc_torch.recording.column_names import split_unit
 from mkc_torch.recording.join_recordings import joint_name
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.report.diagnosis.verdict import RunPaths
@@ -249,7 +250,7 @@ def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
     from mkc_torch.simulation import Paired
 
     table = Recording.read(path, recognise=False)
-    there = {name: column for name, column in columns.items() if column in table}
+    there = {name: column for name, column in columns.items() if column in table or split_unit(column)[0] in table}
     return Paired(Recording.read(path, columns=there, recognise=False))
 
 

@@ -83,7 +83,7 @@ def read_accelerometer(
 
 
 def read_table(path: Path, columns: Mapping[str, str], units: Mapping[str, str]) -> Recording:
-    """Read a recording for the user's own simulation; columns keep their names."""
+    """Read a recording for the user's own simulation; columns keep their names, less units in brackets."""
     return _recording(path, read_file(path, REQUIRED_COLUMNS, columns=columns, units=units, recognise=False))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from mkc_torch.recording.column_names import meaning
+from mkc_torch.recording.column_names import meaning, split_unit
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
 from mkc_torch.recording.recognise import RecognisedColumns, SensorColumns, candidates, recognised, time_column
 
@@ -176,7 +176,7 @@ def _ambiguous(path: Path, found: RecognisedColumns) -> RecordingError:
 
 
 def _by_given_columns(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> ColumnChoice:
-    """The topic that has the caller's columns, and its time column."""
+    """The topic that has the caller's columns, and its time column; ``height [m]`` is taken as ``height``."""
     number = _topic_of(path, topics, columns)
     topic = topics[number]
     given = {new: _local(old, topic) for new, old in columns.items()}
@@ -186,7 +186,19 @@ def _by_given_columns(path: Path, topics: Sequence[Topic], columns: Mapping[str,
         recognised_columns, units = {"time": time[0]}, {"time": time[1]} if time[1] else {}
     elif time is not None and given.get("time", "time") == time[0] and time[1]:
         units = {"time": time[1]}
+    taken = {*given.values(), *recognised_columns.values()}
+    recognised_columns |= {
+        new: old
+        for new, old in _without_units(topic.table.names).items()
+        if old not in taken and new not in given and new not in recognised_columns
+    }
     return ColumnChoice(number, given | recognised_columns, recognised_columns, units, None, ())
+
+
+def _without_units(names: Sequence[str]) -> dict[str, str]:
+    """Names without the unit in brackets behind them, to the names in the file, where the plain name is unique."""
+    plain = [split_unit(name)[0] for name in names]
+    return {new: old for new, old in zip(plain, names, strict=True) if new != old and plain.count(new) == 1}
 
 
 def _topic_of(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> int:

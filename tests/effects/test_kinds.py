@@ -12,6 +12,7 @@ from mkc_torch.effects import DYNAMICS, kind_of, words_of
 from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
 from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
+from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.kinds import MOTION, kind_at, zero_of
 from mkc_torch.recording import Recording
@@ -83,6 +84,21 @@ def test_texts_of_other_kinds_have_no_mechanical_words(kind):
 def test_hidden_lag_states_size_and_time_constant(unit, gamma, text):
     effect = HiddenLag()
     assert effect.explained([gamma], STORE, at_state(effect, unit)).startswith(text)
+
+
+def test_hidden_lag_states_that_its_size_holds_for_a_start_in_balance():
+    effect = HiddenLag()
+    context = at_state(effect, "°C")
+    assert "in balance with the state at the start of each run" in effect.explained([0.4], STORE, context)
+    assert effect.advised([0.4], STORE, context).endswith("fit its start and its size anew.")
+
+
+def test_a_periodic_force_states_its_periods():
+    effect = PositionPeriodicForce()
+    context = at_state(effect, "rad/s")
+    assert effect.components("amplitude", {"order": 1.0}, context) == ("sin(x)", "cos(x)")
+    assert effect.components("amplitude", {"order": 4.0}, context) == ("sin(4 x)", "cos(4 x)")
+    assert "an unbalanced load" in effect.advised([1.0, 0.0], {"order": 1.0}, context)
 
 
 MODE = {"period": 0.1408, "damping": 0.0224}

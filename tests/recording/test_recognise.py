@@ -235,6 +235,19 @@ def test_a_table_of_something_else_keeps_its_names(tmp_path):
     assert recording.time.tolist() == pytest.approx([0.0, 0.01])
 
 
+@pytest.mark.parametrize("recognise", [True, False])
+def test_units_in_brackets_are_split_from_the_names_of_another_table(tmp_path, recognise):
+    recording = read(
+        tmp_path, "time [s],height [m],q[0],mass (kg),mass (lb)\n0,1,2,3,4\n1,1,2,3,4\n", recognise=recognise
+    )
+    assert recording.names == ("time", "height", "q[0]", "mass (kg)", "mass (lb)")
+
+
+def test_a_column_named_by_the_caller_keeps_its_unit_in_brackets(tmp_path):
+    recording = read(tmp_path, "time,height [m]\n0,1\n1,2\n", recognise=False, columns={"level": "height [m]"})
+    assert recording.names == ("time", "level")
+
+
 def test_without_recognition_only_the_time_is_known(tmp_path):
     recording = read(tmp_path, "time_us,mx,my,mz,temp\n0,1,2,3,4\n500,1,2,3,4\n", recognise=False)
     assert recording.names == ("time", "mx", "my", "mz", "temp")

@@ -150,7 +150,7 @@ def test_drift_of_a_sensor_is_reported_as_drift():
         PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002
     )
     text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
-    assert "angle drift in addition to the sensor's noise, and no physics" in text
+    assert "A drift of angle adds to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
 

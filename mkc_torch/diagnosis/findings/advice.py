@@ -169,7 +169,8 @@ def _called(finding: Finding, d: Diagnosis) -> str:
     """Return the name of a finding, with its channels if another finding has the same name."""
     f = finding
     if is_curve(f.effect):
-        name = f"the curve along {', '.join(f.drivers)}" if f.drivers else "the course of an unrecorded cause"
+        along = ", ".join(f.drivers) or (f.curve.driver if f.curve is not None else "time")
+        name = "the course of an unrecorded cause" if along == "time" else f"the curve along {along}"
     else:
         name = f.effect
     same = [other for other in d.findings if (other.effect, other.drivers) == (f.effect, f.drivers)]

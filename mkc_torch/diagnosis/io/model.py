@@ -136,6 +136,7 @@ class DiagnosedModel(CorrectingModel):
                 ],
                 "shape": dict(term.shape),
                 **({"port": term.at} if term.at else {}),
+                **({"first": True} if term.first else {}),
                 "parameters": gamma.tolist(),
                 "equation": term.effect.equation,
             }
@@ -244,7 +245,7 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
             names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
             driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
-        terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", "")))
+        terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", ""), entry.get("first", False)))
         gammas.append(_vector(entry["parameters"]))
     return DiagnosedModel(
         content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas, simulation

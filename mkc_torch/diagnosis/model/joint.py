@@ -233,11 +233,12 @@ def _constant(added: Float[Tensor, "N c"]) -> Change:
 
 
 def in_order_of_the_chain(terms: Sequence[Term], numbers: Iterable[int]) -> list[int]:
-    """Return numbers of terms in the order in which effects in series act: effects with memory come first.
+    """Return numbers of terms in the order in which effects in series act: effects with memory before the others.
 
-    A motor's lag comes before the square law of its propeller; delays, lags and backlash commute.
+    A motor's lag comes before the square law of its propeller; delays, lags and backlash commute. A term that acts
+    ``first``, such as the dead zone of a driver in front of the motor's lag, comes before both.
     """
-    return sorted(numbers, key=lambda number: not terms[number].effect.remembers)
+    return sorted(numbers, key=lambda number: (not terms[number].first, not terms[number].effect.remembers))
 
 
 def summed(previous: Change | None, other: Change, *, series: bool = False) -> Change:

@@ -251,12 +251,16 @@ Key = tuple[str, tuple[str, ...], str]
 
 @dataclass(frozen=True)
 class Term:
-    """An effect with its driver (None for time or the signal alone), its shape, and its port if it has a choice."""
+    """An effect with its driver (None for time or the signal alone), its shape, and its port if it has a choice.
+
+    ``first``: it acts before the effects with memory at its port; by default effects with memory act first.
+    """
 
     effect: Effect
     driver: Driver | None
     shape: Shape
     at: str = ""
+    first: bool = False
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -260,16 +260,18 @@ def _best_start(
 def _under_own_noise(
     running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel:
-    """Return an open-loop fit under the noise around it; unchanged if that loses the recording."""
+    """Return an open-loop fit under the noise around it; unchanged if that is less likely or loses the recording."""
     noise = estimate_noise(running, declared, settings.noise)
-    if noise is not None and noise.observer is not None:
-        prepared = running.model.prepared.observed(noise.observer)
-        observed = JointModel(prepared, running.model.terms, running.model.near)
-        try:
-            running = fitted(observed, running.parameters, base.bound, graduate=False, fresh=True)
-        except NoFitError:
-            return running
-    return with_own_noise(running, declared, settings)
+    if noise is None or noise.observer is None:
+        return with_own_noise(running, declared, settings)
+    observed = JointModel(running.model.prepared.observed(noise.observer), running.model.terms, running.model.near)
+    try:
+        under = fitted(observed, running.parameters, base.bound, graduate=False, fresh=True)
+    except NoFitError:
+        return running
+    under = with_own_noise(under, declared, settings)
+    # an observer undoes a sensor's lag with the recorded outputs, which is exact for short lags only
+    return under if priced(under, settings) > priced(running, settings) else running
 
 
 def _plain(

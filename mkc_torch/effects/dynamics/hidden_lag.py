@@ -78,10 +78,16 @@ class HiddenLag(RateEffect):
         return f"{known}, {share_of(float(gamma[0]))} of the first, {evens_out} in {time}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
-        return f"There is {self.store(gamma, shape, context)}, that is not in the equations."
+        return (
+            f"There is {self.store(gamma, shape, context)}, that is not in the equations. Its size holds if it was in "
+            "balance with the state at the start of each run; otherwise it has another size."
+        )
 
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
-        return f"Add {self.store(gamma, shape, context)}{_EXAMPLES.get(kind_at(context), '')}."
+        return (
+            f"Add {self.store(gamma, shape, context)}{_EXAMPLES.get(kind_at(context), '')}. If it did not start in "
+            "balance with the first, fit its start and its size anew."
+        )
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         length = float(time.max() - time.min())

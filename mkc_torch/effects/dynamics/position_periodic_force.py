@@ -38,7 +38,7 @@ class PositionPeriodicForce(RateEffect):
     plot_axis = "angle"
     equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
     explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
-    advice = "Add a force with this period."
+    advice = "Add a force with this number of periods a turn."
     form_parameters = ("order",)
     source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
 
@@ -46,7 +46,13 @@ class PositionPeriodicForce(RateEffect):
         return f"{self.equation},  k = {sized(shape['order'])}, periods in a turn"
 
     def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
-        return "sin(k x)", "cos(k x)"
+        phase = _phase(shape)
+        return (f"sin({phase})", f"cos({phase})")
+
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        if shape["order"] == 1.0:
+            return "Add a force with one period a turn: gravity on an unbalanced load, or an eccentric load."
+        return self.advice
 
     def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"order": float(order)} for order in ORDERS)
@@ -61,3 +67,7 @@ class PositionPeriodicForce(RateEffect):
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         phase = f"{shape['order']!r} * {names['angle']}"
         return (f"{gamma[0]!r} * torch.sin({phase}) + {gamma[1]!r} * torch.cos({phase})",)
+
+
+def _phase(shape: Shape) -> str:
+    return "x" if shape["order"] == 1.0 else f"{sized(shape['order'])} x"

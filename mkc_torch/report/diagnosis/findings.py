@@ -70,6 +70,8 @@ def finding_name(finding: Finding) -> str:
     """Return the name of a finding with its drivers."""
     if unrecorded(finding):
         return "an unrecorded cause"
+    if is_curve(finding.effect) and not finding.drivers and finding.curve is not None:
+        return f"an unknown dependence of the {several(finding.channels)} on {finding.curve.driver}"
     text = with_drivers(finding.effect, finding.drivers, kind=finding.kind)
     return f"intermittent {text}" if finding.comes_and_goes else text
 

@@ -145,7 +145,7 @@ def unexplained(diagnosis: Diagnosis) -> str:
             )
             if rates
             else (
-                ("{places} drift in addition to the sensor's noise, and no physics in the catalogue explains it."),
+                "A drift of {places} adds to the sensor's noise, and no physics in the catalogue explains it.",
                 "A drift of {places} remains.",
             )
         )

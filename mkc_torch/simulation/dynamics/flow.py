@@ -89,7 +89,8 @@ def flow_along(
     at = states[prepared.rows]
     predict = prepared.predicted(theta)
     C = slopes(predict, at)[..., :n].detach()
-    new = (prepared.seen(theta, changes) - predict(at)).detach()
+    # what sensors and output effects add follows the trajectory, whose disturbances are estimated anew
+    new = prepared.measured - prepared.outputs_by_states(theta, changes, at) + prepared.output_disturbance(at)
     after = at if jump is None else jump.applied(states)[prepared.rows].detach()
     # corrections and disturbances of an observer moved the trajectory itself
     shift = torch.einsum("kij,kj->ki", carry, (after - at)[:-1, :n])

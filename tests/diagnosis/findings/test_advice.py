@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
+from mkc_torch.report.diagnosis.findings import finding_name
 from tests.diagnosis.factory import (
     LOST,
     PROCESS_NOISE,
@@ -37,6 +38,17 @@ def test_the_advice_of_each_effect_is_given():
         "hard_iron_step: look for what changed at that time; use the calibration from after the step."
     )
     assert several[1] == "current_field: move the sensor away from the power wires."
+
+
+def test_a_curve_without_a_column_is_called_by_its_variable():
+    made = make_diagnosis(1, samples=50)
+    curve = dataclasses.replace(made.findings[0].curve, driver="height")
+    unknown = dataclasses.replace(
+        made.findings[0], effect="unknown", drivers=(), curve=curve, channels=("rate of climb",), alternatives=()
+    )
+    *_, model = advice_of(dataclasses.replace(made, findings=(unknown,)))
+    assert model.startswith("The model found here corrects for the curve along height")
+    assert finding_name(unknown) == "an unknown dependence of the rate of climb on height"
 
 
 def test_a_location_specific_finding_is_not_for_other_recordings():
