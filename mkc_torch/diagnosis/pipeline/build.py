@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.alternatives import with_parameters
 from mkc_torch.diagnosis.findings.evidence_warnings import called, evidence_warnings
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
-from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
+from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
 from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
@@ -291,10 +291,7 @@ def _finding(
     shape = None
     if whole.final.model.prepared.dynamics is not None:
         shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
-    grade = grade_of(finding)
-    if shape is not None and shape.curve is not None:
-        grade = "nearest"
-    return replace(finding, grade=grade, shape=shape, alternatives=others)
+    return replace(finding, grade=with_shape(grade_of(finding), shape), shape=shape, alternatives=others)
 
 
 def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
