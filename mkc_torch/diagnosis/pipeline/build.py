@@ -353,6 +353,7 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
+    more += [_enlarging(refused, quick=diagnosis.quick) for refused in search.refused]
     if search.given_up:
         more.append(
             f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
@@ -388,24 +389,33 @@ def _nothing_to_separate() -> Separability:
 
 
 def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
-    shape = described(located.term.effect, located.term.shape)
-    what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
-        f"{what}: {_significance(None if quick else located.p_value)}, but it does not predict held-out blocks better, "
-        "so it does not count as a finding."
+        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but it does not predict "
+        "held-out blocks better, so it does not count as a finding."
     )
+
+
+def _enlarging(located: SearchResult, *, quick: bool) -> str:
+    return (
+        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but the open-loop residual "
+        "is larger with it, so it does not count as a finding."
+    )
+
+
+def _with_shape(term: Term) -> str:
+    """Return the name of a candidate with its shape."""
+    shape = described(term.effect, term.shape)
+    return f"{called(term)} ({shape})" if shape else called(term)
 
 
 def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
     """Describe the best candidate above the level, and how long a recording would decide about it."""
     if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
         return []
-    shape = described(first.term.effect, first.term.shape)
-    what = f"{called(first.term)} ({shape})" if shape else called(first.term)
     return [
-        f"{what} would explain the residual best, but measurement and process noise gain as much by chance: p = "
-        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide whether it "
-        "is real."
+        f"{_with_shape(first.term)} would explain the residual best, but measurement and process noise gain as much by "
+        f"chance: p = {first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide "
+        "whether it is real."
     ]
 
 
