@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
@@ -147,3 +148,11 @@ def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(
     taken = [found.term.key for found in after.found[1:]]
     assert taken == {0: ["first"], 1: ["second"], 2: []}[len(refused)]
     assert after.left == (() if len(refused) == 2 else terms)
+
+
+def test_a_refused_candidate_is_reported_with_its_reason(recording):
+    build = importlib.import_module("mkc_torch.diagnosis.pipeline.build")
+    (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
+    warning = build._enlarging(SimpleNamespace(term=term, p_value=0.01), quick=False)
+    assert term.effect.id in warning
+    assert "p = 0.01 after the whole search, but the open-loop residual is larger with it" in warning
