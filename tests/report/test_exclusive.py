@@ -17,7 +17,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.environment import NoiseEnvironment, ShapeCheck
 from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
+from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.pipeline.build import FitAssessment, verdict_of
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, EffectParameter, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.settings import EvidenceSettings
@@ -74,8 +74,7 @@ def findings(draw, place):
         evidence=(prediction.held_out_gain_result(held, "" if held else "One side of it is too short."),),
     )
     shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
-    grade = "nearest" if shape is not None and shape.curve is not None else grade_of(finding)
-    return dataclasses.replace(finding, shape=shape, grade=grade)
+    return dataclasses.replace(finding, shape=shape, grade=with_shape(grade_of(finding), shape))
 
 
 @dataclasses.dataclass

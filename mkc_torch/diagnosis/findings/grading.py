@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from mkc_torch.diagnosis.environment import Grade
+from mkc_torch.diagnosis.environment import Grade, ShapeCheck
 from mkc_torch.diagnosis.result import Finding, HeldOut
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "small",
     "transfers",
     "vetoed",
+    "with_shape",
     "worth_correcting",
 ]
 
@@ -156,6 +157,23 @@ def grade_of(finding: Finding) -> Grade:
     if not confirmed(finding):
         return "unconfirmed"
     return "small" if small(finding) else "left_out"
+
+
+def with_shape(grade: Grade, shape: ShapeCheck | None) -> Grade:
+    """Return the grade after the test of the shape: a confirmed finding of another shape has only the nearest name.
+
+    An unconfirmed finding stays unconfirmed: held-out blocks do not show that its place lacks anything.
+
+    Args:
+        grade: by the other evidence.
+        shape: result of the test of the shape; None if it was not tested.
+
+    Example:
+        >>> with_shape("small", ShapeCheck(1.2, 0.4))
+        'small'
+    """
+    other = shape is not None and shape.curve is not None
+    return "nearest" if other and grade != "unconfirmed" else grade
 
 
 def grade_in_short(finding: Finding) -> Grade:

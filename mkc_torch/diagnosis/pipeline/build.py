@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.alternatives import with_parameters
 from mkc_torch.diagnosis.findings.evidence_warnings import called, evidence_warnings
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
-from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error
+from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
 from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
@@ -291,10 +291,7 @@ def _finding(
     shape = None
     if whole.final.model.prepared.dynamics is not None:
         shape = shape_of(whole.final, number, whole.terms, whole.options.settings.evidence)
-    grade = grade_of(finding)
-    if shape is not None and shape.curve is not None:
-        grade = "nearest"
-    return replace(finding, grade=grade, shape=shape, alternatives=others)
+    return replace(finding, grade=with_shape(grade_of(finding), shape), shape=shape, alternatives=others)
 
 
 def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
@@ -356,6 +353,7 @@ def with_search_notes(diagnosis: Diagnosis, search: StepwiseSearch) -> Diagnosis
     more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
+    more += [_enlarging(refused, quick=diagnosis.quick) for refused in search.refused]
     if search.given_up:
         more.append(
             f"The search for further findings ended early: with {called(search.found[-1].term)} in the model, a "
@@ -391,24 +389,33 @@ def _nothing_to_separate() -> Separability:
 
 
 def _not_confirmed(located: SearchResult, *, quick: bool) -> str:
-    shape = described(located.term.effect, located.term.shape)
-    what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
-        f"{what}: {_significance(None if quick else located.p_value)}, but it does not predict held-out blocks better, "
-        "so it does not count as a finding."
+        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but it does not predict "
+        "held-out blocks better, so it does not count as a finding."
     )
+
+
+def _enlarging(located: SearchResult, *, quick: bool) -> str:
+    return (
+        f"{_with_shape(located.term)}: {_significance(None if quick else located.p_value)}, but the open-loop residual "
+        "is larger with it, so it does not count as a finding."
+    )
+
+
+def _with_shape(term: Term) -> str:
+    """Return the name of a candidate with its shape."""
+    shape = described(term.effect, term.shape)
+    return f"{called(term)} ({shape})" if shape else called(term)
 
 
 def _short_of_the_level(first: SearchResult, level: float) -> list[str]:
     """Describe the best candidate above the level, and how long a recording would decide about it."""
     if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
         return []
-    shape = described(first.term.effect, first.term.shape)
-    what = f"{called(first.term)} ({shape})" if shape else called(first.term)
     return [
-        f"{what} would explain the residual best, but measurement and process noise gain as much by chance: p = "
-        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide whether it "
-        "is real."
+        f"{_with_shape(first.term)} would explain the residual best, but measurement and process noise gain as much by "
+        f"chance: p = {first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would decide "
+        "whether it is real."
     ]
 
 

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from mkc_torch.diagnosis.model.term import Term
+    from mkc_torch.effects.base import Effect
+    from mkc_torch.simulation.protocol import PreparedSimulation
+
 __all__ = ["simpler_by_price", "simplified"]
 
 Holds = Callable[[FittedModel, Evidence], bool]
@@ -28,7 +32,9 @@ Holds = Callable[[FittedModel, Evidence], bool]
 def simplified(
     fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds, settings: NamingSettings
 ) -> tuple[FittedModel, Evidence]:
-    """Replace each effect by its simpler form unless held-out blocks reject it; return the fit and its scores.
+    """Replace each effect by its simpler form or special case unless held-out blocks reject it.
+
+    Returns the fit and its scores.
 
     Held-out blocks reject a form if it makes them clearly less likely under white noise, and increases the innovations
     under coloured noise.
@@ -71,7 +77,7 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
         settings: thresholds.
     """
     for number in range(len(fit.model.terms)):
-        start = _simpler(fit, number, other=True)
+        start = _simpler(fit, number)
         if start is None:
             continue
         model, parameters = start
@@ -85,22 +91,22 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
     return fit
 
 
-def _simpler(fit: FittedModel, number: int, *, other: bool = False) -> tuple[JointModel, Float[Tensor, " p"]] | None:
-    """Return the model with the simpler form of an effect, and a start; None without a simpler form.
+def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
+    """Return the model with the simpler form or the special case of an effect, and a start; None without either.
 
     Args:
         fit: with effects.
         number: of the effect.
-        other: whether another effect with fewer parameters counts as a simpler form.
     """
     terms = list(fit.model.terms)
     effect = terms[number].effect
-    simpler = effect.simpler or (effect.reduces_to if other else None)
+    simpler = effect.simpler or effect.reduces_to
     if simpler is None:
         return None
     known = simpler.shapes(fit.model.prepared.time)[0]
     shape = {name: value for name, value in terms[number].shape.items() if name in known}
-    terms[number] = replace(terms[number], effect=simpler, shape=shape)
+    at = _port_of(simpler, terms[number], fit.model.prepared)
+    terms[number] = replace(terms[number], effect=simpler, shape=shape, at=at)
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     size = model.sizes[number]
     if size >= fit.model.sizes[number]:
@@ -113,3 +119,14 @@ def _simpler(fit: FittedModel, number: int, *, other: bool = False) -> tuple[Joi
         ]
     )
     return model, fit.parameters.new_tensor([*before, *own.reshape(size, -1).mean(-1), *behind])
+
+
+def _port_of(simpler: Effect, term: Term, prepared: PreparedSimulation) -> str:
+    """Return the port of the same channels where a simpler form acts: a special case can lack a part, such as a load.
+
+    As in :class:`Term`, empty if the effect has no choice of ports.
+    """
+    if simpler.port == term.effect.port:
+        return term.at
+    channels = prepared.ports[term.port].channels
+    return next(name for name, port in prepared.ports.items() if (port.kind, port.channels) == (simpler.port, channels))

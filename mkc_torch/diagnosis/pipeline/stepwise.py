@@ -23,7 +23,7 @@ from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.series_order import in_likelier_order
 from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.pipeline.special_case import with_special_case
-from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop
+from mkc_torch.diagnosis.search.open_loop_gain import enlarges_open_loop, improves_open_loop
 from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
 from mkc_torch.diagnosis.search.ranking import alike
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
@@ -74,6 +74,7 @@ class StepwiseSearch:
         evidence: of the simulation without findings, and after each finding.
         left: candidates that remain to be searched; empty once the search is over.
         pairs: evidence without and with each finding under the same process noise, by which it was confirmed.
+        refused: candidates that passed the surrogates, but enlarge the open-loop residual.
         given_up: why the next search failed; empty if it did not.
         cut: whether there was a further finding beyond the limit.
     """
@@ -85,6 +86,7 @@ class StepwiseSearch:
     evidence: tuple[Evidence, ...]
     left: tuple[Term, ...]
     pairs: tuple[tuple[Evidence, Evidence], ...] = ()
+    refused: tuple[SearchResult, ...] = ()
     given_up: str = ""
     cut: bool = False
 
@@ -153,12 +155,22 @@ def first_step(
 def next_step(
     search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = _kept_nowhere
 ) -> StepwiseSearch:
-    """Run the next search with the findings in the model; skip it if the screening shows nothing."""
+    """Run the next search with the findings in the model; skip it if the screening shows nothing.
+
+    A candidate that enlarges the open-loop residual is refused, and the search repeated once without its effect.
+    """
     if _is_screened_out(search, options):
         return replace(search, left=())
-    fit = search.found[-1].fit
+    fit, left = search.found[-1].fit, search.left
     try:
-        taken = _accept(search, fit, _located(fit, search.left, options, generator, parts=False), options)
+        located = _located(fit, left, options, generator, parts=False)
+        if located.p_value <= options.level and enlarges_open_loop(located.fit, fit):
+            search = replace(search, refused=(*search.refused, located))
+            left = tuple(term for term in left if term.key != located.term.key)
+            located = _located(fit, left, options, generator, parts=False)
+            if enlarges_open_loop(located.fit, fit):
+                return replace(search, left=())
+        taken = _accept(search, fit, located, options)
         keep(taken)
         return _in_two_steps(search, taken, options, generator)
     except NoFitError as error:
@@ -280,9 +292,10 @@ def _accept(
         fit, simpler = simplified(located.fit, after, search.blocks, holds, options.settings.naming)
     paired = simpler if same is None or fit is not located.fit else paired
     after = simpler
-    found = (*search.found, replace(located, fit=fit))
+    found = (*search.found, replace(located, fit=fit, term=fit.model.terms[-1]))
     near = _near(located.fit, options.settings)
-    left = tuple(t for t in search.left if not _same(t, located.term, near, options.settings))
+    known = (located.term, *fit.model.terms)  # a simpler form may have replaced the located effect
+    left = tuple(t for t in search.left if not any(_same(t, own, near, options.settings) for own in known))
     pairs = (*search.pairs, (before, paired))
     taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
     if located.with_noise:

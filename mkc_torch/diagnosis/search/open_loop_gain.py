@@ -13,13 +13,17 @@ from mkc_torch.diagnosis.model.process_noise import refit_open_loop
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.ranking import Ranked
 
-__all__ = ["CLEARLY_LESS", "NO_LESS", "improves_open_loop", "with_open_loop_gain"]
+__all__ = ["CLEARLY_LESS", "LARGER", "NO_LESS", "enlarges_open_loop", "improves_open_loop", "with_open_loop_gain"]
 
 NO_LESS = 0.95
 """Ratio of open-loop residuals with and without a candidate above which it does not improve the open loop."""
 
 CLEARLY_LESS = 0.7
 """Ratio of open-loop residuals of a rival and of such a candidate below which the rival takes its place."""
+
+LARGER = 1.05
+"""Ratio of open-loop residuals with and without a candidate above which it enlarges the open-loop residual: the ratio
+at which held-out blocks reject a finding."""
 
 
 def with_open_loop_gain(
@@ -73,6 +77,21 @@ def improves_open_loop(fit: FittedModel, less: FittedModel) -> bool:
     if runs[0] is None or runs[1] is None:
         return False
     return _size(runs[0]) - _size(runs[1]) < math.log(CLEARLY_LESS)
+
+
+def enlarges_open_loop(fit: FittedModel, less: FittedModel) -> bool:
+    """Whether a joint fit has a clearly larger open-loop residual than the fit without one of its effects.
+
+    The root mean square counts every sample: a robust fit can be more likely because it rejects a stretch that the
+    simulation no longer follows. Outliers of the recording enlarge both residuals alike. False without states.
+    """
+    if fit.model.prepared.dynamics is None:
+        return False
+    runs = refit_open_loop(fit), refit_open_loop(less)
+    if runs[0] is None or runs[1] is None:
+        return False
+    mean_squares = [run.residual.square().mean(0) for run in runs if run is not None]
+    return 0.5 * float((mean_squares[0] / mean_squares[1]).log().mean()) > math.log(LARGER)
 
 
 def _open_loop_size(fit: FittedModel, known: Mapping[Key, FittedModel]) -> float:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
+from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.drift import NoiseFit
@@ -150,6 +151,7 @@ def run_search(
         best = _settled(refined(best, base, again=True), base)
         best = with_spectrum(best, seen)
         best = shape_fitted(best)
+        best = best if quick else with_profiled_shape(best)
     return SearchResult(
         best.model.terms[-1],
         best,

@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.model.process_noise import (
     refit_noise,
     refit_open_loop,
 )
+from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
@@ -150,6 +151,7 @@ def search_with_process_noise(
         if free is not None and not quick:
             paying = [fit for fit in fits if _pays(base, fit, prefer, settings)]
             best, ranking = with_open_loop_gain(best, ranking, paying, free, dict(runs), terms)
+        best = best if quick else with_profiled_shape(best)
         best = refit_noise(best, noise_of_fit(best, declared), declared, settings.noise)
         best = best if quick else refit_input_hold(best, declared, fixed, settings.noise)
     bare = _without(base, best, declared, settings) if fits and has_process_noise(best) else None

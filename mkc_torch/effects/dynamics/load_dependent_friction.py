@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.rate import RateEffect
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ class LoadDependentFriction(RateEffect):
 
     id = "load_dependent_friction"
     port = "loaded rate"
+    reduces_to = CoulombFriction()
     needs = ("reversing", "load")  # at speeds of one sign it is a constant force
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
     gain = "friction"

@@ -258,7 +258,7 @@ def shape(finding: Finding) -> str:
     if found is None:
         return ""
     p = probability(found.p_value)
-    if finding.grade != "nearest":
+    if found.curve is None:
         return f"a free curve of the same variables is not clearly better ({p})"
     return (
         f"a free curve of the same variables at the same port gains {size(found.free_curve_gain)} "

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
+from mkc_torch.diagnosis.environment import ShapeCheck
+from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Finding, HeldOut
 
 SURE = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
@@ -56,3 +57,12 @@ def test_a_finding_that_enlarges_the_residual_is_not_clearly_better():
     found = dataclasses.replace(finding((1.3, 5.5), (0.04, None)), clearly_better=True)
     assert grade_of(found) == "left_out"
     assert grade_of(dataclasses.replace(found, evidence=larger)) == "unconfirmed"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [("left_out", "nearest"), ("small", "nearest"), ("unconfirmed", "unconfirmed")]
+)
+def test_another_shape_does_not_confirm_a_finding(before, after):
+    curve = object()
+    assert with_shape(before, ShapeCheck(40.0, 0.002, curve)) == after
+    assert with_shape(before, ShapeCheck(0.5, 0.4)) == with_shape(before, None) == before

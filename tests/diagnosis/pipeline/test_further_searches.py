@@ -2,11 +2,13 @@
 
 import importlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
@@ -121,3 +123,36 @@ def test_an_effect_that_makes_the_fit_diverge_is_found_from_the_initial_values(r
     assert stiffness.value == pytest.approx(0.8, rel=0.05)
     assert diagnosis.model is not None
     assert float(diagnosis.model.theta[0]) == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("refused", [(), ("first",), ("first", "second")])
+def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(monkeypatch, refused):
+    """The names are those of the candidates that enlarge it; the search is repeated once."""
+    terms = tuple(SimpleNamespace(key=name) for name in ("first", "second", "third"))
+    known = SimpleNamespace(fit="without", term=SimpleNamespace(key="known"))
+
+    def located(_fit, left, *_others, **_options):
+        return SimpleNamespace(term=left[0], fit=left[0].key, p_value=0.01)
+
+    def accept(search, _fit, found, _options):
+        return replace(search, found=(*search.found, found))
+
+    monkeypatch.setattr(stepwise, "_located", located)
+    monkeypatch.setattr(stepwise, "_accept", accept)
+    monkeypatch.setattr(stepwise, "_in_two_steps", lambda _, after, *__: after)
+    monkeypatch.setattr(stepwise, "_is_screened_out", lambda *_: False)
+    monkeypatch.setattr(stepwise, "enlarges_open_loop", lambda fit, _: fit in refused)
+    before = stepwise.StepwiseSearch(None, (known,), None, None, (), terms)
+    after = stepwise.next_step(before, SimpleNamespace(level=0.05, quick=False), torch.Generator())
+    assert [found.term.key for found in after.refused] == list(refused[:1])
+    taken = [found.term.key for found in after.found[1:]]
+    assert taken == {0: ["first"], 1: ["second"], 2: []}[len(refused)]
+    assert after.left == (() if len(refused) == 2 else terms)
+
+
+def test_a_refused_candidate_is_reported_with_its_reason(recording):
+    build = importlib.import_module("mkc_torch.diagnosis.pipeline.build")
+    (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
+    warning = build._enlarging(SimpleNamespace(term=term, p_value=0.01), quick=False)
+    assert term.effect.id in warning
+    assert "p = 0.01 after the whole search, but the open-loop residual is larger with it" in warning

@@ -1,5 +1,6 @@
 """Of an effect with a number for each part, the form with one for all is taken where unseen blocks allow it."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -150,3 +151,40 @@ def test_every_simpler_form_has_fewer_numbers():
         simple = replace(term, effect=effect.simpler)
         one, two = simple.size(context), term.size(context)
         assert (one, two) == (1, 2)
+
+
+class Slide(Dynamics):
+    """A slide that is pushed to and fro, without friction."""
+
+    states = ("place", "speed")
+    inputs = ("force",)
+    units = {"place": "m", "speed": "m/s", "force": "N"}
+    parameters = {"gain": Parameter(1.0, lower=0.0), "spring": Parameter(1.0, lower=0.0)}
+    input_hold = "held"
+
+    def derivative(self, time, x, u, p):
+        return {"place": x.speed, "speed": p.gain * u.force - p.spring * x.place}
+
+
+def test_friction_without_a_share_of_the_load_is_dry_friction():
+    time = STEP * torch.arange(N, dtype=torch.float64)
+    force = torch.sin(0.7 * time)
+    place, speed, places = 0.0, 0.0, []
+    for now in force.tolist():
+        places.append(place)
+        for _ in range(FINE):
+            speed += STEP / FINE * (now - place - 0.2 * math.tanh(speed / 0.01))
+            place += STEP / FINE * speed
+    noise = 0.005 * torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    prepared = Slide().prepare(
+        Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
+    )
+    (*_, term) = candidate_terms(prepared, (), (OF["load_dependent_friction"],))  # the steepest
+    base = fitted(JointModel(prepared), prepared.start())
+    fit = fitted(base.model.with_term(term), torch.cat([base.parameters, torch.zeros(2).double()]), base.bound)
+    blocks = blocks_of(N, 1, ConfirmationSettings())
+    simple, _ = simplified(fit, held_out(fit, blocks), blocks, always, NamingSettings())
+    (found,) = simple.model.terms
+    assert (found.effect.id, found.port) == ("coulomb_friction", "rate of speed")
+    assert found.key in {t.key for t in candidate_terms(prepared, (), DYNAMICS)}
+    assert float(simple.parameters[-1]) == pytest.approx(0.2, rel=0.1)

@@ -1,12 +1,18 @@
 """A candidate without any gain in open loop gives way to a rival that clearly improves the open loop."""
 
+import dataclasses
 import functools
 
 import pytest
 import torch
 
 from mkc_torch.diagnosis.model.fit import fitted_with_effect
-from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop, with_open_loop_gain
+from mkc_torch.diagnosis.search.open_loop_gain import (
+    LARGER,
+    enlarges_open_loop,
+    improves_open_loop,
+    with_open_loop_gain,
+)
 from mkc_torch.diagnosis.search.ranking import Ranked
 from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
 
@@ -63,3 +69,17 @@ def test_an_effect_that_halves_the_open_loop_residual_is_needed():
     assert float(none.residual.std()) == pytest.approx(float(free().residual.std()), rel=0.05)
     assert improves_open_loop(drag, free())
     assert not improves_open_loop(none, free())
+
+
+@pytest.mark.parametrize(("ratio", "larger"), [(0.98 * LARGER, False), (1.02 * LARGER, True)])
+def test_a_stretch_that_a_fit_rejects_counts_in_the_open_loop_residual(ratio, larger):
+    """The middle half of the residual, and so its robust size, is smaller; a stretch of a tenth of it grows."""
+    residual = free().residual - free().residual.mean()
+    moved, N = residual.clone(), len(residual)
+    moved[: N // 2] *= 0.5
+    wanted = ratio**2 * residual.square().sum() - moved[: -N // 10].square().sum()
+    moved[-N // 10 :] = (wanted / len(moved[-N // 10 :])).sqrt()
+    assert (
+        enlarges_open_loop(dataclasses.replace(free(), residual=moved), dataclasses.replace(free(), residual=residual))
+        is larger
+    )

@@ -1,0 +1,72 @@
+"""The delay of an input by a profile of the likelihood."""
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
+from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.simulation import Dynamics, Parameter
+
+STEP, DELAYED, NOISE = 0.02, 8, 0.002
+
+
+class Cart(Dynamics):
+    states = ("place", "speed")
+    inputs = ("force",)
+    outputs = ("place",)
+    units = {"place": "m", "speed": "m/s"}
+    parameters = {"gain": Parameter(1.0, lower=0.0), "spring": Parameter(1.0, lower=0.0)}
+    input_hold = "held"
+
+    def derivative(self, time, x, u, p):
+        return {"place": x.speed, "speed": p.gain * u.force - p.spring * x.place - 0.5 * x.speed}
+
+
+@functools.cache
+def base():
+    """The fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
+    generator = torch.Generator().manual_seed(0)
+    N = 600
+    force = torch.randn(N // 10, generator=generator, dtype=torch.float64).repeat_interleave(10)
+    late = torch.cat([force[:1].expand(DELAYED), force[:-DELAYED]])
+    place, speed, places = 0.0, 0.0, []
+    for now in late.tolist():
+        places.append(place)
+        for _ in range(20):
+            speed += STEP / 20 * (now - 2.0 * place - 0.5 * speed)
+            place += STEP / 20 * speed
+    noise = NOISE * torch.randn(N, generator=generator, dtype=torch.float64)
+    time = STEP * torch.arange(N, dtype=torch.float64)
+    recording = Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
+    prepared = Cart().prepare(recording)
+    return fitted(JointModel(prepared), prepared.start())
+
+
+def with_effect(name, **shape):
+    """The fit with an effect, at this shape."""
+    effect = next(effect for effect in DYNAMICS if effect.id == name)
+    term = candidate_terms(base().model.prepared, (), (effect,))[0]
+    model = base().model.with_term(replace(term, shape={**term.shape, **shape}))
+    return fitted(model, torch.cat([base().parameters, base().parameters.new_tensor([0.5])]), base().bound)
+
+
+@pytest.mark.parametrize("start", [0.06, 0.0999])
+def test_a_delay_is_found_beyond_the_next_local_maximum(start):
+    stuck = shape_fitted(with_effect("input_delay", delay=start))
+    assert abs(stuck.model.terms[-1].shape["delay"] - DELAYED * STEP) > STEP
+    found = with_profiled_shape(stuck)
+    assert found.model.terms[-1].shape["delay"] == pytest.approx(DELAYED * STEP, abs=0.5 * STEP)
+    assert float(found.parameters[-1]) == pytest.approx(1.0, abs=0.05)
+    assert float(found.residual.square().mean().sqrt()) == pytest.approx(NOISE, rel=0.15)
+
+
+def test_effects_without_a_delay_stay():
+    fit = with_effect("dead_zone")
+    assert with_profiled_shape(fit) is fit
