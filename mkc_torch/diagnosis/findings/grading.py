@@ -58,7 +58,9 @@ def confirmed(finding: Finding) -> bool:
     """Whether held-out blocks confirm a finding; the search confirms an event that cannot be held out.
 
     A finding of size 0 is unconfirmed whatever the blocks show: another change, such as of the noise model, made the
-    difference. A finding of impossible size is a proxy of other physics.
+    difference. A finding of impossible size is a proxy of other physics. Where blocks can only reject, because process
+    noise predicts one step ahead as well, the open loop has to gain somewhere: its likelihood, or its residual on the
+    blocks.
     """
     if is_zero_within_error(finding) or finding.cannot_be:
         return False
@@ -66,7 +68,9 @@ def confirmed(finding: Finding) -> bool:
     if held is None:
         return True
     kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
-    return kind == "surely" if held.decides else not vetoed(held)
+    if held.decides:
+        return kind == "surely"
+    return not vetoed(held) and (finding.clearly_better or _mean_ratio(held) <= 1.0)
 
 
 def vetoed(held_out: HeldOut) -> bool:
@@ -97,12 +101,12 @@ def is_zero_within_error(finding: Finding) -> bool:
     """Whether all parameters are within a standard error of 0; False without standard errors.
 
     A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without
-    the finding is clearly less likely, and the residual on held-out blocks is not larger with it. Far from 0 the
+    the finding is clearly less likely, and the residual on held-out blocks clearly smaller with it. Far from 0 the
     likelihood can be flat, as for the capacity of a large second store, and the standard error larger than the size
     (Hauck & Donner, Journal of the American Statistical Association 72 (1977), 851).
     """
     held = finding.held_out
-    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0)
+    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0 - SMALL)
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
