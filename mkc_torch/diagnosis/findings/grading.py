@@ -98,19 +98,20 @@ def _mean_ratio(held_out: HeldOut) -> float:
 
 
 def is_zero_within_error(finding: Finding) -> bool:
-    """Whether all parameters are within a standard error of 0; False without standard errors.
+    """Whether all sizes are within a standard error of 0; False without standard errors.
 
-    A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without
-    the finding is clearly less likely, and the residual on held-out blocks clearly smaller with it. Far from 0 the
-    likelihood can be flat, as for the capacity of a large second store, and the standard error larger than the size
-    (Hauck & Donner, Journal of the American Statistical Association 72 (1977), 851).
+    Numbers of the shape, such as a period, do not count: they exist at any size. A size that ended at a bound of 0 has
+    a standard error of 0. Otherwise False as well if the open-loop fit without the finding is clearly less likely, and
+    the residual on held-out blocks clearly smaller with it. Far from 0 the likelihood can be flat, as for the capacity
+    of a large second store, and the standard error larger than the size (Hauck & Donner, Journal of the American
+    Statistical Association 72 (1977), 851).
     """
     held = finding.held_out
     better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0 - SMALL)
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
-        if parameter.standard_error is not None
+        if parameter.standard_error is not None and not parameter.of_shape
     ]
     if known and not any(bool(value.any()) for value, _ in known):
         return True

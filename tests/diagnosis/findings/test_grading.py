@@ -50,6 +50,16 @@ def test_a_size_that_ended_at_its_bound_of_zero_is_not_confirmed():
     assert not is_zero_within_error(finding((0.0, 0.0), (2.0, 0.1)))
 
 
+def test_a_known_period_does_not_give_an_effect_a_size():
+    """A hidden mode of share 0.5 ± 1 and period 0.45 ± 0.07 s."""
+    share, period = EffectParameter("share", 0.5, 1.0, ""), EffectParameter("period", 0.45, 0.07, "s", of_shape=True)
+    found = dataclasses.replace(finding(), parameters=(share, period))
+    assert grade_of(found) == "unconfirmed"
+    assert (
+        grade_of(dataclasses.replace(found, parameters=(dataclasses.replace(share, value=1.5), period))) == "left_out"
+    )
+
+
 def on_blocks(after, **known):
     return (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 1.0, after, "rad", **known), "")),)
 
