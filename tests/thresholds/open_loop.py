@@ -49,7 +49,7 @@ SAMPLES, FINE = 300, 6
 SENSOR, SLOW = 0.01, 0.03
 """Standard deviations of white noise and of a slow error, as shares of the output's standard deviation."""
 
-PUSH = 0.1
+DISTURBANCE = 0.1
 """Standard deviation of a disturbance, as a share of that of the last state's rate."""
 
 
@@ -158,20 +158,22 @@ def drawn(name: str, hidden: str, seed: int) -> Recording:
     force = force + (2.0 if name in ("basin", "sled") else 0.0)
     rate = equations(hidden, float(np.exp(random.uniform(np.log(0.3), np.log(1.5)))))
     share = float(random.choice([0.02, 0.1, 0.3]))
-    pushed = bool(random.integers(2))
-    push = PUSH * float(np.std(force)) * _slow(random, share) * (0.4 if name == "ship" else 1.0) * pushed
+    disturbed = bool(random.integers(2))
+    disturbance = (
+        DISTURBANCE * float(np.std(force)) * _slow(random, share) * (0.4 if name == "ship" else 1.0) * disturbed
+    )
     course, x = [], np.zeros(states)
     for k in range(SAMPLES):
         course.append(x[0])
         for part in range(FINE):
             u = force[k] + (force[min(k + 1, SAMPLES - 1)] - force[k]) * (part + 0.5) / FINE
             h, kick = step / FINE, np.zeros(states)
-            kick[1 if name in ("ship", "circuit") else 0] = push[k]
+            kick[1 if name in ("ship", "circuit") else 0] = disturbance[k]
             x = x + h * (rate(x + 0.5 * h * (rate(x, u) + kick), u) + kick)
     output = np.array(course)
     size = float(output.std())
     output = (
-        output + SENSOR * size * random.standard_normal(SAMPLES) + (not pushed) * SLOW * size * _slow(random, share)
+        output + SENSOR * size * random.standard_normal(SAMPLES) + (not disturbed) * SLOW * size * _slow(random, share)
     )
     simulation = SYSTEMS[name][0]
     columns = {"time": clock, simulation.inputs[0]: force, simulation.outputs[0]: output}

@@ -105,8 +105,8 @@ def test_a_candidate_that_missed_the_noise_is_fitted_from_the_noise_of_the_simul
     found = _no_less_likely(base, lambda: missed, {}, settings)
     assert priced(found, settings) >= priced(base, settings) - 1e-3
     assert found.model.terms[-1].key == drag.key
-    likelier = dataclasses.replace(found, log_likelihood=base.log_likelihood + 1.0)
-    assert _no_less_likely(base, lambda: likelier, {}, settings) is likelier
+    kept = dataclasses.replace(found, log_likelihood=base.log_likelihood + 1.0)
+    assert _no_less_likely(base, lambda: kept, {}, settings) is kept
 
 
 def of_likelihood(value, size, shape=()):
