@@ -60,7 +60,7 @@ def confirmed(finding: Finding) -> bool:
     A finding of size 0 is unconfirmed whatever the blocks show: another change, such as of the noise model, made the
     difference. A finding of impossible size is a proxy of other physics. Where blocks can only reject, because process
     noise predicts one step ahead as well, the open loop has to gain somewhere: its likelihood, or its residual on the
-    blocks.
+    blocks; a reduction there below :data:`SMALL` counts only with a larger likelihood.
     """
     if is_zero_within_error(finding) or finding.cannot_be:
         return False
@@ -70,7 +70,8 @@ def confirmed(finding: Finding) -> bool:
     kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
     if held.decides:
         return kind == "surely"
-    return not vetoed(held) and (finding.clearly_better or _mean_ratio(held) <= 1.0)
+    least = 1.0 if kind == "surely" else 1.0 - SMALL
+    return not vetoed(held) and (finding.clearly_better or _mean_ratio(held) <= least)
 
 
 def vetoed(held_out: HeldOut) -> bool:

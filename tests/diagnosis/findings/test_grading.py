@@ -77,3 +77,8 @@ def test_where_blocks_only_reject_the_open_loop_has_to_gain_somewhere():
     assert grade_of(found) == "unconfirmed"
     assert grade_of(dataclasses.replace(found, evidence=on_blocks(0.99, decides=False))) == "small"
     assert grade_of(dataclasses.replace(found, clearly_better=True)) == "small"
+    (blocks,) = on_blocks(0.98, decides=False)
+    held = dataclasses.replace(blocks.value[0], log_likelihood_gain=0.002, confidence_interval=(-0.007, 0.011))
+    unsure = dataclasses.replace(found, evidence=(EvidenceResult("held_out", (held, "")),))
+    assert grade_of(unsure) == "unconfirmed"
+    assert grade_of(dataclasses.replace(unsure, clearly_better=True)) == "small"
