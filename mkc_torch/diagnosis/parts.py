@@ -69,7 +69,8 @@ class EffectParameter:
     """A parameter of an effect.
 
     ``standard_error`` has the shape of ``value``, with None for an unknown error. ``components`` labels the numbers of
-    a list in their order; empty for a single number.
+    a list in their order; empty for a single number. ``of_shape`` is True for a number of the effect's shape, such as a
+    period, which exists at any size of the effect.
     """
 
     name: str
@@ -77,6 +78,7 @@ class EffectParameter:
     standard_error: Number | None
     unit: str
     components: tuple[str, ...] = ()
+    of_shape: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 Draws empty recordings of a mass on a spring under six kinds of noise, searches each as `mkc diagnose` does, and takes
 the p-value of that search, which is `p_value` of `diagnosis.json`. Writes `p_values.json`, `null_p_values.svg` with a
-histogram for each kind, and `summary.md`: Kolmogorov's distance from the uniform distribution, and the share below the
-level with the interval of Clopper and Pearson. A run into the same folder continues an interrupted run.
+histogram for each kind, and `summary.md`: the counts of a coarser histogram, Kolmogorov's distance from the uniform
+distribution, and the share below the level with the interval of Clopper and Pearson. A run into the same folder
+continues an interrupted run.
 
     python -m tests.gate.null_p_values --per-kind 40 --output null
     python -m tests.gate.null_p_values --per-kind 5 --kinds white "held inputs" --output quick
@@ -32,6 +33,9 @@ from tests.gate.null_recordings import KINDS, Spring, recording
 LEVEL = 0.05
 BINS = 20
 
+EDGES = (LEVEL, 0.25, 0.5, 0.75, 1.0)
+"""Upper ends, included, of the bins whose counts are in the table."""
+
 PValue = Callable[[Recording, int], float]
 
 
@@ -46,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     settings = {"seed": options.seed, "surrogates": options.surrogates}
     found = run(options.output, options.kinds, options.per_kind, settings)
-    rows = {kind: numbers(values) for kind, values in found.items()}
+    rows = {kind: {**numbers(values), "counts": counts(values)} for kind, values in found.items()}
     (options.output / "summary.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
     (options.output / "null_p_values.svg").write_text(picture(found), encoding="utf-8")
     print("\n".join(table(rows)))
@@ -108,16 +112,27 @@ def numbers(p_values: Sequence[float]) -> dict[str, float]:
     }
 
 
-def table(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
+def counts(p_values: Sequence[float]) -> list[int]:
+    """The number of p-values in each bin of the table.
+
+    Example:
+        >>> counts([0.01, 0.05, 0.2, 1.0])
+        [2, 1, 0, 0, 1]
+    """
+    return [sum(low < p <= high for p in p_values) for low, high in zip((-math.inf, *EDGES), EDGES, strict=False)]
+
+
+def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The table in Markdown."""
     lines = [
-        f"| kind of noise | recordings | p ≤ {LEVEL:g} | 95 % interval | Kolmogorov's distance | p if uniform |",
-        "|---|---:|---:|---|---:|---:|",
+        f"| kind of noise | recordings | p ≤ {LEVEL:g} | 95 % interval | Kolmogorov's distance | p if uniform "
+        f"| {' | '.join(f'to {edge:g}' for edge in EDGES)} |",
+        f"|---|---:|---:|---|---:|---:|{'---:|' * len(EDGES)}",
     ]
     return lines + [
         f"| {kind} | {row['recordings']:.0f} | {100.0 * row['below']:.1f} % "
         f"| {100.0 * row['low']:.1f} to {100.0 * row['high']:.1f} % "
-        f"| {row['distance']:.2f} | {row['uniform_p']:.2g} |"
+        f"| {row['distance']:.2f} | {row['uniform_p']:.2g} | {' | '.join(map(str, row['counts']))} |"
         for kind, row in rows.items()
     ]
 

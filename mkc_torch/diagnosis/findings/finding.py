@@ -243,7 +243,7 @@ def _components(term: Term, quantity: str, size: int, context: Context) -> tuple
 
 def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[EffectParameter, ...]:
     return tuple(
-        EffectParameter(name, value, errors.get(name), term.effect.unit_of_shape(name, context))
+        EffectParameter(name, value, errors.get(name), term.effect.unit_of_shape(name, context), of_shape=True)
         for name, value in term.shape.items()
         if name != "onset" and term.effect.reports(name)
     )

@@ -59,7 +59,9 @@ def confirmed(finding: Finding) -> bool:
     """Whether held-out blocks confirm a finding; the search confirms an event that cannot be held out.
 
     A finding of size 0 is unconfirmed whatever the blocks show: another change, such as of the noise model, made the
-    difference. A finding of impossible size is a proxy of other physics.
+    difference. A finding of impossible size is a proxy of other physics. Where blocks can only reject, because process
+    noise predicts one step ahead as well, the open loop has to gain somewhere: its likelihood, or its residual on the
+    blocks; a reduction there below :data:`SMALL` counts only with a larger likelihood.
     """
     if is_zero_within_error(finding) or finding.cannot_be:
         return False
@@ -67,7 +69,10 @@ def confirmed(finding: Finding) -> bool:
     if held is None:
         return True
     kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
-    return kind == "surely" if held.decides else not vetoed(held)
+    if held.decides:
+        return kind == "surely"
+    least = 1.0 if kind == "surely" else 1.0 - SMALL
+    return not vetoed(held) and (finding.clearly_better or _mean_ratio(held) <= least)
 
 
 def vetoed(held_out: HeldOut) -> bool:
@@ -95,19 +100,20 @@ def _mean_ratio(held_out: HeldOut) -> float:
 
 
 def is_zero_within_error(finding: Finding) -> bool:
-    """Whether all parameters are within a standard error of 0; False without standard errors.
+    """Whether all sizes are within a standard error of 0; False without standard errors.
 
-    A size that ended at a bound of 0 has a standard error of 0. Otherwise False as well if the open-loop fit without
-    the finding is clearly less likely, and the residual on held-out blocks is not larger with it. Far from 0 the
-    likelihood can be flat, as for the capacity of a large second store, and the standard error larger than the size
-    (Hauck & Donner, Journal of the American Statistical Association 72 (1977), 851).
+    Numbers of the shape, such as a period, do not count: they exist at any size. A size that ended at a bound of 0 has
+    a standard error of 0. Otherwise False as well if the open-loop fit without the finding is clearly less likely, and
+    the residual on held-out blocks clearly smaller with it. Far from 0 the likelihood can be flat, as for the capacity
+    of a large second store, and the standard error larger than the size (Hauck & Donner, Journal of the American
+    Statistical Association 72 (1977), 851).
     """
     held = finding.held_out
-    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0)
+    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0 - SMALL)
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters
-        if parameter.standard_error is not None
+        if parameter.standard_error is not None and not parameter.of_shape
     ]
     if known and not any(bool(value.any()) for value, _ in known):
         return True

@@ -295,7 +295,12 @@ def _finding(
 
 
 def _clearly_better(fits: Sequence[FittedModel], number: int, naming: NamingSettings) -> bool:
-    """Whether the fit without the last finding is clearly less likely, with the residual's correlation."""
+    """Whether the fit without the last finding is clearly less likely, with the residual's correlation.
+
+    Schwarz's price and the limit of separability were checked on the recordings of `tests.thresholds.open_loop`, fitted
+    in open loop: 24 of 28 hidden effects gain more. Where nothing is hidden, some candidate does in 3 of 4 under a
+    disturbance of a state, and in 0 of 6 with a slow error of the sensor. So this gain alone confirms no finding.
+    """
     if number < len(fits) - 2:
         return False
     before, after = fits[number], fits[number + 1]

@@ -16,10 +16,20 @@ from mkc_torch.diagnosis.search.ranking import Ranked
 __all__ = ["CLEARLY_LESS", "LARGER", "NO_LESS", "enlarges_open_loop", "improves_open_loop", "with_open_loop_gain"]
 
 NO_LESS = 0.95
-"""Ratio of open-loop residuals with and without a candidate above which it does not improve the open loop."""
+"""Ratio of open-loop residuals with and without a candidate above which it does not improve the open loop.
+
+Judgement, checked on 38 recordings of a ship, a circuit, a basin and a sled (`python -m tests.thresholds.open_loop`,
+seeds 0 to 3). The hidden effect, where most likely, is above it in 0 of 23, and above 0.9 in 1. Where nothing is
+hidden, some candidate is below it in 7 of 10.
+"""
 
 CLEARLY_LESS = 0.7
-"""Ratio of open-loop residuals of a rival and of such a candidate below which the rival takes its place."""
+"""Ratio of open-loop residuals of a rival and of such a candidate below which the rival takes its place.
+
+Judgement, checked on the same recordings: fitted in open loop, the hidden effect is not below it in 2 of 28. Where
+nothing is hidden, some candidate is below it in 3 of 4 under a disturbance of a state, and in 0 of 6 with a slow error
+of the sensor. So this ratio alone names nothing: the rival has to pay its price too.
+"""
 
 LARGER = 1.05
 """Ratio of open-loop residuals with and without a candidate above which it enlarges the open-loop residual: the ratio

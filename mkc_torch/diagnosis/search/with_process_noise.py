@@ -144,6 +144,7 @@ def search_with_process_noise(
             )
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
         works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
+        works = [partial(_no_less_likely, base, work, declared, settings) for work in works]
         chosen += [number for number, _ in more]
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
@@ -274,6 +275,24 @@ def _under_own_noise(
     under = with_own_noise(under, declared, settings)
     # an observer undoes a sensor's lag with the recorded outputs, which is exact for short lags only
     return under if priced(under, settings) > priced(running, settings) else running
+
+
+def _no_less_likely(
+    base: FittedModel, work: Callable[[], FittedModel], declared: Mapping[str, float], settings: Settings
+) -> FittedModel:
+    """Return a candidate's fit, or if it is less likely than the simulation alone, a fit from that one's noise.
+
+    A candidate includes the simulation alone, so such a fit has missed the most likely noise: a slow error of the
+    sensor, for example, in place of process noise.
+    """
+    fit = work()
+    if priced(fit, settings) >= priced(base, settings):
+        return fit
+    model = base.model.with_term(fit.model.terms[-1])
+    zero = fit.parameters.new_zeros(len(fit.parameters) - len(base.parameters))
+    starts = (fit.parameters, torch.cat([base.parameters, zero]))
+    tried = [fitted_with_effect(base, model, start, graduate=False) for start in starts]
+    return with_own_noise(max(tried, key=lambda found: found.log_likelihood), declared, settings)
 
 
 def _plain(

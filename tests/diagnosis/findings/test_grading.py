@@ -51,12 +51,38 @@ def test_a_size_that_ended_at_its_bound_of_zero_is_not_confirmed():
     assert not is_zero_within_error(finding((0.0, 0.0), (2.0, 0.1)))
 
 
-def test_a_finding_that_enlarges_the_residual_is_not_clearly_better():
-    """The likelihood with the residual's correlation can rise for a residual that grows slowly."""
-    larger = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 0.17, 0.8, "rad"), "")),)
+def test_a_known_period_does_not_give_an_effect_a_size():
+    """A hidden mode of share 0.5 ± 1 and period 0.45 ± 0.07 s."""
+    share, period = EffectParameter("share", 0.5, 1.0, ""), EffectParameter("period", 0.45, 0.07, "s", of_shape=True)
+    found = dataclasses.replace(finding(), parameters=(share, period))
+    assert grade_of(found) == "unconfirmed"
+    assert (
+        grade_of(dataclasses.replace(found, parameters=(dataclasses.replace(share, value=1.5), period))) == "left_out"
+    )
+
+
+def on_blocks(after, **known):
+    return (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 1.0, after, "rad", **known), "")),)
+
+
+@pytest.mark.parametrize(("after", "grade"), [(0.9, "left_out"), (0.96, "unconfirmed"), (4.7, "unconfirmed")])
+def test_a_size_of_zero_within_its_error_has_to_reduce_the_residual_on_blocks(after, grade):
+    """The likelihood with the residual's correlation can rise for a residual that grows slowly, or is the same."""
     found = dataclasses.replace(finding((1.3, 5.5), (0.04, None)), clearly_better=True)
-    assert grade_of(found) == "left_out"
-    assert grade_of(dataclasses.replace(found, evidence=larger)) == "unconfirmed"
+    assert grade_of(dataclasses.replace(found, evidence=on_blocks(after))) == grade
+
+
+def test_where_blocks_only_reject_the_open_loop_has_to_gain_somewhere():
+    """Process noise predicts one step ahead with any effect."""
+    found = dataclasses.replace(finding((1.3, 0.1)), evidence=on_blocks(1.01, decides=False))
+    assert grade_of(found) == "unconfirmed"
+    assert grade_of(dataclasses.replace(found, evidence=on_blocks(0.99, decides=False))) == "small"
+    assert grade_of(dataclasses.replace(found, clearly_better=True)) == "small"
+    (blocks,) = on_blocks(0.98, decides=False)
+    held = dataclasses.replace(blocks.value[0], log_likelihood_gain=0.002, confidence_interval=(-0.007, 0.011))
+    unsure = dataclasses.replace(found, evidence=(EvidenceResult("held_out", (held, "")),))
+    assert grade_of(unsure) == "unconfirmed"
+    assert grade_of(dataclasses.replace(unsure, clearly_better=True)) == "small"
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,16 @@ import types
 import pytest
 import torch
 
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.ranking import within_reach
-from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, search_with_process_noise
+from mkc_torch.diagnosis.search.with_process_noise import (
+    _needless,
+    _no_less_likely,
+    _plain,
+    search_with_process_noise,
+)
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
@@ -85,6 +93,19 @@ def test_candidates_without_a_refit_stay_in_the_ranking():
     assert len(found.compared) == 1
     assert len({rival.number for rival in found.ranking}) > 4
     assert found.ranking[0].gap == 0.0 <= min(rival.gap for rival in found.ranking[1:])
+
+
+def test_a_candidate_that_missed_the_noise_is_fitted_from_the_noise_of_the_simulation_alone():
+    base, settings = fitted_swing("slow", drag=0.0).fit, Settings()
+    drag = next(term for term in candidates(base, DYNAMICS) if term.effect.id == "quadratic_drag")
+    model = JointModel(base.model.prepared.open_loop(), (drag,), base.model.near)
+    missed = fitted(model, torch.cat([base.parameters, torch.zeros(1).double()]))
+    assert priced(missed, settings) < priced(base, settings) - 20.0
+    found = _no_less_likely(base, lambda: missed, {}, settings)
+    assert priced(found, settings) >= priced(base, settings) - 1e-3
+    assert found.model.terms[-1].key == drag.key
+    kept = dataclasses.replace(found, log_likelihood=base.log_likelihood + 1.0)
+    assert _no_less_likely(base, lambda: kept, {}, settings) is kept
 
 
 def of_likelihood(value, size, shape=()):

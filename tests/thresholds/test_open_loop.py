@@ -1,0 +1,30 @@
+"""The draws that thresholds are set on hide what their names say, and error rates are counted per recording."""
+
+import pytest
+import torch
+
+from tests.thresholds.open_loop import NOTHING, SYSTEMS, drawn, rates
+
+
+@pytest.mark.parametrize("name", list(SYSTEMS))
+def test_the_same_seed_gives_the_same_recording_and_each_effect_its_own(name):
+    simulation, _, _, effects = SYSTEMS[name]
+    output = simulation.outputs[0]
+    first, again = drawn(name, effects[0], 3), drawn(name, effects[0], 3)
+    torch.testing.assert_close(first[output], again[output], rtol=0, atol=0)
+    assert len({float(drawn(name, hidden, 3)[output][9]) for hidden in (*effects, NOTHING)}) == len(effects) + 1
+    assert set(first.names) == {"time", output, *simulation.inputs}
+
+
+def test_error_rates_count_recordings():
+    def candidate(ratio, right):
+        return {"ratio": ratio, "gain": 5.0, "right": right}
+
+    rows = [
+        {"hidden": "drag", "free": [candidate(0.4, True)], "paying": [candidate(0.97, True)], "special": []},
+        {"hidden": "drag", "free": [candidate(0.8, True), candidate(0.2, False)], "paying": [], "special": []},
+        {"hidden": NOTHING, "free": [candidate(0.6, False), candidate(0.3, False)], "paying": [], "special": []},
+    ]
+    lines = list(rates(rows))
+    assert "ratio 0.7: by chance below 1/1; hidden effect not below 1/2, as most likely candidate 1/1" in lines[2]
+    assert "gain 4.5: by chance above 1/1, hidden effect not above 0/2" in lines
