@@ -83,7 +83,6 @@ def descend(
         damping = torch.full_like(quadratic.value, 1e-4)
     growth = torch.full_like(damping, 4.0)
     done = torch.zeros_like(damping, dtype=torch.bool)
-    accepted = torch.zeros_like(done)
     least = eps * eps * quadratic.value
     if allowance is not None:
         least = torch.maximum(least, allowance)
@@ -108,7 +107,6 @@ def descend(
         small = small | (solved & (step.abs() <= 4 * eps * point.theta.abs()).all(-1))
         ratio = (actual / predicted.clamp(min=torch.finfo(actual.dtype).tiny)).clamp(max=2.0)
         shrink = (1.0 - (2.0 * ratio - 1.0).pow(3)).clamp(0.1, 2.0)
-        accepted = torch.where(done, accepted, accept)
         failed_step = ~accept & ~small & ~done
         # a failed step with stale derivatives does not raise the damping
         changed = torch.where(
@@ -133,7 +131,7 @@ def descend(
                 quadratic = replace(quadratic, value=current)
         elif bool((done | (damping >= 1e15)).all()):
             break
-    return Descent(point, quadratic.value, done, needs_refresh, accepted, damping, n_iter)
+    return Descent(point, quadratic.value, done, needs_refresh, damping, n_iter)
 
 
 def _unpredicted_share(

@@ -191,7 +191,6 @@ class Descent:
     value: Tensor
     converged: Tensor  # converged: actual and predicted decrease, with fresh derivatives, are below the limit
     needs_refresh: bool  # the derivatives are too stale to continue
-    accepted: Tensor  # whether the last trial step was accepted
     damping: Tensor
     n_iter: int
 

@@ -45,7 +45,7 @@ def descend_single(
         quadratic = objective.quadratic(at.theta, at.residual, at.tangents, None)
         model, scaling = _model_curvature(quadratic), _positive(quadratic.majoriser.diagonal())
         own, growth = 1e-4 if damping is None else float(damping[0]), 4.0
-        done = accepted = needs_refresh = False
+        done = needs_refresh = False
         least = eps * eps * quadratic.value
         if allowance is not None:
             least = max(least, float(allowance[0]))
@@ -72,7 +72,6 @@ def descend_single(
             small = solved and own <= 1.0 and predicted <= limit and not actual > limit
             small = small or (solved and bool((np.abs(step) <= 4 * eps * np.abs(at.theta)).all()))
             ratio = min(actual / max(predicted, np.finfo(float).tiny), 2.0)
-            accepted = accept
             if accept:
                 own, growth = own * min(max(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1), 2.0), 4.0
             elif not small:
@@ -101,7 +100,6 @@ def descend_single(
         torch.full_like(like, quadratic.value),
         torch.full_like(like, done, dtype=torch.bool),
         needs_refresh,
-        torch.full_like(like, accepted, dtype=torch.bool),
         torch.full_like(like, own),
         n_iter,
     )

@@ -43,13 +43,6 @@ _OTHERS = {
 }  # fmt: skip
 """Words that mark another quantity: an estimate, an expected value, or a derived value."""
 
-_FILLERS = {
-    "field", "raw", "sensor", "imu", "data", "value", "values", "val", "measured", "measurement", "reading", "body",
-    "frame", "vector", "vec", "axis", "component", "motion", "device", "msg", "message", "uncalibrated", "uncal",
-    "calibrated", "cal", "calib", "corrected", "si",
-}  # fmt: skip
-"""Words that do not identify the sensor, or only describe the form of the data."""
-
 _TIME_UNITS = {"millis", "micros", "seconds", "milliseconds", "microseconds", "nanoseconds"}
 _TIME = {
     "utc",

@@ -37,7 +37,7 @@ def undetermined(
 
         >>> tangents = torch.ones(5, 2) * torch.tensor([1.0, -2.0])
         >>> undetermined(tangents, torch.tensor([2.0, 1.0]), ("spring", "mass"))
-        ('The recording does not determine `spring` and `mass`, but only ... 0.71 spring + 0.71 mass, relative).',)
+        ('The recording does not determine `spring` and `mass` separately: ... 0.71 spring + 0.71 mass, relative).',)
     """
     size = torch.where(theta == 0, 1.0, theta.abs())
     scaled = tangents * size

@@ -99,9 +99,9 @@ def best_shares(g: Generator, guess: Guess, trial: RunSet, outputs: Array) -> li
     middle = outputs.mean((1, 2), keepdims=True)
     scale = outputs.std((1, 2), keepdims=True)
     low, high = (np.array([bound[k] for bound in guess.bounds], dtype=float) for k in (0, 1))
-    begin = _first_states(plant, trial, outputs)
+    begin, reach = _first_states(plant, trial, outputs)
     theta = np.stack([np.concatenate([start, begin.ravel()]) for start in _starts(g, guess, low, high)])
-    spread = np.concatenate([np.abs(theta[:, : len(low)]).max(0), np.repeat(_reach(plant, trial, outputs), runs)])
+    spread = np.concatenate([np.abs(theta[:, : len(low)]).max(0), np.repeat(reach, runs)])
 
     def left(points: Array) -> Array:
         """Return residuals (points, M) in standard deviations of the outputs."""
@@ -141,24 +141,18 @@ def _starts(g: Generator, guess: Guess, low: Array, high: Array) -> list[Array]:
     return found
 
 
-def _first_states(plant: Plant, trial: RunSet, outputs: Array) -> Array:
-    """Return initial states (n, R): measured positions, speeds from first differences, 0 for the rest."""
-    begin = np.zeros((len(plant.states), trial.runs))
-    for output, values in zip(plant.outputs, outputs, strict=True):
-        begin[plant.row(output)] = values[0]
-        if plant.speeds.get(output) in plant.states:
-            begin[plant.row(plant.speeds[output])] = (values[1] - values[0]) / trial.step
-    return begin
+def _first_states(plant: Plant, trial: RunSet, outputs: Array) -> tuple[Array, Array]:
+    """Return initial states (n, R) and the range of each state (n,), from its output or that of its position.
 
-
-def _reach(plant: Plant, trial: RunSet, outputs: Array) -> Array:
-    """Return the range of each state (n,), from its output or that of its position."""
-    reach = np.ones(len(plant.states))
+    Speeds are first differences. A state that is not measured starts at 0 and has the range 1.
+    """
+    begin, reach = np.zeros((len(plant.states), trial.runs)), np.ones(len(plant.states))
     for output, values in zip(plant.outputs, outputs, strict=True):
-        reach[plant.row(output)] = np.ptp(values)
+        begin[plant.row(output)], reach[plant.row(output)] = values[0], np.ptp(values)
         if plant.speeds.get(output) in plant.states:
-            reach[plant.row(plant.speeds[output])] = np.abs(np.diff(values, axis=0)).max() / trial.step
-    return reach
+            row, pace = plant.row(plant.speeds[output]), np.diff(values, axis=0) / trial.step
+            begin[row], reach[row] = pace[0], np.abs(pace).max()
+    return begin, reach
 
 
 def _course(plant: Plant, trial: RunSet, parameters: Array, begin: Array) -> Array:

@@ -33,7 +33,7 @@ class CoulombFriction(RateEffect):
 
     id = "coulomb_friction"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
-    needs = ("reversing",)  # at speeds of one sign it is a constant force
+    needs: tuple[str, ...] = ("reversing",)  # at speeds of one sign it is a constant force
     gain = "friction"
     equation = "δv̇ = −γ tanh(v / w)"
     explanation = "Dry friction opposes the motion with a force that does not depend on the speed."

@@ -8,19 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
-from mkc_torch.effects.dynamics.rate import RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-WIDTHS = (0.3, 0.1, 0.03, 0.01)
-"""Widths of the smoothed sign, as shares of the typical speed."""
 
-
-class LoadDependentFriction(RateEffect):
+class LoadDependentFriction(CoulombFriction):
     """Dry friction of a gear: a constant part, and a part in proportion to the load on the teeth.
 
     Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, where a is the contribution of the
@@ -35,20 +30,10 @@ class LoadDependentFriction(RateEffect):
     port = "loaded rate"
     reduces_to = CoulombFriction()
     needs = ("reversing", "load")  # at speeds of one sign it is a constant force
-    relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
-    gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
     explanation = "Dry friction opposes the motion, the more the larger the load of the drive."
     advice = "Add dry friction with a part in proportion to the load."
-    form_parameters = ("width",)
     source = "Duclusaud et al., Extended Friction Models for the Physics Simulation of Servo Actuators, ICRA 2025"
-
-    def equation_of(self, shape: Shape, context: Context) -> str:
-        width = sized(float(shape["width"]), context.unit_of("own"))
-        return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
-
-    def shapes(self, time: object) -> Sequence[Shape]:
-        return tuple({"width": width} for width in WIDTHS)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         return (Quantity("friction", 1, context.signal_unit), Quantity("share_of_load", 1, ""))

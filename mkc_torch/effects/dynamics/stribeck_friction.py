@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
-from mkc_torch.effects.dynamics.rate import RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,7 +19,7 @@ SPEEDS = (0.1, 0.3, 1.0)
 """Stribeck speeds to search, below which friction grows, as shares of the typical speed."""
 
 
-class StribeckFriction(RateEffect):
+class StribeckFriction(CoulombFriction):
     """Dry friction that grows at small speeds, where the lubricant's film breaks down.
 
     Simulation: adds ``−(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)`` to the rate of a speed v.
@@ -34,18 +32,11 @@ class StribeckFriction(RateEffect):
     id = "stribeck_friction"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical"), "stribeck_speed": ("own", "typical")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"stribeck_speed": (0.05, 2.0)}
-    needs = ("reversing",)  # at speeds of one sign it is a constant force
     reduces_to = CoulombFriction()
-    gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
     explanation = "Dry friction opposes the motion, and is larger at small speeds."
     advice = "Add dry friction with a rise towards standstill."
-    form_parameters = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"
-
-    def equation_of(self, shape: Shape, context: Context) -> str:
-        width = sized(float(shape["width"]), context.unit_of("own"))
-        return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
     def shapes(self, time: object) -> Sequence[Shape]:
         return tuple({"width": width, "stribeck_speed": speed} for width in (0.1, 0.03) for speed in SPEEDS)

@@ -36,8 +36,6 @@ COUNTERS = 128
 PROGRAMS_EACH = 32
 """Programs per multiprocessor."""
 
-_INT32 = 2**31
-
 _COUNT, _LABELS = CachedKernel(count_kernel), CachedKernel(labels_kernel)
 
 
