@@ -13,7 +13,7 @@ ROOT = Path(mkc_torch.__file__).parent
 MOST_LINES = 450
 
 FLOORS = (
-    {"_parallel", "_support", "_words"},
+    {"_parallel", "_support"},
     {"density", "recording"},
     {"functional"},
     {"losses"},

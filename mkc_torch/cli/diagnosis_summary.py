@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mkc_torch._words.typesetting import plain, typeset
+from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.cli.remarks import note_rows, warning_rows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import environment, noise, numbers, unseen

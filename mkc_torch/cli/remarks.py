@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from mkc_torch._words.typesetting import plain
+from mkc_torch._support.typesetting import plain
 
 NOTE = "note"
 """Label of a note."""

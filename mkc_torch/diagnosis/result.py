@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from mkc_torch._parallel.deadline import Reason
 from mkc_torch._support.html_table import html_table
-from mkc_torch._words.typesetting import plain, typeset
+from mkc_torch._support.typesetting import plain, typeset
 from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
 from mkc_torch.diagnosis.parts import (
     Alternative,

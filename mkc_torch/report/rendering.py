@@ -7,7 +7,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from mkc_torch._words.typesetting import capital
+from mkc_torch._support.typesetting import capital
 from mkc_torch.calibration.coverage import nearest_axis
 from mkc_torch.report.words import numbers as wording
 

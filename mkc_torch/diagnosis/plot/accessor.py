@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from mkc_torch._support.drawing import BLUE, GREY, ORANGE, array, axes_or_new
+from mkc_torch._support.typesetting import capital, plain
 from mkc_torch._support.unit_text import tidy
-from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import CandidateScore, Finding, Separability, Traces
 from mkc_torch.diagnosis.plot.curves import (

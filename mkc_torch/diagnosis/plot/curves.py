@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, array
+from mkc_torch._support.typesetting import plain
 from mkc_torch._support.unit_text import tidy
-from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, NoiseEnvironment
 from mkc_torch.diagnosis.parts import StateMap
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, SHADE, array
-from mkc_torch._words.typesetting import capital
+from mkc_torch._support.typesetting import capital
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import Finding, Traces
 from mkc_torch.diagnosis.plot.curves import named, short, units_of_outputs

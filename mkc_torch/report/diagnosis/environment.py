@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from mkc_torch._support.typesetting import plain
 from mkc_torch._support.unit_text import sized, tidy
-from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.report.diagnosis.evidence import Table

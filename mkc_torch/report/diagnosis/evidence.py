@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mkc_torch._words.typesetting import typeset
+from mkc_torch._support.typesetting import typeset
 from mkc_torch.diagnosis.result import DensityCheck, DriverShift, EvidenceResult, Extrapolation
 
 _DRIVEN_BY = "driven by"

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 
-from mkc_torch._words.typesetting import plain, several, typeset
+from mkc_torch._support.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.environment import Grade, Run
 from mkc_torch.diagnosis.result import Alternative, CandidateScore, Finding, Region
 from mkc_torch.effects import is_curve, words_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from mkc_torch._words.typesetting import plain, several
+from mkc_torch._support.typesetting import plain, several
 from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size

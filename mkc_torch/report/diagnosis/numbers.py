@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from mkc_torch._words.typesetting import plain, superscript
+from mkc_torch._support.typesetting import plain, superscript
 from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mkc_torch._words.typesetting import plain
+from mkc_torch._support.typesetting import plain
 
 
 def recording_called(number: int, name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from mkc_torch._words.typesetting import capital, plain
+from mkc_torch._support.typesetting import capital, plain
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.environment import noise_lines, output_lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mkc_torch._words.typesetting import plain
+from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, vetoed
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes

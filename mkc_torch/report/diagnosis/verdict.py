@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from mkc_torch._words.typesetting import capital, plain, several
+from mkc_torch._support.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
 from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
