@@ -19,8 +19,6 @@ from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.protocol import Simulation
 
-__all__ = ["diagnose"]
-
 LEVEL = 0.05
 """Default rate of false alarms."""
 

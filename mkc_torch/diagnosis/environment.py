@@ -11,19 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "Curve",
-    "DisturbanceEstimate",
-    "GoodnessOfFit",
-    "Grade",
-    "NoiseEnvironment",
-    "Offset",
-    "ProcessNoise",
-    "Run",
-    "ShapeCheck",
-    "Verdict",
-]
-
 Verdict = Literal["unfit", "adequate", "explained", "unexplained"]
 
 Grade = Literal["left_out", "small", "unconfirmed", "nearest"]

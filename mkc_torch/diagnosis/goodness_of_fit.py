@@ -17,8 +17,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["goodness_of_fit", "pooled", "poor_fits", "size_of", "units_of"]
-
 _SLOWER = 1e-4
 """Share of an output's variation below which a noise floor estimated from samples is not meaningful."""
 

@@ -15,29 +15,6 @@ from mkc_torch.effects.kinds import Kind
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "Alternative",
-    "CandidateScore",
-    "DensityCheck",
-    "DivergedBlock",
-    "DriverShift",
-    "EffectParameter",
-    "EvidenceResult",
-    "Extrapolation",
-    "Finding",
-    "HeldOut",
-    "HeldOutScore",
-    "NoiseSummary",
-    "Reference",
-    "Region",
-    "ResidualSizes",
-    "Separability",
-    "SmoothCorrection",
-    "StateMap",
-    "Traces",
-    "value_of",
-]
-
 Number = float | tuple["Number", ...]
 
 

@@ -11,11 +11,6 @@ from dataclasses import dataclass, fields, replace
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type
 
-__all__ = [
-    "ConfirmationSettings", "DriverSettings", "EvidenceSettings", "NamingSettings", "NoiseSettings", "SearchSettings",
-    "Settings",
-]  # fmt: skip
-
 
 class _Stage:
     """Check the numbers of a stage: integers from 1, other numbers finite and not negative."""

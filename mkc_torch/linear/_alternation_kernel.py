@@ -8,8 +8,6 @@ import triton.language as tl
 from mkc_torch.density._newton_kernel import newton_step
 from mkc_torch.linear._concentration_kernel import weighted_fit
 
-__all__ = ["alternation_kernel"]
-
 _NUMBERS = ("problems", "samples", "x_batch", "w_batch", "steps", "patience", "free_kappa", "free_d")
 """Numbers of which the compiled form does not depend."""
 

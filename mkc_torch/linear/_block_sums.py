@@ -20,8 +20,6 @@ from mkc_torch.linear.summary import LIGHT
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
-__all__ = ["PLAIN_KAPPA", "BlockSums", "Memory", "products"]
-
 _STRIP = 1 << 13
 """Rows whose products are formed at once; four times as many take three times as long."""
 

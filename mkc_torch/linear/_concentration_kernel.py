@@ -5,8 +5,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-__all__ = ["concentration_kernel", "weighted_fit", "weighted_fit_kernel"]
-
 _NUMBERS = (
     "starts", "sets", "samples", "x_batch", "w_batch", "max_iter", "has_near", "keeps", "newton_steps", "is_exact",
 )  # fmt: skip

@@ -19,8 +19,6 @@ from mkc_torch.losses.kernels.cached import CachedKernel
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
-__all__ = ["fused_pass"]
-
 _PROGRAMS = 1024
 """Largest number of programs, about eight for each multiprocessor."""
 

@@ -18,8 +18,6 @@ from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start, small_sample_factor
 
-__all__ = ["TIGHT", "FixedParameters", "LikelihoodMaximum", "given_bound", "least_d", "maximise", "rough_fit"]
-
 _FLOOR = 0.3
 """Least d in robust scales. Outliers at most double a scale; the d of a fit that interpolates is far smaller."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["rank_tolerance"]
-
 _MOST_ROWS = 8192
 """Rows beyond which the tolerance no longer grows: LAPACK adds up blocks of rows, whose errors nearly cancel.
 

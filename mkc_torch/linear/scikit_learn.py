@@ -25,8 +25,6 @@ from mkc_torch.linear.mm_regression import MMRegression
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ScikitLearnRegressor"]
-
 
 class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn has no types
     """Robust linear regression with scikit-learn's interface, for pipelines, searches and cross-validation.

@@ -18,8 +18,6 @@ from mkc_torch.recording.row_sensors import with_row_sensors
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["write_with_columns"]
-
 _LEADING_ZERO = r"^\s*[+-]?0\d"
 """Pattern of digits that are a name rather than a number, such as 007."""
 

@@ -1,4 +1,4 @@
-"""Lags of sensors and actuators are told apart, and come in the order in which the signal passes them."""
+"""Lags of sensors and actuators are distinguished, and come in the order in which the signal passes them."""
 
 import numpy as np
 import pytest

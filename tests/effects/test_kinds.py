@@ -90,7 +90,7 @@ def test_hidden_lag_states_that_its_size_holds_for_a_start_in_balance():
     effect = HiddenLag()
     context = at_state(effect, "°C")
     assert "in balance with the state at the start of each run" in effect.explained([0.4], STORE, context)
-    assert effect.advised([0.4], STORE, context).endswith("fit its start and its size anew.")
+    assert effect.advised([0.4], STORE, context).endswith("refit its start and its size.")
 
 
 def test_a_periodic_force_states_its_periods():

@@ -28,8 +28,6 @@ from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["CommonCause", "common_cause", "course_without", "goes_on", "located_cause", "proxy_driver_evidence"]
-
 _ROUNDS, _SETTLED = 40, 1e-2
 """Maximum number of MM iterations, and the gain in nats below which they stop."""
 

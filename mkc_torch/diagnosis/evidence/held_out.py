@@ -20,8 +20,6 @@ from mkc_torch.functional import mkc_nll
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "on_all", "scored"]
-
 
 @dataclass(frozen=True)
 class HeldOutBlocks:

@@ -18,9 +18,6 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["OpenLoop", "open_loop_at", "open_loop_evidence", "running_unjudged"]
-
-
 _REACH = 3.0
 """Minimum half-width of the density's domain, in robust scales of the residual."""
 

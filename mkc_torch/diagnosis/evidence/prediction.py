@@ -20,17 +20,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Bool
 
-__all__ = [
-    "extrapolated",
-    "extrapolation_evidence",
-    "extrapolation_of_finding",
-    "extrapolation_result",
-    "held_out_gain_evidence",
-    "kept_blocks",
-    "sizes_of",
-    "without_finding",
-]
-
 _RANGE = 1.0
 """Residual, in ranges of the recorded output, beyond which a sample has diverged."""
 

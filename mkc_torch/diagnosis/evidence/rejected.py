@@ -13,8 +13,6 @@ from mkc_torch.recording.disturbance import RejectedInterval, disturbed_interval
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["RejectedByFit", "localised_evidence", "rejected_evidence", "rejected_intervals"]
-
 
 def localised_evidence(case: EvidenceContext) -> EvidenceResult:
     """Return the interval to which the first candidate is confined, in s; None if it is not confined."""

@@ -24,16 +24,6 @@ from mkc_torch.functional import mkc_weight
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "Ceiling",
-    "as_result",
-    "ceiling",
-    "nameless",
-    "remaining",
-    "remaining_evidence",
-    "within_reach",
-]
-
 _MOST = 4
 """Largest number of selected columns; a column counts once per port."""
 

@@ -19,18 +19,6 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "Whiteness",
-    "as_result",
-    "density_checks",
-    "density_evidence",
-    "kolmogorov",
-    "student_cdf",
-    "student_fit",
-    "whiteness",
-    "whiteness_evidence",
-]
-
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 """Candidate degrees of freedom."""
 

@@ -15,8 +15,6 @@ from mkc_torch.diagnosis.evidence.rejected import localised_evidence, rejected_e
 from mkc_torch.diagnosis.evidence.residual_noise import whiteness_evidence
 from mkc_torch.diagnosis.search.estimate import FinalEstimate, estimate
 
-__all__ = ["EvidenceReport", "all_results", "in_short", "precompute", "results_of_tests"]
-
 
 def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
     """Return the fast tests.

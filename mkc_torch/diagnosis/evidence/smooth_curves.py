@@ -19,8 +19,6 @@ from mkc_torch.simulation.ports import Port
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Smooth", "curves_of", "legendre", "smooth_tangents"]
-
 DEGREE = 5
 """Degree of the Legendre curves of columns."""
 

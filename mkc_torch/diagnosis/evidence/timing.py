@@ -22,21 +22,6 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "comes_and_goes",
-    "driver_shift_evidence",
-    "driver_shift_of_finding",
-    "driver_shift_result",
-    "intermittency_evidence",
-    "intermittency_result",
-    "memory_of",
-    "onset_evidence",
-    "onset_interval",
-    "onset_of_finding",
-    "onset_result",
-    "shifted",
-]
-
 _CRITICAL = -2.0 * math.log(1.0 - math.sqrt(0.95))
 """95 % quantile of the likelihood ratio of the onset."""
 

@@ -11,8 +11,6 @@ from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.effects.kinds import MOTION
 
-__all__ = ["advice_of", "follows", "follows_all", "nothing_shows"]
-
 _FLOOR = 2.0
 """Residual, in noise floors, up to which an output that hardly varies counts as fitted."""
 

@@ -21,8 +21,6 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["MOST_FITTED", "with_parameters"]
-
 MOST_FITTED = 3
 """Number of alternatives that are fitted; the terminal names as many."""
 

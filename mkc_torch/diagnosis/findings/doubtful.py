@@ -9,8 +9,6 @@ from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
 from mkc_torch.diagnosis.findings.grading import worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis
 
-__all__ = ["DiagnosisDoubt", "diagnosis_doubts", "rejected_share"]
-
 DiagnosisDoubt = Literal["unfit", "unexplained", "unconfirmed", "not_better", "much_rejected"]
 """``unfit``: the simulation does not fit the recording.
 ``unexplained``: structure remains that no finding explains, or the search was stopped.

@@ -14,17 +14,6 @@ from mkc_torch.diagnosis.result import DensityCheck, DriverShift, Extrapolation,
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.recording.disturbance import RejectedInterval
 
-__all__ = [
-    "called",
-    "density_warnings",
-    "driver_shift_warnings",
-    "evidence_warnings",
-    "extrapolation_warnings",
-    "localised_warnings",
-    "rejected_warnings",
-    "remaining_warnings",
-]
-
 _MOST_LISTED = 3
 """Largest number of intervals that are listed, the longest."""
 

@@ -16,8 +16,6 @@ from mkc_torch.diagnosis.search.run import SearchResult
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["SAME", "distinguishing_state"]
-
 SAME = "They are identical in this recording: a recording in which they differ can distinguish them."
 
 _NOTHING = 0.05

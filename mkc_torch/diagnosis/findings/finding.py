@@ -30,20 +30,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "all_parameters",
-    "ended_shapes",
-    "far_from_plausible",
-    "finding_of",
-    "intervals_of",
-    "labels",
-    "parameters_of",
-    "places_of",
-    "separability",
-    "shape_at_ends",
-    "times_plausible",
-]
-
 FAR = 10.0
 """Multiple of the plausible size above which a finding is unconfirmed."""
 

@@ -10,22 +10,6 @@ import torch
 from mkc_torch.diagnosis.environment import Grade, ShapeCheck
 from mkc_torch.diagnosis.result import Finding, HeldOut
 
-__all__ = [
-    "SMALL",
-    "Confirmation",
-    "change",
-    "confirmation",
-    "confirmed",
-    "grade_in_short",
-    "grade_of",
-    "is_zero_within_error",
-    "small",
-    "transfers",
-    "vetoed",
-    "with_shape",
-    "worth_correcting",
-]
-
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
 
 SMALL = 0.05

@@ -24,8 +24,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["forcing_of", "noise_summary", "offsets_of", "process_noise_of", "runs_of"]
-
 
 def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary:
     """Return the noise model (white, autoregressive or random walk) with its parameters."""

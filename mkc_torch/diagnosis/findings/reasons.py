@@ -23,8 +23,6 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["at_ends", "reasons_of"]
-
 _NOUGHT = 1e-3
 """Relative value below which a parameter is nearly 0."""
 

@@ -24,8 +24,6 @@ from mkc_torch.diagnosis.result import Region, StateMap
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Attribution", "attributed", "map_of", "region_of", "shares_of_runs"]
-
 _NODES = 8
 """Gauss-Legendre nodes of the integral over the amplitude, denser near the full amplitude."""
 

@@ -10,8 +10,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FINE_POINTS", "bending_points", "drawn_points"]
-
 FINE_POINTS = 800
 """Number of evenly spaced points at which a curve is computed."""
 

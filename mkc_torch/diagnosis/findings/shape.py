@@ -22,8 +22,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["formulas", "nearest_power", "shape_of"]
-
 _MOST_TERMS = 3
 """Largest number of terms."""
 

@@ -26,19 +26,6 @@ from mkc_torch.diagnosis.result import (
     Number,
 )
 
-__all__ = [
-    "SCHEMA",
-    "DiagnosisFileError",
-    "diagnosis_to_json",
-    "disturbance_json",
-    "goodness_of_fit_json",
-    "json_schema",
-    "noise_json",
-    "recordings_json",
-    "remaining_json",
-    "validate",
-]
-
 _MOST_POINTS = 500
 """Largest number of samples of a disturbance that are written."""
 

@@ -31,8 +31,6 @@ from mkc_torch.simulation.protocol import CorrectableSimulation, Correction, Sim
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SCHEMA", "DiagnosedModel", "ModelFileError", "correction_of", "model_of", "refuse_unknown"]
-
 SCHEMA = "mkc-model/1"
 
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from mkc_torch.diagnosis.model.term import Term
 
-__all__ = ["SourceError", "python_source"]
-
 _DIGITS = 9
 """Significant digits of a number in the source."""
 _FROM_HERE: Mapping[str, str] = {

@@ -13,8 +13,6 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer import Magnetometer
 
-__all__ = ["sensor_correction"]
-
 
 def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
     """Return the affine part of a model's correction, with notes on the effects that are left out.

@@ -19,8 +19,6 @@ from mkc_torch.diagnosis.settings import NoiseSettings
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_with_effect", "without_term"]
-
 _CLIP = 2.0
 """Robust standard deviations at which residuals are clipped for the start of a fit."""
 

@@ -24,8 +24,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointModel", "directions", "in_order_of_the_chain", "port_jacobian", "summed", "through_port"]
-
 _CHUNK = 64
 """Number of changes at a port whose tangents are computed together."""
 

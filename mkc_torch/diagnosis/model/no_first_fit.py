@@ -5,8 +5,6 @@ from __future__ import annotations
 from mkc_torch.simulation.dynamics.other_starts import OtherStarts
 from mkc_torch.simulation.protocol import PreparedSimulation
 
-__all__ = ["no_first_fit"]
-
 
 def no_first_fit(prepared: PreparedSimulation, others: OtherStarts | None = None) -> str:
     """Return sentences: what is wrong, what was tried and what to change.

@@ -28,20 +28,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "ProcessNoiseFit",
-    "choose_input_hold",
-    "estimate_noise",
-    "first_samples",
-    "fit_alone",
-    "fit_with_process_noise",
-    "has_process_noise",
-    "noise_of_fit",
-    "refit_input_hold",
-    "refit_noise",
-    "refit_open_loop",
-]
-
 _ROUNDS = 2
 """Rounds of estimating the noise along a trajectory and fitting the parameters under it."""
 

@@ -11,8 +11,6 @@ from mkc_torch.diagnosis.model.shapes import reach_of, shape_fitted
 from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["with_profiled_shape"]
-
 _FACTORS = (0.5, 0.71, 0.84, 0.92, 1.09, 1.19, 1.41, 2.0)
 """Factors by which a delay or a lag is varied in each round."""
 

@@ -21,8 +21,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ShapedModel", "candidate_terms", "described", "finer", "reach_of", "shape_fitted", "within_a_sample"]
-
 _STEPS = 8
 """Grid points of a shape number to either side of its value, and the factor by which its range shrinks each round."""
 

@@ -22,19 +22,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "ANY",
-    "Driver",
-    "Drivers",
-    "Key",
-    "Term",
-    "common_parts",
-    "context_at",
-    "continuous",
-    "find_drivers",
-    "run_parallel",
-]
-
 COPY = 1e-9
 """Distance of a correlation from ±1 below which two columns are one driver."""
 

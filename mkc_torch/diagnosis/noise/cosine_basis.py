@@ -11,8 +11,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["cosines", "course_of", "dct", "dct_of_courses", "inverse_dct"]
-
 
 def dct(values: Float[Tensor, N * rest], count: int | None = None) -> Float[Tensor, count * rest]:
     """Orthonormal cosine transform (DCT-II) over the first dimension, or the first ``count`` of its coefficients.

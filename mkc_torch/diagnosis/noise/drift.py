@@ -13,8 +13,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["DriftStatistics"]
-
 _SIZES = 36
 """Number of drift sizes tried, up to a few times the largest that could fit."""
 

@@ -20,8 +20,6 @@ from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Imputation", "MissingSamples"]
-
 _PLAIN = 0.3
 """Relative distance to the level of its high-frequency end within which a spectrum counts as white."""
 

@@ -14,16 +14,6 @@ from mkc_torch.diagnosis.settings import NoiseSettings
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "crowded",
-    "near_median",
-    "out_of_bursts",
-    "pseudo_residual",
-    "rejected_in_all",
-    "running_median",
-    "without_one_sided",
-]
-
 
 def running_median(values: Float[Tensor, "N m"], half: int) -> Float[Tensor, "N m"]:
     """Return the median of each value and ``half`` neighbours to either side, mirrored at the ends.

@@ -16,21 +16,6 @@ from mkc_torch.diagnosis.noise.outliers import running_median
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = [
-    "NoiseSpectrum",
-    "agreed_innovation_gain",
-    "autoregression",
-    "autoregressive",
-    "correlation_time",
-    "enters_at_port",
-    "filtered",
-    "innovation_gain",
-    "port_autoregression",
-    "spectrum_of",
-    "spectrum_of_fast",
-    "whittle",
-]
-
 MAX_ORDER = 12
 """Highest order of the autoregression."""
 

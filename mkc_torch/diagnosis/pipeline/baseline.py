@@ -11,8 +11,6 @@ from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.simulation.protocol import PreparedSimulation
 
-__all__ = ["fit_baseline"]
-
 
 def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:
     """Fit the simulation without findings, with a step of integration on which the fit does not depend.

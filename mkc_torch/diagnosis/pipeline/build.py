@@ -39,18 +39,6 @@ from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, sized_noise
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
-__all__ = [
-    "DiagnosisInputs",
-    "FitAssessment",
-    "assess",
-    "assess_baseline",
-    "build_diagnosis",
-    "impossible_rotations",
-    "noise_environment",
-    "verdict_of",
-    "with_search_notes",
-]
-
 _LOST = -1.0
 """Smallest explained share of an output in the mean over the outputs."""
 

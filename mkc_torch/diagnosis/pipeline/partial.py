@@ -24,8 +24,6 @@ from mkc_torch.diagnosis.result import Diagnosis, Stop
 from mkc_torch.diagnosis.search.estimate import estimate as final_estimate
 from mkc_torch.diagnosis.search.run import SearchResult
 
-__all__ = ["PartialResult", "build_result", "cut_short", "error_without_fit", "estimate", "run_tests"]
-
 
 class PartialResult:
     """What is known of a running diagnosis; the stages fill it in.

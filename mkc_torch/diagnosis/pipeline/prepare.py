@@ -17,18 +17,6 @@ from mkc_torch.recording.join_recordings import join_recordings, recording_names
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
-__all__ = [
-    "Problem",
-    "SearchOptions",
-    "checked_effects",
-    "checked_input_hold",
-    "checked_noise",
-    "joined",
-    "prepare",
-    "subject_of",
-    "with_own_offsets",
-]
-
 
 @dataclass(frozen=True)
 class SearchOptions:

@@ -15,8 +15,6 @@ from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch, first_step, next_step
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 
-__all__ = ["stepwise_search"]
-
 
 def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoiseFit) -> StepwiseSearch:
     """Search for effects one after another, each with the previous findings in the model.

@@ -14,10 +14,8 @@ from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["in_likelier_order"]
 
-
-def in_likelier_order(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
+def in_better_order(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
     """Return the fit, or the fit with lag and static effect of a port exchanged if that is clearly more likely.
 
     A driver's dead zone comes before the lag of its motor, the square law of a propeller behind it.

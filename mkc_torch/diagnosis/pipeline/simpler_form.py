@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from mkc_torch.effects.base import Effect
     from mkc_torch.simulation.protocol import PreparedSimulation
 
-__all__ = ["simpler_by_price", "simplified"]
-
 Holds = Callable[[FittedModel, Evidence], bool]
 
 

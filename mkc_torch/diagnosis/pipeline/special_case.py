@@ -13,8 +13,6 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NamingSettings
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["REACH", "with_special_case"]
-
 REACH = 2.0
 """Limits of separability within which a special case is compared on held-out blocks: a Bayes factor of 8,000.
 

@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.pipeline.series_order import in_likelier_order
+from mkc_torch.diagnosis.pipeline.series_order import in_better_order
 from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.pipeline.special_case import with_special_case
 from mkc_torch.diagnosis.search.open_loop_gain import enlarges_open_loop, improves_open_loop
@@ -255,7 +255,7 @@ def _accept(
     if located.with_noise and after is None and options.judged and not options.quick:
         scores = partial(_evidence, blocks=search.blocks, options=options)
         located = with_special_case(located, scores, search.blocks, options.seed, options.settings.naming)
-    ordered = in_likelier_order(located.fit, options.declared, options.settings)
+    ordered = in_better_order(located.fit, options.declared, options.settings)
     if ordered is not located.fit:
         located, after = replace(located, fit=ordered, term=ordered.model.terms[-1]), None
     before = search.evidence[-1]

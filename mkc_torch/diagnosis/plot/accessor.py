@@ -31,8 +31,6 @@ from mkc_torch.diagnosis.plot.residual import (
 )
 from mkc_torch.effects import words_of
 
-__all__ = ["DiagnosisPlot"]
-
 _MOST_SHOWN = 12
 """Default number of candidates."""
 

@@ -13,18 +13,6 @@ from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate, NoiseEnvironment
 from mkc_torch.diagnosis.parts import StateMap
 
-__all__ = [
-    "CURVE_COLORS",
-    "MOST_LETTERS",
-    "draw_course",
-    "draw_curve",
-    "draw_map",
-    "named",
-    "of_time",
-    "short",
-    "units_of_outputs",
-]
-
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 MOST_LETTERS = 26
 """Letters of a name in a figure; longer names are cut."""

@@ -15,19 +15,6 @@ from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import Finding, Traces
 from mkc_torch.diagnosis.plot.curves import named, short, units_of_outputs
 
-__all__ = [
-    "MOMENTS",
-    "acting_channels",
-    "draw_floor",
-    "draw_residual",
-    "draw_residuals",
-    "mark_findings",
-    "mark_rejected",
-    "of_channel",
-    "onsets",
-    "unit_of_channel",
-]
-
 MOMENTS = ("before", "after")
 _USED, _REJECTED = "#7FB8DA", "#F2C7AA"
 _MOST_POINTS = 5_000  # of a panel

@@ -34,8 +34,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FinalEstimate", "Local", "drift_residuals", "estimate", "explained", "with_smaller_step"]
-
 _ROUNDS = 4
 """Largest number of rounds of rejecting residuals by their distance from the drift and estimating the drift again."""
 

@@ -33,8 +33,6 @@ from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joine
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointLikelihood", "JointStart", "joint_likelihood"]
-
 _STEPS = (0.5, 0.5, 0.25, 0.25, 0.125)
 """Decades by which sizes and times of the leading noise models are varied, round by round."""
 

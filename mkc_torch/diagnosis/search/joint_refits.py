@@ -25,8 +25,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["by_joint_fits", "refitted", "strongest"]
-
 T = TypeVar("T")
 
 

@@ -31,8 +31,6 @@ from mkc_torch.simulation.dynamics.whitening import (
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Columns", "LogLikelihoods", "log_likelihoods"]
-
 _SINGULAR = 1e-9
 """Share of a candidate's squares, or of their largest eigenvalue, below which a direction counts as absent."""
 

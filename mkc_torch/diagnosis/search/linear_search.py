@@ -21,8 +21,6 @@ from mkc_torch.diagnosis.noise.drift import DriftFamily, DriftStatistics, NoiseF
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["LinearSearch", "SearchGains", "log_survival"]
-
 _LEFT = 1e-4
 """Share of a candidate's direction that the simulation's own parameters have to leave; other directions are dropped."""
 

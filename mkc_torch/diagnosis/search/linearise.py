@@ -28,8 +28,6 @@ from mkc_torch.diagnosis.search.tangents import AT_ONCE, ModelTangents, SlowBasi
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FILLED_AT_ONCE", "CosineProjection", "LinearisedSearch", "each", "linearise"]
-
 _MOST = 0.9
 """Share of the tangents' power that sets their bandwidth."""
 

@@ -13,8 +13,6 @@ from mkc_torch.diagnosis.model.process_noise import refit_open_loop
 from mkc_torch.diagnosis.model.term import Key, Term, run_parallel
 from mkc_torch.diagnosis.search.ranking import Ranked
 
-__all__ = ["CLEARLY_LESS", "LARGER", "NO_LESS", "enlarges_open_loop", "improves_open_loop", "with_open_loop_gain"]
-
 NO_LESS = 0.95
 """Ratio of open-loop residuals with and without a candidate above which it does not improve the open loop.
 

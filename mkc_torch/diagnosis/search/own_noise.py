@@ -22,8 +22,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FreeRuns", "free_runs", "linear_gains", "needless_term", "priced", "with_own_noise", "without"]
-
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
     """Return the joint fit of a candidate, with its shape, under the most likely sizes of the remaining noise."""

@@ -25,8 +25,6 @@ from mkc_torch.functional import mkc_energy
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["LinearizedSearch", "SearchProblem", "middle", "refine_candidates", "refined", "with_spectrum"]
-
 
 @dataclass(frozen=True)
 class SearchProblem:

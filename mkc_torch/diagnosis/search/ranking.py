@@ -20,8 +20,6 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ModelPrior", "Ranked", "alike", "best_first", "in_order", "ranked", "schwarz", "within_reach"]
-
 AKAIKE = 1.0
 """Nats per number (Akaike's criterion)."""
 

@@ -35,8 +35,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SearchResult", "run_search", "screening_p_value"]
-
 
 @dataclass(frozen=True)
 class SearchResult:

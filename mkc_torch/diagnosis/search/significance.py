@@ -20,18 +20,6 @@ from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = [
-    "COUNTS",
-    "COUNTS_NOT",
-    "any_pays",
-    "best_rank_p_value",
-    "localised_stretch",
-    "own_spectrum_gains",
-    "pays",
-    "price",
-    "surrogate_p_value",
-]
-
 
 def own_spectrum_gains(
     linearised: LinearisedSearch, series: Float[Tensor, "M B"], possible: Bool[Tensor, " C"]

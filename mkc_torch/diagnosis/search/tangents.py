@@ -19,16 +19,6 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "AT_ONCE",
-    "Candidates",
-    "ModelTangents",
-    "SlowBasis",
-    "in_blocks",
-    "one_after_the_other",
-    "tangents_of",
-]
-
 AT_ONCE = 8
 """Largest number of candidates whose tangents are computed together, so that a short recording's fit into the cache."""
 

@@ -36,8 +36,6 @@ from mkc_torch.diagnosis.search.tangents import tangents_of
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
-__all__ = ["search_with_process_noise"]
-
 _CURVES = 2
 """Number of free curves that are fitted in addition to the leading candidates."""
 

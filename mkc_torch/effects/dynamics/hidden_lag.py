@@ -86,7 +86,7 @@ class HiddenLag(RateEffect):
     def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return (
             f"Add {self.store(gamma, shape, context)}{_EXAMPLES.get(kind_at(context), '')}. If it did not start in "
-            "balance with the first, fit its start and its size anew."
+            "balance with the first, refit its start and its size."
         )
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:

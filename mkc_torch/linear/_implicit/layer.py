@@ -33,8 +33,6 @@ from mkc_torch.linear.covariance import CovarianceKind
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Given", "Layer", "fit_layer", "needs_derivatives"]
-
 _APPLICATIONS = 2
 """Orders of derivatives that are right."""
 

@@ -7,8 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["NotDifferentiableError"]
-
 
 class NotDifferentiableError(ValueError):
     """A derivative was taken of a fit that has not converged or is not at a strict minimum."""

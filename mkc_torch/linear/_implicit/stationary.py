@@ -19,8 +19,6 @@ from mkc_torch.linear._problem import LinearProblem
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["FitState", "Unknowns", "free_unknowns", "inverse_where", "moved"]
-
 _POLISHING_STEPS = 12
 """Largest number of Newton steps that polish a fit."""
 

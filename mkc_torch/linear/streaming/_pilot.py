@@ -22,8 +22,6 @@ from mkc_torch.linear.streaming._survey import Survey
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["PilotFit", "fit_pilot"]
-
 _LEAST_D = 0.1
 """Least d of all rows, in d of the sample; a sample of a few hundred rows knows its scale to a tenth."""
 

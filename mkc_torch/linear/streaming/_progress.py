@@ -27,8 +27,6 @@ from mkc_torch.linear.streaming._survey import Survey
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Phase", "StreamChangedError", "StreamProgress"]
-
 Phase = Literal["range", "climb", "done"]
 
 FORMAT = 3

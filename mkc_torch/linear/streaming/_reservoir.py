@@ -18,8 +18,6 @@ from mkc_torch.linear._blocks import Block
 if TYPE_CHECKING:
     from jaxtyping import Float64, Int64
 
-__all__ = ["Drawn", "Reservoir", "largest_key", "merged"]
-
 
 @dataclass(frozen=True)
 class Drawn:

@@ -15,8 +15,6 @@ from mkc_torch.linear.streaming._batches import Shape, rows_of
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["flat_length", "sums_of", "sums_pass"]
-
 
 def _shapes(shape: Shape) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
     """Shapes of the fields of :class:`Sums` and of :class:`CurvatureSums`."""

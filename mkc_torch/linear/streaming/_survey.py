@@ -27,8 +27,6 @@ from mkc_torch.linear.streaming._reservoir import Reservoir
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Survey", "survey_rows"]
-
 NEARLY_DEPENDENT = 1e3
 """Ratio of the singular values of the scaled columns above which every block is transformed to an orthonormal basis.
 

@@ -13,8 +13,6 @@ from mkc_torch._support.arguments import checked_whole, format_value, refuse_tex
 if TYPE_CHECKING:
     from jaxtyping import Shaped
 
-__all__ = ["MemmapBatches", "ParquetBatches", "from_memmap", "from_parquet"]
-
 _ROWS = 65_536
 """Default number of rows of a batch: half a megabyte per float64 column."""
 

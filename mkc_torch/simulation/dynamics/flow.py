@@ -89,7 +89,7 @@ def flow_along(
     at = states[prepared.rows]
     predict = prepared.predicted(theta)
     C = slopes(predict, at)[..., :n].detach()
-    # what sensors and output effects add follows the trajectory, whose disturbances are estimated anew
+    # what sensors and output effects add follows the trajectory, whose disturbances are estimated again
     new = prepared.measured - prepared.outputs_by_states(theta, changes, at) + prepared.output_disturbance(at)
     after = at if jump is None else jump.applied(states)[prepared.rows].detach()
     # corrections and disturbances of an observer moved the trajectory itself

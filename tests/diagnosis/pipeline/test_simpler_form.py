@@ -154,7 +154,7 @@ def test_every_simpler_form_has_fewer_numbers():
 
 
 class Slide(Dynamics):
-    """A slide that is pushed to and fro, without friction."""
+    """A slide under a force of alternating sign, without friction."""
 
     states = ("place", "speed")
     inputs = ("force",)

@@ -11,8 +11,6 @@ from torch import Tensor
 from mkc_torch._support.forward_mode import twice_reverse_tangents
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 
-__all__ = ["Courses"]
-
 
 class Courses:
     """Columns as a function of the parameters that need not be traceable, as an input behind a delay.
