@@ -15,7 +15,7 @@ from examples.blind_proof.key import Key
 from examples.blind_proof.magnetometer.cases import magnetometer
 from examples.blind_proof.magnetometer.scenarios import magnetometer_scenarios
 from examples.blind_proof.proof import Case, Proof
-from examples.blind_proof.run import Pool, every, silent
+from examples.blind_proof.run import Pool, every
 from examples.blind_proof.score import ProofScore, Score, score_proof
 from examples.blind_proof.scored_case import ScoredCase, scored
 from mkc_torch._support.files import write_atomically
@@ -98,7 +98,7 @@ def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple
     """Draw and write the recordings. Returns their jobs, and their keys by the names in the run."""
     folder.mkdir(parents=True, exist_ok=True)
     with Pool(workers) as pool:
-        drawn = every(pool, partial(_write, folder), addresses, partial(silent, "draw"))
+        drawn = every(pool, partial(_write, folder), addresses, lambda *_: None)
     return [job for job, _ in drawn], {job.name: key for job, key in drawn}
 
 
