@@ -126,11 +126,15 @@ def _start(stop: _Stop) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _stopped() -> bool:
+    return _stop is not None and _stop.value
+
+
 def _interruptible(work: Callable[[T], R], item: T) -> R:
     """Run ``work`` with the default handler of interrupts, so that it removes its half-written files."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        if _stop is not None and _stop.value:
+        if _stopped():
             raise KeyboardInterrupt
         return work(item)
     finally:

@@ -119,17 +119,7 @@ def parsed_columns(text: str | None) -> dict[str, str]:
         >>> parsed_columns("mag_x=mx, mag_y=my")
         {'mag_x': 'mx', 'mag_y': 'my'}
     """
-    pairs: dict[str, str] = {}
-    for part in (text or "").split(","):
-        name, equals, source = (piece.strip() for piece in part.partition("="))
-        if not part.strip() and not text:
-            continue
-        if not (name and equals and source):
-            raise typer.BadParameter(f'"{part}" is not a pair; write name=column, such as mag_x=mx,mag_y=my,mag_z=mz.')
-        if name in pairs:
-            raise typer.BadParameter(f'"{name}" is given twice.')
-        pairs[name] = source
-    return pairs
+    return parsed_pairs("--columns", [text] if text else [], "mag_x=mx,mag_y=my,mag_z=mz")
 
 
 def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, str]:
@@ -148,7 +138,7 @@ def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, s
         if not (name and equals and value):
             raise typer.BadParameter(f'{option} "{part}" is not a pair; write name=value, such as {example}.')
         if name in pairs:
-            raise typer.BadParameter(f'"{name}" is given twice.')
+            raise typer.BadParameter(f'{option} gives "{name}" twice; keep one of them.')
         pairs[name] = value
     return pairs
 

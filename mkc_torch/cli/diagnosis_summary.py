@@ -122,10 +122,7 @@ def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Ite
     if not d.findings and d.verdict != "unfit":
         evidence = numbers.evidence(d.p_value, d.surrogates)
         tried = f"{d.candidates_tried:,}"
-        yield (
-            "how sure",
-            f"{evidence}, corrected for {tried} candidates, level {d.level:g}",
-        )
+        yield ("how sure", f"{evidence}, corrected for {tried} candidates, level {d.level:g}")
     smooth = noise.smooth_fit(d)
     if smooth and d.verdict != "unfit":
         yield "compare", smooth

@@ -23,15 +23,7 @@ EXTRAS = (
     Extra(
         "cli",
         "the command mkc, tables and reports",
-        (
-            "typer",
-            "rich",
-            "polars",
-            "matplotlib",
-            "jinja2",
-            "jsonschema",
-            "threadpoolctl",
-        ),
+        ("typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema", "threadpoolctl"),
     ),
     Extra("fast", "diagnoses of differential equations in compiled code", ("numba",)),
     Extra("lightning", "the callback for Lightning", ("lightning",)),
@@ -39,60 +31,13 @@ EXTRAS = (
     Extra("fmu", "simulations in FMUs", ("fmpy",)),
     Extra("parquet", "streamed fits of Parquet files", ("pyarrow",)),
     Extra("wmm", "the Earth's field at a place, for --place", ("ahrs",)),
-    Extra(
-        "ulog",
-        "logs of PX4",
-        (
-            "pyulog",
-            "polars",
-        ),
-    ),
+    Extra("ulog", "logs of PX4", ("pyulog", "polars")),
     Extra("dataflash", "logs of ArduPilot", ("polars",)),
-    Extra(
-        "mcap",
-        "MCAP files",
-        (
-            "mcap",
-            "mcap-protobuf-support",
-            "rosbags",
-            "polars",
-        ),
-    ),
-    Extra(
-        "rosbag",
-        "bags of ROS 1 and 2",
-        (
-            "mcap",
-            "mcap-protobuf-support",
-            "rosbags",
-            "polars",
-        ),
-    ),
-    Extra(
-        "mat",
-        "MATLAB files",
-        (
-            "scipy",
-            "h5py",
-            "polars",
-        ),
-    ),
-    Extra(
-        "hdf5",
-        "HDF5 files",
-        (
-            "h5py",
-            "polars",
-        ),
-    ),
-    Extra(
-        "mdf",
-        "ASAM MDF files",
-        (
-            "asammdf",
-            "polars",
-        ),
-    ),
+    Extra("mcap", "MCAP files", ("mcap", "mcap-protobuf-support", "rosbags", "polars")),
+    Extra("rosbag", "bags of ROS 1 and 2", ("mcap", "mcap-protobuf-support", "rosbags", "polars")),
+    Extra("mat", "MATLAB files", ("scipy", "h5py", "polars")),
+    Extra("hdf5", "HDF5 files", ("h5py", "polars")),
+    Extra("mdf", "ASAM MDF files", ("asammdf", "polars")),
 )
 """The extras of pyproject.toml that add abilities; a test compares the packages."""
 

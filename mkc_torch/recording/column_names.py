@@ -45,20 +45,9 @@ _OTHERS = {
 
 _TIME_UNITS = {"millis", "micros", "seconds", "milliseconds", "microseconds", "nanoseconds"}
 _TIME = {
-    "utc",
-    "time",
-    "timestamp",
-    "timestamps",
-    "stamp",
-    "datetime",
-    "zeit",
-    "zeitstempel",
-    "uhrzeit",
-    "temps",
-    "tow",
-    "itow",
-    *_TIME_UNITS,
-}
+    "utc", "time", "timestamp", "timestamps", "stamp", "datetime", "zeit", "zeitstempel", "uhrzeit", "temps", "tow",
+    "itow", *_TIME_UNITS,
+}  # fmt: skip
 _TIME_FILLERS = {
     "header", "utc", "sample", "boot", "ros", "log", "logging", "logger", "elapsed", "since", "epoch", "unix", "system",
     "sys", "sensor", "recorded", "local", "gps", "date", "iso", "field", "and", "of", "reboot", "start",
@@ -252,22 +241,9 @@ def form(sensor: str) -> str:
     """A sensor's name without numbers and words of position; equal for two sensors of the same kind."""
     words = [re.sub(r"\d+$", "", word) for word in sensor.split("_")]
     places = {
-        "primary",
-        "secondary",
-        "left",
-        "right",
-        "front",
-        "back",
-        "rear",
-        "internal",
-        "external",
-        "int",
-        "ext",
-        "l",
-        "r",
-        "a",
-        "b",
-    }
+        "primary", "secondary", "left", "right", "front", "back", "rear", "internal", "external", "int", "ext", "l",
+        "r", "a", "b",
+    }  # fmt: skip
     return "_".join(word for word in words if word and word not in places)
 
 

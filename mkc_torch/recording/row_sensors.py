@@ -11,33 +11,13 @@ from mkc_torch.recording.column_names import is_about_magnetometer, meaning
 from mkc_torch.recording.formats.base import Table, Topic, listed, polars
 
 _SENSOR = {
-    "sensor",
-    "sensorid",
-    "sensorname",
-    "sensorindex",
-    "device",
-    "deviceid",
-    "instance",
-    "imu",
-    "compass",
-    "magid",
-}
+    "sensor", "sensorid", "sensorname", "sensorindex", "device", "deviceid", "instance", "imu", "compass", "magid",
+}  # fmt: skip
 """Names of columns that identify the sensor of a row."""
 
 _KIND = {
-    "id",
-    "type",
-    "sensortype",
-    "topic",
-    "source",
-    "msg",
-    "msgtype",
-    "message",
-    "channel",
-    "node",
-    "addr",
-    "address",
-}
+    "id", "type", "sensortype", "topic", "source", "msg", "msgtype", "message", "channel", "node", "addr", "address",
+}  # fmt: skip
 """Names of columns that may identify the sensor of a row; they count only if the sensors alternate."""
 
 _TURNS = 0.2

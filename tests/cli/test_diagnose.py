@@ -350,7 +350,7 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--noise", "norm=much"), "is not a number"),
         ((path, *out, *known, "--noise", "norm=0"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=inf"), "must be above 0"),
-        ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), "given twice"),
+        ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), '--noise gives "norm" twice'),
         ((path, *out, *known, "--input-hold", "torque=stepped"), "known: held, linear, smooth"),
         ((path, *out, *known, "--unit-label", " "), "--unit-label is empty"),
         ((path, *out, *known, "--run-column", ""), "--run-column is empty"),

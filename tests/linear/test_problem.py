@@ -242,7 +242,7 @@ def test_values_that_are_not_finite_are_named_with_their_index(value):
 def test_integer_dtype_raises(name):
     values = {"X": sample(0, 20, 3), "Y": sample(1, 20)}
     values[name] = values[name].long()
-    message = rf"`{name}` to be a real floating-point tensor but got torch.int64"
+    message = rf"`{name}` .*real.* got torch\.int64"
     with pytest.raises(TypeError, match=message):
         linear_problem(**values)
 

@@ -100,7 +100,7 @@ def _errors(rank):
     bad = Y.copy()
     bad[-3] = float("nan")
     fit = StreamedMKCRegression(pilot=300)
-    message = "Rank 1 failed, so all ranks stopped: ValueError: Expected `Y` to be finite" if rank == 0 else "finite"
+    message = "Rank 1 failed.*`Y` .*finite" if rank == 0 else "finite"
     with pytest.raises(RanksError if rank == 0 else ValueError, match=message):
         fit.fit(from_memmap(X, bad, shard=(rank, 2)))
     with pytest.raises(ValueError if rank == 0 else RanksError, match=r"every rank.*same columns"):
