@@ -152,6 +152,9 @@ class GeneralizedMaximumEntropy(LinearEstimator):
 _POINTS = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0], dtype=torch.float64)
 """Default support points in half-widths, (30)-(31)."""
 
+_END = 1e-9
+"""Distance from the end of the support, in half-widths, below which an error is at the end."""
+
 _LARGEST = 1e8
 """Largest multiplier, in units of the errors' half-width; only errors at the end of their support exceed it."""
 
@@ -229,6 +232,7 @@ class _Dual:
             size = torch.where(used, gap.abs(), 0.0)
             left = ~(size.amax(-1) <= tol)
             if not bool(left.any()):
+                self._refuse_ends(multiplier, shape)
                 return multiplier, tilt, n_iter
             # errors at the end of their support have ever larger multipliers, and steps that are not finite
             steps = torch.cat([change, change_tilt], -1).isfinite().all(-1)
@@ -248,10 +252,25 @@ class _Dual:
             multiplier, tilt, best = trial, trial_tilt, value
             n_iter = n_iter + left
         problem = int(torch.where(left, size.amax(-1), -1.0).argmax())
-        sample, channel = divmod(int(size[problem].argmax()), shape[1])
-        at = f"sample {sample}" + (f", channel {channel}" if shape[1] > 1 else "")
-        raise ValueError(
-            "Expected supports within which `Y = X coef + error` can hold but at "
-            f"{at} {float((size * self.unit)[problem].max()):.3g} remains unexplained; "
-            "widen `coef_support` or `error_support`."
-        )
+        place = int(size[problem].argmax())
+        raise _infeasible(place, shape, f"{float((size * self.unit)[problem].max()):.3g} remains unexplained")
+
+    def _refuse_ends(self, multiplier: Tensor, shape: tuple[int, int]) -> None:
+        """Refuse errors at the end of their support: rounding decides whether steps towards them converge."""
+        error = (torch.softmax(-multiplier.unsqueeze(-1) * self.v, -1) * self.v).sum(-1)
+        left = torch.minimum(self.v.amax(-1) - error, error - self.v.amin(-1))
+        ends = (self.weight > 0) & (left < _END)
+        if bool(ends.any()):
+            problem, place = (int(index) for index in ends.nonzero()[0])
+            size = float((error * self.unit)[problem, place])
+            raise _infeasible(place, shape, f"the error has to be {size:.3g}, the end of its support")
+
+
+def _infeasible(place: int, shape: tuple[int, int], why: str) -> ValueError:
+    """The error for supports that are too narrow at the sample and channel of a flat index."""
+    sample, channel = divmod(place, shape[1])
+    at = f"sample {sample}" + (f", channel {channel}" if shape[1] > 1 else "")
+    return ValueError(
+        f"Expected supports within which `Y = X coef + error` can hold but at {at} {why}; widen `coef_support` or "
+        "`error_support`."
+    )
