@@ -133,9 +133,10 @@ def bias(parameters: Mapping[str, float], hand: ByHand) -> Iterator[str]:
 
 
 def open_loop(row: Mapping[str, Any]) -> Iterator[str]:
-    """Return open-loop residuals by output, before and after."""
+    """Return open-loop residuals by output, before and, where an effect is claimed, after."""
+    claims = any(found["grade"] in CLAIMS for found in row["findings"])
     for output, before in row["residual_before"].items():
-        after = row["residual_after"].get(output)
+        after = row["residual_after"].get(output) if claims else None
         numbers = [f"{value:.3g}" for value in (before, after) if value is not None]
         yield f"{output} {' → '.join(numbers)}"
 

@@ -69,8 +69,10 @@ class ResidualHistogram:
 
     def __init__(self, bound: Float[Tensor, " m"] | None = None, *, num_channels: int | None = None) -> None:
         m = num_channels if bound is None else len(bound)
-        if m is None or num_channels not in (None, m):
-            raise ValueError(f"Expected `bound`, or `num_channels` (m if both), but got {bound} and {num_channels}.")
+        if m is None:
+            raise ValueError("Expected `bound` or `num_channels` but got neither; pass the number of channels.")
+        if num_channels not in (None, m):
+            raise ValueError(f"Expected `num_channels` to be {m}, as `bound` has channels, but got {num_channels}.")
         flat = torch.zeros(2 * m * BINS + 2 * m + 1, dtype=torch.float64)
         self._begun = False
         self._place(flat, torch.zeros_like(flat[:m]), torch.zeros_like(flat[:m]))

@@ -386,9 +386,12 @@ def test_a_bound_may_be_unknown_in_single_channels(unknown):
     torch.testing.assert_close(histogram.share_beyond()[0].item(), 0.5)
 
 
-@pytest.mark.parametrize(("bound", "m"), [(None, None), (torch.ones(2), 3)])
-def test_a_histogram_without_a_number_of_channels_or_with_two_is_refused(bound, m):
-    with pytest.raises(ValueError, match="`bound` or `num_channels`"):
+@pytest.mark.parametrize(
+    ("bound", "m", "message"),
+    [(None, None, "`bound` or `num_channels`.*neither"), (torch.ones(2), 3, "`num_channels` to be 2.*got 3")],
+)
+def test_a_histogram_without_a_number_of_channels_or_with_two_is_refused(bound, m, message):
+    with pytest.raises(ValueError, match=message):
         ResidualHistogram(bound, num_channels=m)
 
 
