@@ -12,12 +12,21 @@ if TYPE_CHECKING:
 _DECIMALS = 7
 """Numbers of a file with fewer decimals than this are taken as rounded."""
 
+_FEWEST = 20
+"""Fewest distinct values by which multiples of a step are recognised."""
+
+_DISTINCT = 0.9
+"""Largest share of distinct values; those of a ramp without noise are multiples of a step, and all distinct."""
+
+_OFF = 1e-4
+"""Distance from a multiple, in steps, that is rounding of the file's numbers."""
+
 _ROUNDED = 1e-12
 """Relative tolerance at which a number counts as rounded."""
 
 
 def quanta_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """The resolution of each column: the smallest step between few distinct values, or the last decimal; else 0.
+    """The resolution of each column: the smallest step between its values, or the last decimal; else 0.
 
     Example:
         >>> import torch
@@ -34,10 +43,22 @@ def rounding_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
 
 
 def _step(values: Float[Tensor, " N"]) -> float:
-    """The smallest step between distinct values of a column; 0 where nearly all values are distinct."""
+    """The smallest step between distinct values of a column; 0 where many are distinct and not multiples of it.
+
+    Example:
+        >>> import torch
+        >>> _step(0.25 * torch.arange(0.0, 40.0, 0.7).round())
+        0.25
+    """
     numbers = values.unique()
-    few = len(numbers) < len(values) // 4 and len(numbers) > 1
-    return float(numbers.diff().min()) if few else 0.0
+    if len(numbers) < 2:
+        return 0.0
+    step = float(numbers.diff().min())
+    if len(numbers) < len(values) // 4:
+        return step
+    multiples = (numbers - numbers[0]) / step
+    repeated = _FEWEST <= len(numbers) <= _DISTINCT * len(values)
+    return step if repeated and bool(((multiples - multiples.round()).abs() <= _OFF).all()) else 0.0
 
 
 def _resolution(values: Float[Tensor, " N"]) -> float:

@@ -88,3 +88,11 @@ def test_the_quantum_of_a_column_is_its_smallest_step():
     values = torch.tensor([0.25, 0.75, 1.25], dtype=torch.float64).repeat(20)
     fine = torch.linspace(0.0, 1.0, 60, dtype=torch.float64) * torch.pi
     assert quanta_of(torch.stack([values, fine], -1)).tolist() == [0.5, 0.0]
+
+
+def test_a_quantum_is_found_where_most_values_are_distinct():
+    generator = torch.Generator().manual_seed(0)
+    values = 8.0 * torch.rand(500, 1, generator=generator, dtype=torch.float64)
+    assert values.mul(50).round().div(50).unique().numel() > 250
+    torch.testing.assert_close(quanta_of(values.mul(50).round().div(50)), values.new_tensor([0.02]))
+    assert quanta_of(values).tolist() == [0.0]
