@@ -76,10 +76,9 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
     elif d.verdict == "unexplained" and rates:
         yield _find_disturbance(rates[0])
     elif d.verdict == "unexplained" and d.environment.process_noise:
-        yield (
-            f"Look for a cause of the drift of `{d.environment.process_noise[0].place}`, such as warming up, and "
-            f"record it."
-        )
+        drift = d.environment.process_noise[0]
+        example = ", such as warming up" if drift.correlation_time > _WARMING_UP else ""
+        yield f"Look for a cause of the drift of `{drift.place}`{example}, and record it."
     elif any(f.grade == "nearest" for f in d.findings):
         return  # advice on its curve follows
     elif not d.findings or d.verdict == "unexplained":
@@ -154,6 +153,9 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
         "and check whether it is found again."
     )
 
+
+_WARMING_UP = 60.0
+"""Correlation time in s beyond which a drift may be the warming up of a sensor."""
 
 _USE = "The simulation can be used within the range of this recording."
 

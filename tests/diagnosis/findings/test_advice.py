@@ -110,11 +110,16 @@ def test_a_disturbance_is_to_be_found_and_used_as_process_noise():
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", environment=make_environment()).advice
     assert only.startswith("Look for the cause of the disturbance of the rate of `rate`")
     assert "use 0.23 rad/s² as the process noise" in only
-    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False)
+
+
+@pytest.mark.parametrize(("seconds", "example"), [(0.7, False), (300.0, True)])
+def test_only_a_drift_over_minutes_may_be_the_warming_up_of_a_sensor(seconds, example):
+    drift = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, correlation_time=seconds)
     (only,) = make_diagnosis(
-        0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(slow,))
+        0, samples=50, verdict="unexplained", environment=make_environment(process_noise=(drift,))
     ).advice
     assert only.startswith("Look for a cause of the drift of `angle`")
+    assert ("warming up" in only) == example
 
 
 def test_a_step_and_a_drift_are_distinguished_by_another_recording():
