@@ -212,6 +212,7 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
             HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False),
             "do not reject it: the open-loop residual is smaller",
         ),
+        (HeldOut(0.1, (-0.4, 0.6), 1.0, 0.97, "m", decides=False), "little difference on held-out blocks"),
     ):
         assert reason in unseen.better(held)
         assert unseen.diverged(held) == ""

@@ -56,7 +56,7 @@ def confirmed(finding: Finding) -> bool:
     if held.decides:
         return kind == "surely"
     least = 1.0 if kind == "surely" else 1.0 - SMALL
-    return not vetoed(held) and (finding.clearly_better or _mean_ratio(held) <= least)
+    return not vetoed(held) and (finding.clearly_better or mean_ratio(held) <= least)
 
 
 def vetoed(held_out: HeldOut) -> bool:
@@ -72,12 +72,12 @@ def vetoed(held_out: HeldOut) -> bool:
         >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.0, "m")), vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 2.2, "m"))
         (False, True)
     """
-    less = 1.0 - _mean_ratio(held_out)
+    less = 1.0 - mean_ratio(held_out)
     worse = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval) == "worse"
     return less < -SMALL or (worse and less < SMALL)
 
 
-def _mean_ratio(held_out: HeldOut) -> float:
+def mean_ratio(held_out: HeldOut) -> float:
     """Return the geometric mean over the outputs of the ratio of residuals with and without the finding."""
     ratios = [_ratio(*pair) for pair in _sizes(held_out)]
     return math.exp(sum(map(math.log, ratios)) / len(ratios))
@@ -93,7 +93,7 @@ def is_zero_within_error(finding: Finding) -> bool:
     Statistical Association 72 (1977), 851).
     """
     held = finding.held_out
-    better = finding.clearly_better and (held is None or _mean_ratio(held) <= 1.0 - SMALL)
+    better = finding.clearly_better and (held is None or mean_ratio(held) <= 1.0 - SMALL)
     known = [
         (torch.as_tensor(parameter.value), torch.as_tensor(parameter.standard_error))
         for parameter in finding.parameters

@@ -6,7 +6,7 @@ import math
 
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
-from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, vetoed
+from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, mean_ratio, vetoed
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
@@ -45,6 +45,8 @@ def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
         return _by_likelihood(held_out, kind)
     if kind == "surely":
         return _by_likelihood(held_out, kind)
+    if mean_ratio(held_out) > 1.0 - SMALL:
+        return "little difference on held-out blocks", ""
     return (
         "held-out blocks do not reject it",
         "the open-loop residual is smaller there, although one-step predictions are less likely"
