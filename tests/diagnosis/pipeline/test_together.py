@@ -107,7 +107,7 @@ def test_offsets_are_per_recording_and_findings_are_common():
     parts = [coast(seed, name, offset) for seed, name, offset in ((0, "a", 0.3), (1, "b", -0.2), (2, "c", 0.0))]
     recordings = [moved(part, "speed", added) for part, added in parts]
     drag = tuple(effect for effect in CATALOGUE if effect.id == "quadratic_drag")
-    result = diagnose(Coast(), recordings, effects=drag, quick=True)
+    result = diagnose(Coast(), recordings, effects=drag, surrogates=19)
     assert [finding.effect for finding in result.findings] == ["quadratic_drag"]
     assert result.findings[0].parameters[0].value == pytest.approx(0.05, rel=0.02)
     assert rounded_offsets(result) == [("speed", "a", 0.3), ("speed", "b", -0.2), ("speed", "c", 0.0)]
