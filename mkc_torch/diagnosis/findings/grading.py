@@ -43,9 +43,11 @@ def confirmed(finding: Finding) -> bool:
     """Whether held-out blocks confirm a finding; the search confirms an event that cannot be held out.
 
     A finding of size 0 is unconfirmed whatever the blocks show: another change, such as of the noise model, made the
-    difference. A finding of impossible size is a proxy of other physics. Where blocks can only reject, because process
-    noise predicts one step ahead as well, the open loop has to gain somewhere: its likelihood, or its residual on the
-    blocks; a reduction there below :data:`SMALL` counts only with a larger likelihood.
+    difference. A finding of impossible size is a proxy of other physics. Blocks confirm by a surely larger likelihood,
+    or by a larger one with a residual smaller by :data:`SMALL`: the surrogates have shown that the finding is no
+    chance. Where blocks can only reject, because process noise predicts one step ahead as well, the open loop has to
+    gain somewhere: its likelihood, or its residual on the blocks; a reduction there below :data:`SMALL` counts only
+    with a larger likelihood.
     """
     if is_zero_within_error(finding) or finding.cannot_be:
         return False
@@ -54,9 +56,14 @@ def confirmed(finding: Finding) -> bool:
         return True
     kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
     if held.decides:
-        return kind == "surely"
+        return kind == "surely" or _likely_better(held)
     least = 1.0 if kind == "surely" else 1.0 - SMALL
     return not vetoed(held) and (finding.clearly_better or mean_ratio(held) <= least)
+
+
+def _likely_better(held_out: HeldOut) -> bool:
+    """Whether likelihood and residual on held-out blocks are better, whatever the interval of the gain."""
+    return held_out.log_likelihood_gain > 0.0 and mean_ratio(held_out) <= 1.0 - SMALL
 
 
 def vetoed(held_out: HeldOut) -> bool:
@@ -169,10 +176,12 @@ def with_shape(grade: Grade, shape: ShapeCheck | None) -> Grade:
 def grade_in_short(finding: Finding) -> Grade:
     """Return the grade without surrogates and without the test of the shape: only held-out blocks can confirm.
 
-    Blocks that can only reject a finding, as with process noise, do not confirm it.
+    They have to do so surely, and blocks that can only reject a finding, as with process noise, do not confirm it.
     """
     held = finding.held_out
     if held is None or not held.decides:
+        return "unconfirmed"
+    if confirmation(held.log_likelihood_gain, held.confidence_interval) != "surely":
         return "unconfirmed"
     return grade_of(finding)
 

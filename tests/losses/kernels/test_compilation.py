@@ -22,6 +22,9 @@ def test_kernels_compile_for_a_gpu_with_vector_loads_of_four_numbers():
     assert done.returncode == 0, done.stderr[-4000:]
     lines = done.stdout.splitlines()
     assert len(lines) >= 22
-    assert sum(line.startswith(("rows, ", "starts, ", "fits, ")) for line in lines) == 7
+    assert sum(line.startswith(("rows, ", "starts, ", "fits, ")) for line in lines) == 8
     for start in ("channels, float32", "samples, float32", "labels, float32"):
-        assert any(line.startswith(start) and line.endswith("ld.global.v4") for line in lines)
+        assert any(line.startswith(start) and "ld.global.v4" in line for line in lines)
+    loops = [line for line in lines if line.startswith(("starts, ", "alternations, "))]
+    assert len(loops) >= 7
+    assert all(line.endswith("lanes agree") for line in loops)
