@@ -56,13 +56,13 @@ def confirmed(finding: Finding) -> bool:
         return True
     kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
     if held.decides:
-        return kind == "surely" or _likely_better(held)
+        return kind == "surely" or better_on_average(held)
     least = 1.0 if kind == "surely" else 1.0 - SMALL
     return not vetoed(held) and (finding.clearly_better or mean_ratio(held) <= least)
 
 
-def _likely_better(held_out: HeldOut) -> bool:
-    """Whether likelihood and residual on held-out blocks are better, whatever the interval of the gain."""
+def better_on_average(held_out: HeldOut) -> bool:
+    """Whether likelihood and residual on held-out blocks are better in the mean, whatever the interval of the gain."""
     return held_out.log_likelihood_gain > 0.0 and mean_ratio(held_out) <= 1.0 - SMALL
 
 

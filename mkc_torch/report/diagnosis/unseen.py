@@ -6,7 +6,15 @@ import math
 
 from mkc_torch._support.typesetting import plain
 from mkc_torch.diagnosis.environment import NoiseEnvironment
-from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, mean_ratio, vetoed
+from mkc_torch.diagnosis.findings.grading import (
+    SMALL,
+    Confirmation,
+    better_on_average,
+    change,
+    confirmation,
+    mean_ratio,
+    vetoed,
+)
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
@@ -17,6 +25,7 @@ _BETTER = {
     "not shown": "not shown to be better on held-out blocks",
     "worse": "worse on held-out blocks",
 }
+_VARIES = "the gain varies between blocks by more than its mean"
 _UNCHANGED = 5e-4
 """Share by which a residual must shrink for "surely better"."""
 
@@ -28,7 +37,7 @@ def better(held_out: HeldOut) -> str:
         >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.01, (-0.1, 0.1), 1.0, 0.99, "µT"))
         ('surely better on held-out blocks', 'not shown to be better on held-out blocks')
         >>> better(HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "µT"))
-        'not shown to be better on held-out blocks: the gain varies between blocks by more than its ...'
+        'better on average on held-out blocks: the gain varies between blocks by more than its mean'
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
     text, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)
@@ -64,11 +73,12 @@ def _by_likelihood(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
         return "surely more likely on held-out blocks", "the gain is in the tail of the residual, not in its centre"
     if less < SMALL:
         return _BETTER[kind], ""
-    why = (
-        "the loss is in the tail of the residual, not in its centre"
-        if kind == "worse"
-        else "the gain varies between blocks by more than its mean, so it may be chance"
-    )
+    if kind == "worse":
+        why = "the loss is in the tail of the residual, not in its centre"
+    elif kind == "not shown" and better_on_average(held_out):
+        return "better on average on held-out blocks", _within(_diverged(held_out)) or _VARIES
+    else:
+        why = f"{_VARIES}, so it may be chance"
     return _BETTER[kind], _within(_diverged(held_out)) or why
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.environment import ShapeCheck
-from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error, with_shape
+from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, with_shape
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Finding, HeldOut
 
 SURE = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
@@ -92,3 +92,13 @@ def test_another_shape_does_not_confirm_a_finding(before, after):
     curve = object()
     assert with_shape(before, ShapeCheck(40.0, 0.002, curve)) == after
     assert with_shape(before, ShapeCheck(0.5, 0.4)) == with_shape(before, None) == before
+
+
+@pytest.mark.parametrize(
+    ("gain", "after", "grade"), [(0.1, 0.9, "left_out"), (0.1, 0.97, "unconfirmed"), (-0.01, 0.9, "unconfirmed")]
+)
+def test_blocks_confirm_by_likelihood_and_residual_though_the_interval_includes_zero(gain, after, grade):
+    held = HeldOut(gain, (-0.2, 0.3), 1.0, after, "rad")
+    found = dataclasses.replace(finding((1.3, 0.1)), evidence=(EvidenceResult("held_out", (held, "")),))
+    assert grade_of(found) == grade
+    assert grade_in_short(found) == "unconfirmed"  # without surrogates it may be chance
