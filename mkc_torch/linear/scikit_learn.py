@@ -53,7 +53,7 @@ class ScikitLearnRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         >>> from sklearn.preprocessing import StandardScaler
         >>> X = np.arange(10.0)[:, None]
         >>> y = 1 + 2 * X[:, 0]
-        >>> y[:4] = 100.0
+        >>> y[:3] = 100.0
         >>> model = make_pipeline(StandardScaler(), ScikitLearnRegressor()).fit(X, y)
         >>> model.predict([[20.0]]).round(6)
         array([41.])
