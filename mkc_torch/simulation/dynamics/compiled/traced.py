@@ -148,7 +148,7 @@ def _inputs(system: Traceable, meaning: Meaning, parameters: Symbol) -> Tensor:
     """The acting inputs at the stations; computed by torch where they cannot be traced, as behind a delay."""
     try:
         return system.acting_inputs(*meaning(parameters))
-    except Exception:  # a function may raise anything on a symbol
+    except Exception:  # a function may raise anything on a symbol; torch computes it instead, or raises again
         stations, width = len(system.grid.stations), system.inputs.shape[1]
         return course_symbol(lambda values: system.acting_inputs(*meaning(values)), parameters, stations, width)
 
