@@ -18,7 +18,7 @@ from torch import Tensor
 from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
+from mkc_torch.diagnosis.search.likelihoods import Columns, Limits, LogLikelihoods, log_likelihoods
 from mkc_torch.diagnosis.search.significance import COUNTS, COUNTS_NOT, price
 from mkc_torch.diagnosis.search.tangents import ModelTangents
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
@@ -249,10 +249,21 @@ def _scene(
         model.size,
         tuple(columns.shape[-1] for columns in tangents.candidates),
         tuple(term.effect.one_sided for term in terms),
+        _limits(base),
     )
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, model.near)
     return _LinearisedRecording(prepared, flow, counted, series, columns, largest)
+
+
+def _limits(base: FittedModel) -> Limits | None:
+    """Return the limits of the simulation's own parameters."""
+    bounds = base.model.prepared.bounds
+    if bounds is None:
+        return None
+    free = base.parameters.new_full((base.model.size - base.model.base,), torch.inf)
+    lower, upper = torch.cat([bounds[0], -free]), torch.cat([bounds[1], free])
+    return Limits.of(base.parameters.numpy(), lower.numpy(), upper.numpy())
 
 
 def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:

@@ -48,6 +48,47 @@ _DEPENDENT = 1e-10
 
 
 @dataclass(frozen=True)
+class Limits:
+    """Limits of parameters as Gaussian priors: gravity cannot double to explain drag.
+
+    A parameter with two limits has the mean and the standard deviation of a uniform distribution between them.
+
+    Attributes:
+        off: (k,), distance of each limited parameter from its mean, in standard deviations.
+        slope: (k, p), its derivative by the parameters.
+    """
+
+    off: Float[np.ndarray, " k"]
+    slope: Float[np.ndarray, "k p"]
+
+    @classmethod
+    def of(
+        cls, values: Float[np.ndarray, " p"], lower: Float[np.ndarray, " p"], upper: Float[np.ndarray, " p"]
+    ) -> Limits | None:
+        """Return the limits of parameters at these values; None if no parameter has two.
+
+        Example:
+            >>> limits = Limits.of(np.array([9.9, 1.0]), np.array([9.7, 0.0]), np.array([9.9, np.inf]))
+            >>> print(limits.off.round(2), limits.slope.round(1))
+            [1.73] [[17.3  0. ]]
+        """
+        limited = np.isfinite(lower) & np.isfinite(upper) & (upper > lower)
+        if not limited.any():
+            return None
+        lower, upper = lower[limited], upper[limited]
+        deviation = (upper - lower) / np.sqrt(12.0)
+        off = (values[limited] - 0.5 * (lower + upper)) / deviation
+        return cls(off, np.eye(len(values))[limited] / deviation[:, None])
+
+    def appended(
+        self, y: Float[np.ndarray, "M Y"], moved: Float[np.ndarray, "M p"], scale: float
+    ) -> tuple[Float[np.ndarray, "M+k Y"], Float[np.ndarray, "M+k p"]]:
+        """Append the priors to series and to the parameters' tangents, in noise of that scale."""
+        off = np.repeat(scale * self.off[:, None], y.shape[1], 1)
+        return np.concatenate([y, off]), np.concatenate([moved, scale * self.slope])
+
+
+@dataclass(frozen=True)
 class Columns:
     """Tangents along a trajectory: of the parameters, then of each candidate.
 
@@ -56,12 +97,14 @@ class Columns:
         parameters: number of parameters.
         sizes: numbers of each candidate.
         one_sided: (C,), whether a candidate's size has one sign only.
+        limits: of the parameters; None if all are free.
     """
 
     series: SeriesAlong
     parameters: int
     sizes: tuple[int, ...]
     one_sided: tuple[bool, ...]
+    limits: Limits | None = None
 
     def places(self, number: int) -> slice:
         """Return the columns of a candidate's tangents."""
@@ -164,13 +207,22 @@ def log_likelihoods(
         y, moved = np.split(rows, [Y], 1)
         basis, log_det = _basis(moved)
         left = y - basis @ (basis.T @ y)
+        limits, count = columns.limits, len(rows)
+        if limits is not None:
+            alone = float(
+                _scale(np.square(left[:, :1]).sum(), count - basis.shape[1], free, models[number].least_scale)
+            )
+            y, moved = limits.appended(y, moved, alone)
+            basis, log_det = _basis(moved)
+            left = y - basis @ (basis.T @ y)
         before = None if known is None else known[number]
-        products = None if before is None else _products_with(flow, gains, place, candidates, left, before)
-        products = products or _products(flow, gains, place, candidates, basis, left, groups)
+        seen = left[:count]
+        products = None if before is None else _products_with(flow, gains, place, candidates, seen, before)
+        products = products or _products(flow, gains, place, candidates, basis[:count], seen, groups)
         if products is None:
             continue
         kept[number] = [(gram, norm) for gram, _, norm in products]
-        n = len(rows) - basis.shape[1]
+        n = len(y) - basis.shape[1]
         level = -gains.log_spread[place] - log_det - PRICE * len(models[number].components)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mkc_torch.diagnosis.search import likelihoods
-from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
+from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, Limits, log_likelihoods
 from mkc_torch.simulation.dynamics import whitening
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong
@@ -148,3 +148,23 @@ def test_the_floor_of_the_noise_model_limits_the_scale():
     assert (held.without < free.without).all()
     loose = log_likelihoods(flow, [replace(WHITE, floor=(1e-6,))], series(y), columns)
     np.testing.assert_array_equal(loose.without, free.without)
+
+
+def test_limits_are_priors_in_the_noise_of_the_first_series():
+    flow, y, own, candidates, columns = scene(sizes=(1,))
+    used = flow.counts[:, 0] > 0
+    limits = Limits.of(np.array([0.9, 3.0]), np.array([0.0, -np.inf]), np.array([1.0, 0.0]))
+    found = log_likelihoods(flow, [WHITE], series(y), replace(columns, limits=limits))
+    alone = own[used] @ np.linalg.lstsq(own[used], y[used, 0], rcond=None)[0]
+    prior = np.sqrt(np.square(y[used, 0] - alone).sum() / (used.sum() - 2) * 12.0)
+
+    def power(columns):
+        pulled = np.zeros((1, columns.shape[1]))
+        pulled[0, 0] = prior
+        rows = np.concatenate([columns[used], pulled])
+        values = np.concatenate([y[used], np.full((1, 3), 0.4 * prior)])
+        return np.square(values - rows @ np.linalg.lstsq(rows, values, rcond=None)[0]).sum(0)
+
+    n = used.sum() + 1 - 2
+    gain = found.with_candidate[0, 0] - found.without[0]
+    np.testing.assert_allclose(gain, 0.5 * n * np.log(power(own) / power(np.concatenate([own, candidates], 1))))
