@@ -14,7 +14,9 @@ from torch import Tensor
 from mkc_torch.diagnosis.environment import Curve, ShapeCheck
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import has_process_noise
 from mkc_torch.diagnosis.model.term import Term, continuous, run_parallel
+from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop
 from mkc_torch.diagnosis.search.ranking import schwarz
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.nonlinear import NoFitError
@@ -136,6 +138,9 @@ _NORMAL_95 = 1.96
 def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> ShapeCheck | None:
     """Test the shape of an effect; None without a comparable curve.
 
+    A constant is a part of every curve. A curve that is more likely than a constant, but does not clearly improve the
+    open loop, is no rival of the constant: it follows what is left, together with process noise.
+
     Args:
         fit: with all effects.
         number: of the effect.
@@ -161,6 +166,8 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     chance = float(torch.special.gammaincc(half, value))
     if chance >= settings.shape_level or gain <= settings.shape_nats + schwarz(best) * more:
         return ShapeCheck(gain, chance)
+    if has_process_noise(fit) and not term.effect.plot_axis and not improves_open_loop(best, fit):
+        return None
     curve = curve_of(best, number)
     return ShapeCheck(gain, chance, curve, nearest_power(curve))
 

@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, block
 from mkc_torch.diagnosis.findings.finding import ended_shapes
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_noise
+from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_noise, refit_open_loop
 from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
@@ -196,7 +196,7 @@ def _located(
             generator=generator,
             declared=options.declared,
             fixed=options.fixed,
-            free=free,
+            free=refit_open_loop(fit) if fit.model.terms else free,
             settings=options.settings,
             quick=options.quick,
             keep=keep,

@@ -86,6 +86,9 @@ def without(fit: FittedModel, number: int, declared: Mapping[str, float], settin
 PHYSICS = 8
 """Number of effects that are fitted in open loop."""
 
+FURTHER = 3
+"""The same beside findings: there the linear gains are more reliable."""
+
 SHAPES = 2
 """Number of initial shapes for each effect."""
 
@@ -115,7 +118,7 @@ def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> F
         settings: of the diagnosis.
     """
     gains, sizes = linear_gains(free, terms, settings)
-    chosen = _chosen(gains, terms)
+    chosen = _chosen(gains, terms, FURTHER if free.model.terms else PHYSICS)
     if not chosen:
         return FreeRuns([])
     known = free.model.prepared, [terms[number] for number in chosen]
@@ -166,14 +169,14 @@ def linear_gains(
     return gains, sizes
 
 
-def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
+def _chosen(gains: Sequence[float], terms: Sequence[Term], most: int) -> list[int]:
     """Return the leading effects, each at its shapes that gain most.
 
     Far from the solution the linear gains are unreliable, so no leading effect is dropped because of its gain.
     """
     order = sorted(range(len(terms)), key=lambda number: -gains[number])
     able = [number for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
-    keys = list(dict.fromkeys(terms[number].key for number in able))[:PHYSICS]
+    keys = list(dict.fromkeys(terms[number].key for number in able))[:most]
     return [n for key in keys for n in [n for n in able if terms[n].key == key][:SHAPES]]
 
 

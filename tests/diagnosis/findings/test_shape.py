@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
@@ -110,6 +111,15 @@ def test_a_curve_claims_no_shape_and_without_curves_there_is_nothing_to_compare_
     whole = torch.cat([fit.parameters[: model.base], torch.zeros(model.sizes[0]).double()])
     nameless = dataclasses.replace(fit, model=model, parameters=whole)
     assert shape_of(nameless, 0, terms, EvidenceSettings()) is None
+
+
+@pytest.mark.parametrize(("noise", "rival"), [(False, True), (True, False)])
+def test_a_constant_has_no_rival_in_a_curve_that_only_follows_with_process_noise(monkeypatch, noise, rival):
+    monkeypatch.setattr("mkc_torch.diagnosis.findings.shape.has_process_noise", lambda _: noise)
+    monkeypatch.setattr("mkc_torch.diagnosis.findings.shape.improves_open_loop", lambda *_: False)
+    found = shape(sailed(2.0, 0), ConstantForce())
+    assert (found is not None and found.curve is not None) == rival
+    assert shape(sailed(2.0, 0), LinearDrag()).curve is not None
 
 
 def curve_of(values, low=-2.0, driver="speed", band=0.01):

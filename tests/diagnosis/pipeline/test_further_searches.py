@@ -150,6 +150,17 @@ def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(
     assert after.left == (() if len(refused) == 2 else terms)
 
 
+@pytest.mark.parametrize(("terms", "start"), [((), "first"), (("found",), "open loop with the findings")])
+def test_a_further_search_also_starts_from_the_open_loop(monkeypatch, terms, start):
+    """Process noise of the fit with the findings hides what the open loop shows: a constant force, for example."""
+    fit = SimpleNamespace(model=SimpleNamespace(terms=terms))
+    options = SimpleNamespace(level=0.05, surrogates=9, declared={}, fixed={}, settings=None, quick=False)
+    monkeypatch.setattr(stepwise, "has_process_noise", lambda _: True)
+    monkeypatch.setattr(stepwise, "refit_open_loop", lambda _: "open loop with the findings")
+    monkeypatch.setattr(stepwise, "search_with_process_noise", lambda *_, free, **__: free)
+    assert stepwise._located(fit, (), options, torch.Generator(), free="first") == start
+
+
 def test_a_refused_candidate_is_reported_with_its_reason(recording):
     build = importlib.import_module("mkc_torch.diagnosis.pipeline.build")
     (term, *_) = candidate_terms(Sled().prepare(recording), (), EFFECTS)
