@@ -21,7 +21,8 @@ class Parameter:
 
     Attributes:
         value: start value of the fit.
-        lower, upper: bounds.
+        lower, upper: bounds. Two finite bounds are also a Gaussian prior, with the mean and the standard deviation of a
+            uniform distribution between them, in a fit of differential equations.
         unit: unit in reports.
 
     Raises:

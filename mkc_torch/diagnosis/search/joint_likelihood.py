@@ -257,13 +257,11 @@ def _scene(
 
 
 def _limits(base: FittedModel) -> Limits | None:
-    """Return the limits of the simulation's own parameters."""
-    bounds = base.model.prepared.bounds
-    if bounds is None:
+    """Return the priors of the simulation's own parameters; None without."""
+    prior = base.model.prior
+    if prior is None:
         return None
-    free = base.parameters.new_full((base.model.size - base.model.base,), torch.inf)
-    lower, upper = torch.cat([bounds[0], -free]), torch.cat([bounds[1], free])
-    return Limits.of(base.parameters.numpy(), lower.numpy(), upper.numpy())
+    return Limits.of(*(values.double().cpu().numpy() for values in (base.parameters, prior.mean, prior.precision)))
 
 
 def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:

@@ -49,9 +49,7 @@ _DEPENDENT = 1e-10
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of parameters as Gaussian priors: gravity cannot double to explain drag.
-
-    A parameter with two limits has the mean and the standard deviation of a uniform distribution between them.
+    """Priors of parameters with two limits: gravity cannot double to explain drag.
 
     Attributes:
         off: (k,), distance of each limited parameter from its mean, in standard deviations.
@@ -63,22 +61,17 @@ class Limits:
 
     @classmethod
     def of(
-        cls, values: Float[np.ndarray, " p"], lower: Float[np.ndarray, " p"], upper: Float[np.ndarray, " p"]
-    ) -> Limits | None:
-        """Return the limits of parameters at these values; None if no parameter has two.
+        cls, values: Float[np.ndarray, " p"], mean: Float[np.ndarray, " p"], precision: Float[np.ndarray, " p"]
+    ) -> Limits:
+        """Return the priors at these values of the parameters; a precision of 0 is no prior.
 
         Example:
-            >>> limits = Limits.of(np.array([9.9, 1.0]), np.array([9.7, 0.0]), np.array([9.9, np.inf]))
-            >>> print(limits.off.round(2), limits.slope.round(1))
-            [1.73] [[17.3  0. ]]
+            >>> limits = Limits.of(np.array([9.9, 1.0]), np.array([9.8, 0.0]), np.array([100.0, 0.0]))
+            >>> print(limits.off.round(2), limits.slope)
+            [1.] [[10.  0.]]
         """
-        limited = np.isfinite(lower) & np.isfinite(upper) & (upper > lower)
-        if not limited.any():
-            return None
-        lower, upper = lower[limited], upper[limited]
-        deviation = (upper - lower) / np.sqrt(12.0)
-        off = (values[limited] - 0.5 * (lower + upper)) / deviation
-        return cls(off, np.eye(len(values))[limited] / deviation[:, None])
+        limited, root = precision > 0.0, np.sqrt(precision)
+        return cls((root * (values - mean))[limited], np.diag(root)[limited])
 
     def appended(
         self, y: Float[np.ndarray, "M Y"], moved: Float[np.ndarray, "M p"], scale: float
@@ -97,7 +90,7 @@ class Columns:
         parameters: number of parameters.
         sizes: numbers of each candidate.
         one_sided: (C,), whether a candidate's size has one sign only.
-        limits: of the parameters; None if all are free.
+        limits: of the parameters; None without priors.
     """
 
     series: SeriesAlong

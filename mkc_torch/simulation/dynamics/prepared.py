@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
@@ -74,6 +74,7 @@ class PreparedDynamics(ObservedDynamics):
         high = [parameter.upper for parameter in self.known.values()]
         any_value = [torch.inf] * len(starts)
         self.bounds = self.time.new_tensor([*low, *(-x for x in any_value)]), self.time.new_tensor(high + any_value)
+        self.prior = _prior_within(*self.bounds)
         self._p = len(self.known)
         self.clean = torch.stack([despiked(values, self.time, self.begins) for values in self.measured.unbind(-1)], -1)
         self.counts = self.clean == self.measured
@@ -423,3 +424,16 @@ class PreparedDynamics(ObservedDynamics):
             return self.simulated(theta, {})
 
         self._lay_out(enough_parts(simulated, self.measured))
+
+
+def _prior_within(lower: Float[Tensor, " p"], upper: Float[Tensor, " p"]) -> GaussianPrior | None:
+    """Return the mean and precision of a uniform distribution within two finite limits; None if no parameter has two.
+
+    At a limit of the gravity, for example, missing drag would be estimated too large.
+    """
+    limited = lower.isfinite() & upper.isfinite() & (upper > lower)
+    if not bool(limited.any()):
+        return None
+    none = torch.zeros_like(lower)
+    mean = torch.where(limited, 0.5 * (lower + upper), none)
+    return GaussianPrior(mean, torch.where(limited, 12.0 / (upper - lower).square(), none))

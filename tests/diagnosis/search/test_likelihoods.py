@@ -153,7 +153,7 @@ def test_the_floor_of_the_noise_model_limits_the_scale():
 def test_limits_are_priors_in_the_noise_of_the_first_series():
     flow, y, own, candidates, columns = scene(sizes=(1,))
     used = flow.counts[:, 0] > 0
-    limits = Limits.of(np.array([0.9, 3.0]), np.array([0.0, -np.inf]), np.array([1.0, 0.0]))
+    limits = Limits.of(np.array([0.9, 3.0]), np.array([0.5, 0.0]), np.array([12.0, 0.0]))
     found = log_likelihoods(flow, [WHITE], series(y), replace(columns, limits=limits))
     alone = own[used] @ np.linalg.lstsq(own[used], y[used, 0], rcond=None)[0]
     prior = np.sqrt(np.square(y[used, 0] - alone).sum() / (used.sum() - 2) * 12.0)
