@@ -320,8 +320,8 @@ def _plain(
     if max(beyond) <= priced(alone, settings):
         return False
     without = run_parallel([partial(_without_at_best, base, fit, declared, settings) for fit in fits], *known)
-    likeliest = max(priced(fit, settings) for fit in (alone, *without) if fit is not None)
-    return any(value > likeliest for value, bare in zip(beyond, without, strict=True) if bare is not None)
+    most_likely = max(priced(fit, settings) for fit in (alone, *without) if fit is not None)
+    return any(value > most_likely for value, bare in zip(beyond, without, strict=True) if bare is not None)
 
 
 def _without(

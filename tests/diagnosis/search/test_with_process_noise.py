@@ -138,7 +138,7 @@ def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_ef
 @pytest.mark.parametrize(
     ("led_to", "again", "counts"), [(1000.0, 1000.0, True), (1095.0, 1000.0, False), (1000.0, 1095.0, False)]
 )
-def test_without_surrogates_the_simulation_alone_has_the_likeliest_noise_of_any_candidate_selected_again(
+def test_without_surrogates_the_simulation_alone_has_the_best_noise_of_any_candidate_selected_again(
     led_to, again, counts, monkeypatch
 ):
     base, run, other = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4), of_likelihood(1001.0, 4)
