@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_n
 from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
+from mkc_torch.diagnosis.pipeline.doubted_driver import with_driver_or_time
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.series_order import in_better_order
 from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
@@ -252,6 +253,8 @@ def _accept(
     over = replace(search, left=())
     if located.p_value > options.level or options.max_findings == 0:
         return over
+    if not located.with_noise and after is None and not options.quick:
+        located = with_driver_or_time(previous, located, options.settings)
     if located.with_noise and after is None and options.judged and not options.quick:
         scores = partial(_evidence, blocks=search.blocks, options=options)
         located = with_special_case(located, scores, search.blocks, options.seed, options.settings.naming)

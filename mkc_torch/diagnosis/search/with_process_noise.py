@@ -262,7 +262,7 @@ def _best_start(
 def _under_own_noise(
     running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel:
-    """Return an open-loop fit under the noise around it; unchanged if that is less likely or loses the recording."""
+    """Return a fit under newly selected noise around it; unchanged if that is less likely or loses the recording."""
     noise = estimate_noise(running, declared, settings.noise)
     if noise is None or noise.observer is None:
         return with_own_noise(running, declared, settings)
@@ -304,23 +304,24 @@ def _plain(
     """Whether a candidate's fit is so much more likely than the simulation alone that no surrogates are needed.
 
     Without the effect, a likelihood ratio exceeds k with a probability of at most 1/k (Markov's inequality; Wasserman,
-    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), if the simulation alone has its most likely noise too: that of its
-    own fit, or that found with the effect. The expected gain of fitting the effect's numbers and of choosing among the
-    candidates is subtracted.
+    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), if the simulation alone has its most likely noise too. Each
+    candidate leads to another noise, also one that gains nothing, so the simulation alone has the most likely of all
+    of them and of its own, each selected again as for a candidate. The expected gain of fitting the effect's numbers
+    and of choosing among the candidates is subtracted.
     """
     if not runs:
         return False
+    known = base.model.prepared, [fit.model.terms[-1] for fit in runs]
     works = [partial(with_own_noise, base, declared, settings)]
     works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
-    alone, *others = run_parallel(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
+    alone, *fits = run_parallel(works, *known)
     samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
-    for fit in others:
-        least = _DOUBT + price(_numbers(fit), samples, kinds)
-        if priced(fit, settings) - priced(alone, settings) > least:
-            bare = _without(base, fit, declared, settings)
-            if bare is not None and priced(fit, settings) - priced(bare, settings) > least:
-                return True
-    return False
+    beyond = [priced(fit, settings) - _DOUBT - price(_numbers(fit), samples, kinds) for fit in fits]
+    if max(beyond) <= priced(alone, settings):
+        return False
+    without = run_parallel([partial(_without_at_best, base, fit, declared, settings) for fit in fits], *known)
+    most_likely = max(priced(fit, settings) for fit in (alone, *without) if fit is not None)
+    return any(value > most_likely for value, bare in zip(beyond, without, strict=True) if bare is not None)
 
 
 def _without(
@@ -333,6 +334,14 @@ def _without(
     except NoFitError:
         return None
     return with_own_noise(without, declared, settings)
+
+
+def _without_at_best(
+    base: FittedModel, fit: FittedModel, declared: Mapping[str, float], settings: Settings
+) -> FittedModel | None:
+    """Fit the simulation without a candidate, under noise selected again from that found with it; None if it fails."""
+    bare = _without(base, fit, declared, settings)
+    return None if bare is None else _under_own_noise(bare, base, declared, settings)
 
 
 def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn: bool) -> bool:

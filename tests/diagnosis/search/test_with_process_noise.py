@@ -135,6 +135,23 @@ def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_ef
     assert _plain(base, [run], run.model.terms, {}, FEW) is counts
 
 
+@pytest.mark.parametrize(
+    ("led_to", "again", "counts"), [(1000.0, 1000.0, True), (1095.0, 1000.0, False), (1000.0, 1095.0, False)]
+)
+def test_without_surrogates_the_simulation_alone_has_the_best_noise_of_any_candidate_selected_again(
+    led_to, again, counts, monkeypatch
+):
+    base, run, other = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4), of_likelihood(1001.0, 4)
+    bare, selected_again = of_likelihood(1000.0, 3), of_likelihood(again, 3)
+    module = "mkc_torch.diagnosis.search.with_process_noise"
+    monkeypatch.setattr(f"{module}.with_own_noise", lambda fit, *_: fit)
+    monkeypatch.setattr(f"{module}._under_own_noise", lambda fit, *_: selected_again if fit is bare else fit)
+    monkeypatch.setattr(f"{module}.run_parallel", lambda works, *_: [work() for work in works])
+    monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
+    monkeypatch.setattr(f"{module}._without", lambda _, fit, *__: bare if fit is run else of_likelihood(led_to, 3))
+    assert _plain(base, [run, other], run.model.terms, {}, FEW) is counts
+
+
 @pytest.mark.e2e
 def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
     bases, original = [], of_search.first_step
