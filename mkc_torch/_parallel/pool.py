@@ -5,16 +5,19 @@ from __future__ import annotations
 import ctypes
 import gc
 import io
+import math
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -34,7 +37,16 @@ _BYTES = 4
 _CHECK_INTERVAL_S = 0.1
 """Seconds between two checks of the deadline while waiting for a copy."""
 
+_WORTH_S = 0.2
+"""CPU seconds that copies have to take off this process.
+
+After a fork the system copies each page of memory that either process writes: about 5,000 pages, 0.1 s in each process.
+"""
+
 _copies = 0
+
+_costs: dict[object, float] = {}
+"""CPU seconds of a work by its function, averaged with more weight on the last ones."""
 
 
 def allow_copies(most: int | None = None) -> None:
@@ -44,6 +56,7 @@ def allow_copies(most: int | None = None) -> None:
     Nothing is forked on systems other than Linux.
     """
     global _copies
+    _costs.clear()
     _copies = (cores() - 1 if most is None else most) if sys.platform == "linux" else 0
 
 
@@ -66,9 +79,22 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
     if len(works) < 2:
         return [work() for work in works]
     parcels, copies = Serializer(known), min(_copies, len(works) - 1)
-    if copies < 1:
+    if copies < 1 or not _worth_copies(works, copies):
         return [_do(work, parcels, thing) for work in counted(works, len(works), thing)]
     return _shared_by_copies(works, copies, parcels, thing)
+
+
+def _worth_copies(works: Sequence[Callable[[], object]], copies: int) -> bool:
+    """Whether copies save more time than a fork costs; True for functions whose cost is unknown."""
+    seconds = sum(_costs.get(_function_of(work), math.inf) for work in works)
+    return seconds * copies / (copies + 1) > _WORTH_S
+
+
+def _function_of(work: Callable[[], object]) -> object:
+    """What identifies the function of a work, without its arguments."""
+    while isinstance(work, partial):
+        work = work.func
+    return getattr(work, "__code__", type(work))
 
 
 class Serializer:
@@ -188,8 +214,11 @@ def _take_numbers(todo: int) -> Iterator[int]:
 def _do(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
     """The result of a work as if sent by a copy; a counted work does not count its own steps."""
     check_deadline()
+    begin, function = time.process_time(), _function_of(work)
     with silently() if thing else nullcontext():
         result = work()
+    seconds = time.process_time() - begin
+    _costs[function] = 0.5 * (_costs.get(function, seconds) + seconds)
     try:
         return parcels.unpacked(parcels.packed(result))
     except Exception:  # it cannot be pickled

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from functools import partial
 
 import pytest
 import torch
@@ -48,6 +49,21 @@ def test_results_come_in_order_and_copies_take_part():
 def test_without_copies_this_process_does_all_work():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
+
+
+def process_after(seconds):
+    """Return the process, after some CPU seconds."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+    return os.getpid()
+
+
+@pytest.mark.parametrize(("seconds", "most"), [(0.0, 1), (0.2, 3)])
+def test_copies_take_part_where_the_last_works_of_a_function_took_long(seconds, most):
+    works = [partial(process_after, seconds)] * 6
+    shared(works)
+    assert len(set(shared(works))) == most
 
 
 def test_nothing_is_forked_on_other_systems_than_linux(monkeypatch):
