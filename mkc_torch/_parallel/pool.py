@@ -46,7 +46,7 @@ After a fork the system copies each page of memory that either process writes: a
 _copies = 0
 
 _costs: dict[object, float] = {}
-"""Seconds of a work by its function: a mean with more weight on the last works."""
+"""CPU seconds of a work by its function: a mean with more weight on the last works."""
 
 
 def allow_copies(most: int | None = None) -> None:
@@ -91,7 +91,7 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
 
 
 def _seconds(works: Sequence[Callable[[], object]]) -> float:
-    """Seconds that works will take; infinite if the cost of a function is unknown."""
+    """CPU seconds that works will take; infinite if the cost of a function is unknown."""
     return sum(_costs.get(_function_of(work), math.inf) for work in works)
 
 
@@ -226,10 +226,10 @@ def _take_numbers(todo: int) -> Iterator[int]:
 def _do(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
     """The result of a work as if sent by a copy; a counted work does not count its own steps."""
     check_deadline()
-    begin, function = time.perf_counter(), _function_of(work)
+    begin, function = time.process_time(), _function_of(work)
     with silently() if thing else nullcontext():
         result = work()
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     _costs[function] = 0.5 * (_costs.get(function, seconds) + seconds)
     try:
         return parcels.unpacked(parcels.packed(result))

@@ -154,8 +154,11 @@ def log_likelihoods(
     """
     length = -(-len(models) // _PARTS)
     parts = [slice(first, first + length) for first in range(0, len(models), length)]
+    groups = _by_size(columns.sizes)
+    own, candidates = _split(columns, groups)
+    data = joined(series, own), candidates, columns, groups
     works = [
-        partial(_in_this_process, flow, models[part], series, columns, largest, None if known is None else known[part])
+        partial(_in_this_process, flow, models[part], *data, largest, None if known is None else known[part])
         for part in parts
     ]
     return reduce(LogLikelihoods.and_more, shared(works, thing=thing))
@@ -165,19 +168,20 @@ def _in_this_process(
     flow: Flow,
     models: Sequence[NoiseModel],
     series: SeriesAlong,
+    candidates: SeriesAlong,
     columns: Columns,
+    groups: Sequence[tuple[np.ndarray, np.ndarray]],
     largest: Float[np.ndarray, " p+m"] | None,
     known: Sequence[Products | None] | None,
 ) -> LogLikelihoods:
-    B, C, Y = len(models), len(columns.sizes), series.count
+    """Compute the log-likelihoods of series that the parameters' tangents follow."""
+    B, C, Y = len(models), len(columns.sizes), series.count - columns.parameters
     used = flow.counts > 0
     without, with_candidate = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
-    groups = _by_size(columns.sizes)
-    own, candidates = _split(columns, groups)
     free = not any(models[0].known)
     kept: list[Products | None] = [None] * B
-    for number, gains, place, values in _under_each(flow, models, joined(series, own)):
+    for number, gains, place, values in _under_each(flow, models, series):
         check_deadline()
         rows = values[used]
         if not np.isfinite(rows).all():
