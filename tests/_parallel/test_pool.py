@@ -144,7 +144,6 @@ def test_copies_are_ended():
 
 ENDED = """
 import os, signal, sys, time
-from mkc_torch._parallel import pool
 from mkc_torch._parallel.pool import allow_copies, shared
 
 def work():
@@ -177,8 +176,7 @@ def test_the_end_of_this_process_ends_its_copies(number):
 CODE = """
     import json, math, os, sys, torch
     from mkc_torch import Recording, diagnose
-    from mkc_torch._parallel import pool
-from mkc_torch._parallel.pool import allow_copies
+    from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import one_thread
     from mkc_torch.recording.demonstration import simulated_recording
     from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
