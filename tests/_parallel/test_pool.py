@@ -176,6 +176,7 @@ def test_the_end_of_this_process_ends_its_copies(number):
 CODE = """
     import json, math, os, sys, torch
     from mkc_torch import Recording, diagnose
+    from mkc_torch._parallel import pool
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import one_thread
     from mkc_torch.recording.demonstration import simulated_recording
@@ -183,6 +184,7 @@ CODE = """
     from mkc_torch.simulation import Dynamics, Magnetometer
 
     one_thread()
+    pool._WORTH_S = -1.0  # share small tasks as well
 
     def alike(first, second):
         # a process repeats a diagnosis up to rounding only, which fits and open-loop runs amplify;
