@@ -5,16 +5,19 @@ from __future__ import annotations
 import ctypes
 import gc
 import io
+import math
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -34,7 +37,17 @@ _BYTES = 4
 _CHECK_INTERVAL_S = 0.1
 """Seconds between two checks of the deadline while waiting for a copy."""
 
+_WORTH_S = 0.05
+"""Seconds that copies have to save.
+
+A fork takes 0.02 s, and after it the system copies each page of memory that either process writes: about 5,000 pages,
+0.03 to 0.1 s in each process.
+"""
+
 _copies = 0
+
+_costs: dict[object, float] = {}
+"""CPU seconds of a work by its function: a mean with more weight on the last works."""
 
 
 def allow_copies(most: int | None = None) -> None:
@@ -44,6 +57,7 @@ def allow_copies(most: int | None = None) -> None:
     Nothing is forked on systems other than Linux.
     """
     global _copies
+    _costs.clear()
     _copies = (cores() - 1 if most is None else most) if sys.platform == "linux" else 0
 
 
@@ -65,10 +79,28 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
     check_deadline()
     if len(works) < 2:
         return [work() for work in works]
-    parcels, copies = Serializer(known), min(_copies, len(works) - 1)
-    if copies < 1:
-        return [_do(work, parcels, thing) for work in counted(works, len(works), thing)]
-    return _shared_by_copies(works, copies, parcels, thing)
+    parcels, total, left = Serializer(known), len(works), list(works)
+    last: list[T] = []
+    # the last works first, as in copies; of two works, trying one leaves nothing to share
+    while _copies and len(left) > 2 and _seconds(left) == math.inf:
+        count(thing, len(last), total)
+        last.insert(0, _do(left.pop(), parcels, thing))
+    copies = min(_copies, len(left) - 1)
+    if copies and _seconds(left) * copies / (copies + 1) > _WORTH_S:
+        return [*_shared_by_copies(left, copies, parcels, thing, total), *last]
+    return [*(_do(work, parcels, thing) for work in counted(left, total, thing, len(last))), *last]
+
+
+def _seconds(works: Sequence[Callable[[], object]]) -> float:
+    """CPU seconds that works will take; infinite if the cost of a function is unknown."""
+    return sum(_costs.get(_function_of(work), math.inf) for work in works)
+
+
+def _function_of(work: Callable[[], object]) -> object:
+    """What identifies the function of a work, without its arguments."""
+    while isinstance(work, partial):
+        work = work.func
+    return getattr(work, "__code__", type(work))
 
 
 class Serializer:
@@ -117,8 +149,10 @@ class _Unpacker(pickle.Unpickler):
         return self._known[pid]
 
 
-def _shared_by_copies(works: Sequence[Callable[[], T]], copies: int, parcels: Serializer, thing: str) -> list[T]:
-    """Do works in this process and in forked copies, which are all ended on return."""
+def _shared_by_copies(
+    works: Sequence[Callable[[], T]], copies: int, parcels: Serializer, thing: str, total: int
+) -> list[T]:
+    """Do works in this process and in forked copies, which are all ended on return; ``total`` counts those before."""
     # the process that reads a number does that work
     todo, entry = os.pipe()
     # in reverse order: works are sorted by likelihood, and the fit of an unlikely candidate takes longest
@@ -128,7 +162,7 @@ def _shared_by_copies(works: Sequence[Callable[[], T]], copies: int, parcels: Se
     task = works, todo, parcels
     pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _initialise_copy, task)
     try:
-        return _results(works, parcels, todo, _fork_copies(pool, copies), thing)
+        return _results(works, parcels, todo, _fork_copies(pool, copies), thing, total)
     finally:
         with _uninterrupted():
             for child in set(multiprocessing.active_children()) - before:
@@ -158,12 +192,17 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _results(
-    works: Sequence[Callable[[], T]], parcels: Serializer, todo: int, copies: list[Future[dict[int, bytes]]], thing: str
+    works: Sequence[Callable[[], T]],
+    parcels: Serializer,
+    todo: int,
+    copies: list[Future[dict[int, bytes]]],
+    thing: str,
+    total: int,
 ) -> list[T]:
     done = {}
     for number in _take_numbers(todo):
         # all processes take the works in reverse order
-        count(thing, len(works) - 1 - number, len(works))
+        count(thing, total - 1 - number, total)
         done[number] = _do(works[number], parcels, thing)
     for copy in copies:
         _wait_for(copy)
@@ -188,8 +227,11 @@ def _take_numbers(todo: int) -> Iterator[int]:
 def _do(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
     """The result of a work as if sent by a copy; a counted work does not count its own steps."""
     check_deadline()
+    begin, function = time.process_time(), _function_of(work)
     with silently() if thing else nullcontext():
         result = work()
+    seconds = time.process_time() - begin
+    _costs[function] = 0.5 * (_costs.get(function, seconds) + seconds)
     try:
         return parcels.unpacked(parcels.packed(result))
     except Exception:  # it cannot be pickled

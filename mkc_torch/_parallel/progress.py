@@ -45,8 +45,8 @@ def count(thing: str, done: int, total: int) -> None:
         counter.count(thing, done, total)
 
 
-def counted(things: Iterable[T], total: int, thing: str) -> Iterator[T]:
-    """Iterate over the things; each is counted as done when the next is requested.
+def counted(things: Iterable[T], total: int, thing: str, done: int = 0) -> Iterator[T]:
+    """Iterate over the things; each is counted as done when the next is requested. ``done`` were done before.
 
     Example:
         >>> class Printer:
@@ -59,7 +59,6 @@ def counted(things: Iterable[T], total: int, thing: str) -> Iterator[T]:
         letter: 2 of 2
         ['a', 'b']
     """
-    done = 0
     for item in things:
         count(thing, done, total)
         yield item

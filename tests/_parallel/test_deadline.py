@@ -126,7 +126,7 @@ def test_deadline_ends_a_copy_that_is_waited_for():
         time.sleep(0.05)
 
     with limited(0.3), pytest.raises(Stopped):
-        shared([work] * 3)
+        shared([work] * 2)
     assert multiprocessing.active_children() == []
 
 

@@ -12,6 +12,7 @@ import time
 import pytest
 import torch
 
+from mkc_torch._parallel import pool
 from mkc_torch._parallel.pool import Serializer, allow_copies, shared
 from tests.started import started
 
@@ -21,9 +22,10 @@ HERE = os.getpid()
 
 
 @pytest.fixture(autouse=True)
-def _copies():
+def _copies(monkeypatch):
     # copies lack the threads of this process, so no work here computes with large tensors
     allow_copies(2)
+    monkeypatch.setattr(pool, "_WORTH_S", -1.0)  # the works here are short
     yield
     allow_copies(0)
     assert multiprocessing.active_children() == []
@@ -48,6 +50,14 @@ def test_results_come_in_order_and_copies_take_part():
 def test_without_copies_this_process_does_all_work():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
+
+
+@pytest.mark.parametrize("works", [6, 2])
+def test_works_that_take_less_time_than_a_fork_are_done_here(works, monkeypatch):
+    monkeypatch.setattr(pool, "_WORTH_S", 0.1)
+    cheap = [os.getpid] * works
+    shared(cheap)  # of two works, the cost has to be known
+    assert shared(cheap) == [HERE] * works
 
 
 def test_nothing_is_forked_on_other_systems_than_linux(monkeypatch):
@@ -166,6 +176,7 @@ def test_the_end_of_this_process_ends_its_copies(number):
 CODE = """
     import json, math, os, sys, torch
     from mkc_torch import Recording, diagnose
+    from mkc_torch._parallel import pool
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import one_thread
     from mkc_torch.recording.demonstration import simulated_recording
@@ -173,6 +184,7 @@ CODE = """
     from mkc_torch.simulation import Dynamics, Magnetometer
 
     one_thread()
+    pool._WORTH_S = -1.0  # share small tasks as well
 
     def alike(first, second):
         # a process repeats a diagnosis up to rounding only, which fits and open-loop runs amplify;

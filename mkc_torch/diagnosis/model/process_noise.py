@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -239,13 +240,20 @@ def fit_with_process_noise(
 
 
 def refit_noise(
-    fit: FittedModel, around: StateSpaceNoise | None, declared: Mapping[str, float], settings: NoiseSettings
+    fit: FittedModel,
+    around: StateSpaceNoise | None,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+    least: float = -math.inf,
 ) -> FittedModel:
-    """Refit a joint model under its remaining process noise, or in open loop if that is as likely."""
+    """Refit a joint model under its remaining process noise, or in open loop if that is as likely.
+
+    ``least`` is the log-likelihood that matters: where both are below it, the slower comparison of the two is left out.
+    """
     found = _under_noise(fit, estimate_noise(fit, declared, settings, around), declared, settings)
     best = fit if found is None or found[0].log_likelihood < fit.log_likelihood else found[0]
     free = refit_open_loop(best)
-    if free is None:
+    if free is None or max(best.log_likelihood, free.log_likelihood) <= least:
         return best
     # parameters fitted under a disturbance can depend on it; those of the open-loop fit do not
     left = estimate_noise(free, declared, settings)
@@ -271,7 +279,8 @@ def refit_input_hold(
                 under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
             except NoFitError:
                 continue
-            found = refit_noise(shape_fitted(under), noise_of_fit(under, declared), declared, settings)
+            around = noise_of_fit(under, declared)
+            found = refit_noise(shape_fitted(under), around, declared, settings, fit.log_likelihood)
             if found.log_likelihood > fit.log_likelihood:
                 fit, prepared = found, found.model.prepared
     return fit

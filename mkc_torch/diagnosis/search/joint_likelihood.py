@@ -125,11 +125,13 @@ class _LinearisedRecording:
 
     def likelihoods(self, models: Sequence[NoiseModel]) -> LogLikelihoods:
         """Return the recording's log-likelihoods under noise models."""
-        return log_likelihoods(self.counted, models, self.series, self.columns, self.largest, "kind of noise")
+        return log_likelihoods(
+            self.counted, models, self.series, self.columns, self.largest, "part of the kinds of noise"
+        )
 
     def with_draws(self, near: LogLikelihoods, draws: SeriesAlong) -> LogLikelihoods:
         """Return the log-likelihoods of the recording and of surrogates under the models of an earlier result."""
-        series, thing = joined(self.series, draws), "draws under noise"
+        series, thing = joined(self.series, draws), "part of the draws under noise"
         return log_likelihoods(self.counted, near.models, series, self.columns, self.largest, thing, near.products)
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch._parallel.progress import counted
+from mkc_torch._parallel.pool import shared
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.whitening import (
@@ -42,6 +43,9 @@ _CELLS = 1 << 17
 
 _COVARIANCES = 8_000_000
 """Numbers of the filters' covariances that are held at once: 64 MB, a few times over."""
+
+_PARTS = 8
+"""Parts of the noise models that processes take in turn."""
 
 _DEPENDENT = 1e-10
 """Share of the largest singular value of the parameters' tangents below which a direction counts as absent."""
@@ -181,18 +185,39 @@ def log_likelihoods(
         series: Y series to explain, the recording's first.
         columns: tangents that may explain them.
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
-        thing: name of a noise model in the progress.
+        thing: name of a part of the noise models in the progress.
         known: products of the tangents under each model, from an earlier result for the same flow and tangents.
     """
-    B, C, Y = len(models), len(columns.sizes), series.count
+    length = -(-len(models) // _PARTS)
+    parts = [slice(first, first + length) for first in range(0, len(models), length)]
+    groups = _by_size(columns.sizes)
+    own, candidates = _split(columns, groups)
+    data = joined(series, own), candidates, columns, groups
+    works = [
+        partial(_in_this_process, flow, models[part], *data, largest, None if known is None else known[part])
+        for part in parts
+    ]
+    return reduce(LogLikelihoods.and_more, shared(works, thing=thing))
+
+
+def _in_this_process(
+    flow: Flow,
+    models: Sequence[NoiseModel],
+    series: SeriesAlong,
+    candidates: SeriesAlong,
+    columns: Columns,
+    groups: Sequence[tuple[np.ndarray, np.ndarray]],
+    largest: Float[np.ndarray, " p+m"] | None,
+    known: Sequence[Products | None] | None,
+) -> LogLikelihoods:
+    """Compute the log-likelihoods of series that the parameters' tangents follow."""
+    B, C, Y = len(models), len(columns.sizes), series.count - columns.parameters
     used = flow.counts > 0
     without, with_candidate = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
-    groups = _by_size(columns.sizes)
-    own, candidates = _split(columns, groups)
     free = not any(models[0].known)
     kept: list[Products | None] = [None] * B
-    for number, gains, place, values in counted(_under_each(flow, models, joined(series, own)), B, thing):
+    for number, gains, place, values in _under_each(flow, models, series):
         check_deadline()
         rows = values[used]
         if not np.isfinite(rows).all():

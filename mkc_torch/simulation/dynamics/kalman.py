@@ -32,6 +32,9 @@ _SCALINGS = 100
 _SETTLED = 1e-9
 """Relative change of the scale at which its iteration has converged."""
 
+_LINEAR = 0.95
+"""Ratio of successive steps of the scale up to which the next are extrapolated."""
+
 _FAR = 700.0
 """Nats at which an exponent is clipped, so that its exponential does not overflow."""
 
@@ -370,6 +373,7 @@ def robust_likelihood(
     odds = np.broadcast_to(tail, counts.shape)[used] + spread
     scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, 1e-300) if free else np.ones(B)
     left = np.arange(B if free else 0)  # models whose scale has not converged
+    moved = np.zeros(B)  # logarithm of a scale's last step; 0 after an extrapolation
     for _ in range(_SCALINGS):
         if not len(left):
             break
@@ -381,8 +385,13 @@ def robust_likelihood(
         np.exp(away, out=away)
         away += 1.0
         inner = np.reciprocal(away, out=away)
-        scale[left] = np.sqrt(np.maximum(np.einsum("bn,bn->b", inner, own) / inner.sum(-1), 1e-300))
-        left = left[~(np.abs(scale[left] / before - 1.0) < _SETTLED)]
+        step = np.log(np.sqrt(np.maximum(np.einsum("bn,bn->b", inner, own) / inner.sum(-1), 1e-300)) / before)
+        # Aitken's extrapolation of linear convergence
+        ratio = np.divide(step, moved[left], out=np.zeros(len(left)), where=moved[left] != 0.0)
+        ratio = np.where((ratio > 0.0) & (ratio < _LINEAR), ratio, 0.0)
+        scale[left] = before * np.exp(step / (1.0 - ratio))
+        moved[left] = np.where(ratio > 0.0, 0.0, step)
+        left = left[~(np.abs(step) < _SETTLED)]
     scale = np.maximum(scale, least) if free else scale
     log = np.log(scale)[:, None]
     normal = -0.5 * square / scale[:, None] ** 2 - log - spread

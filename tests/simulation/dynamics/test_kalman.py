@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mkc_torch.simulation.dynamics import kalman
 from mkc_torch.simulation.dynamics.kalman import Filtered, FilterModels, filtered, robust_likelihood, smoothed
 from tests.simulation.dynamics.oscillating import course, disturbed_states, flow, with_residual
 
@@ -244,6 +245,13 @@ class TestRobustLikelihood:
         matrix, vector = np.zeros((0, 1, 1, 1, 1)), np.zeros((0, 1, 1, 1))
         found = Filtered(z, np.full(z.shape, log_spread), matrix, vector, vector, matrix)
         return robust_likelihood(found, np.ones((*z.shape[:2], 1)), np.array([cls.REACH]))
+
+    def test_the_scale_converges_in_six_steps(self, monkeypatch):
+        random = np.random.default_rng(0)
+        z = random.standard_normal(400) * np.where(random.random(400) < 0.2, 8.0, 2.0)
+        _, expected = self.of(z)
+        monkeypatch.setattr(kalman, "_SCALINGS", 6)
+        np.testing.assert_allclose(self.of(z)[1], expected, rtol=1e-8)
 
     def test_the_scale_maximises_the_likelihood(self):
         z = np.random.default_rng(0).standard_t(3, 400)
