@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -254,14 +255,14 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
     def residual(numbers: Tensor) -> Tensor:
         return shaped.residual(torch.cat([make_dual(parameters, numbers[0]), numbers]))
 
-    columns = torch.func.jacfwd(residual)(start[shaped.joint :])
+    columns, within = _with_secants(torch.func.jacfwd(residual)(start[shaped.joint :]), shaped, start, inside)
     if not bool(columns.isfinite().all()):
         return plain
     wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
     found = linearise(shaped, start, local.values, local.counts, wide, spectrum=local.noise.spectrum, joint=True)
     error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
     numbers = [term.shape[name] for term, reach in zip(model.terms, inside, strict=True) for name in reach]
-    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())
+    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).hypot(within).tolist())
     known = [
         {
             name: deviation
@@ -271,6 +272,30 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
         for term, reach, found in zip(model.terms, inside, errors, strict=True)
     ]
     return replace(plain.at_least(error[: shaped.joint]), shape_errors=tuple(known))
+
+
+def _with_secants(
+    columns: Float[Tensor, "N m s"],
+    shaped: ShapedModel,
+    start: Float[Tensor, " p"],
+    inside: Sequence[Mapping[str, tuple[float, float]]],
+) -> tuple[Float[Tensor, "N m s"], Float[Tensor, " s"]]:
+    """Return the derivatives by the shape numbers, a secant for each delay with a derivative of 0; and its resolution.
+
+    The residual is constant in the delay of a held input within a sample interval, and a step from one to the next. The
+    secant is taken over one interval to either side; the position within an interval is uniformly distributed.
+    """
+    inner = shaped.prepared.time.diff()
+    step = float(inner[inner > 0].median())
+    within = columns.new_zeros(columns.shape[-1])
+    names = [(term, name) for term, reach in zip(shaped.terms, inside, strict=True) for name in reach]
+    for number, (term, name) in enumerate(names):
+        if name not in term.effect.continuous or bool(columns[..., number].any()):
+            continue
+        low, high = (shaped.moved(start, number, term.shape[name] + by) for by in (-step, step))
+        secant = (shaped.residual(high) - shaped.residual(low)) / (high - low)[shaped.joint + number]
+        columns[..., number], within[number] = secant.detach(), step / math.sqrt(12.0)
+    return columns, within
 
 
 def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
