@@ -27,7 +27,7 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.open_loop_gain import with_open_loop_gain
-from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, priced, with_own_noise
+from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, number_count, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
 from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, within_reach
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -141,7 +141,7 @@ def search_with_process_noise(
                 partial(_best_start, base, own, terms[number], fit, gamma, declared, settings, running, quick=quick)
             )
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
-        works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
+        works += [partial(under_own_noise, fit, base, declared, settings) for _, fit in more]
         works = [partial(_no_less_likely, base, work, declared, settings) for work in works]
         chosen += [number for number, _ in more]
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
@@ -255,11 +255,11 @@ def _best_start(
         works = [partial(fitted_with_effect, free, model, start, graduate=False) for start in starts]
         tried = run_parallel(works, model.prepared, [term])
         running = shape_fitted(max(tried, key=lambda open_loop_fit: open_loop_fit.log_likelihood))
-    running = _under_own_noise(running, base, declared, settings)
+    running = under_own_noise(running, base, declared, settings)
     return running if priced(running, settings) > priced(under, settings) else under
 
 
-def _under_own_noise(
+def under_own_noise(
     running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel:
     """Return an open-loop fit under the noise around it; unchanged if that is less likely or loses the recording."""
@@ -311,11 +311,11 @@ def _plain(
     if not runs:
         return False
     works = [partial(with_own_noise, base, declared, settings)]
-    works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
+    works += [partial(under_own_noise, fit, base, declared, settings) for fit in runs]
     alone, *others = run_parallel(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
     samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
     for fit in others:
-        least = _DOUBT + price(_numbers(fit), samples, kinds)
+        least = _DOUBT + price(number_count(fit), samples, kinds)
         if priced(fit, settings) - priced(alone, settings) > least:
             bare = _without(base, fit, declared, settings)
             if bare is not None and priced(fit, settings) - priced(bare, settings) > least:
@@ -366,7 +366,7 @@ def _by_free_run(
     """
     gaps = {terms[rival.number].key: rival.gap for rival in ranking}
     alike = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
-    near = [fit for fit in alike if fit is best or _numbers(fit) <= _numbers(best)]
+    near = [fit for fit in alike if fit is best or number_count(fit) <= number_count(best)]
     keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
     if len(keys) < 2:
         return best, ranking
@@ -380,11 +380,6 @@ def _by_free_run(
         return best, ranking
     key = near[first].model.terms[-1].key
     return near[first], tuple(sorted(ranking, key=lambda rival: (terms[rival.number].key != key, rival.gap)))
-
-
-def _numbers(fit: FittedModel) -> int:
-    """Number of parameters of the last effect and its shape."""
-    return fit.model.sizes[-1] + len(fit.model.terms[-1].effect.fitted_shape)
 
 
 def _by_own_noise(
