@@ -9,12 +9,12 @@ from functools import partial
 import torch
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
+from mkc_torch.diagnosis.model.process_noise import fit_with_process_noise
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Term, run_parallel
 from mkc_torch.diagnosis.search.estimate import estimate
 from mkc_torch.diagnosis.search.own_noise import number_count, priced
 from mkc_torch.diagnosis.search.run import SearchResult
-from mkc_torch.diagnosis.search.with_process_noise import under_own_noise
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 
 _LEADING = 3
@@ -50,7 +50,8 @@ def with_partner(
     pairs = run_parallel([partial(_with_effect, alone, term) for term in _partners(found)], *common)
     if not pairs:
         return None
-    pair = under_own_noise(max(pairs, key=_likelihood), found.fit, declared, settings)
+    # the shapes stay: with process noise many shapes follow the recording
+    pair = fit_with_process_noise(max(pairs, key=_likelihood), declared, settings.noise).fit
     price = 0.5 * math.log(len(pair.residual)) * number_count(pair) + settings.naming.separable
     return pair if priced(pair, settings) > priced(found.fit, settings) + price else None
 

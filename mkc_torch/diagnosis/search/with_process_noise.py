@@ -141,7 +141,7 @@ def search_with_process_noise(
                 partial(_best_start, base, own, terms[number], fit, gamma, declared, settings, running, quick=quick)
             )
         more = [(number, fit) for number, fit in runs if terms[number].key in known]
-        works += [partial(under_own_noise, fit, base, declared, settings) for _, fit in more]
+        works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
         works = [partial(_no_less_likely, base, work, declared, settings) for work in works]
         chosen += [number for number, _ in more]
         fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
@@ -255,11 +255,11 @@ def _best_start(
         works = [partial(fitted_with_effect, free, model, start, graduate=False) for start in starts]
         tried = run_parallel(works, model.prepared, [term])
         running = shape_fitted(max(tried, key=lambda open_loop_fit: open_loop_fit.log_likelihood))
-    running = under_own_noise(running, base, declared, settings)
+    running = _under_own_noise(running, base, declared, settings)
     return running if priced(running, settings) > priced(under, settings) else under
 
 
-def under_own_noise(
+def _under_own_noise(
     running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
 ) -> FittedModel:
     """Return an open-loop fit under the noise around it; unchanged if that is less likely or loses the recording."""
@@ -311,7 +311,7 @@ def _plain(
     if not runs:
         return False
     works = [partial(with_own_noise, base, declared, settings)]
-    works += [partial(under_own_noise, fit, base, declared, settings) for fit in runs]
+    works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
     alone, *others = run_parallel(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
     samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
     for fit in others:

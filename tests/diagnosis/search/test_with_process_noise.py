@@ -128,7 +128,7 @@ def test_without_surrogates_the_gain_must_hold_under_the_noise_found_with_the_ef
     base, run = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4)
     module = "mkc_torch.diagnosis.search.with_process_noise"
     monkeypatch.setattr(f"{module}.with_own_noise", lambda fit, *_: fit)
-    monkeypatch.setattr(f"{module}.under_own_noise", lambda fit, *_: fit)
+    monkeypatch.setattr(f"{module}._under_own_noise", lambda fit, *_: fit)
     monkeypatch.setattr(f"{module}.run_parallel", lambda works, *_: [work() for work in works])
     monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
     monkeypatch.setattr(f"{module}._without", lambda *_: None if bare is None else of_likelihood(bare, 3))
