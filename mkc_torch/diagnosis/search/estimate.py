@@ -25,7 +25,7 @@ from mkc_torch.diagnosis.noise.outliers import (
     rejected_in_all,
     without_one_sided,
 )
-from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum, agreed_innovation_gain
 from mkc_torch.diagnosis.search.linearise import LinearisedSearch, linearise
 from mkc_torch.diagnosis.search.tangents import ModelTangents, SlowBasis, tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -172,7 +172,7 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
 
     The M-estimate weighs samples as if they were independent. For coloured noise this step is more precise, and its
     covariance includes the autocorrelation. A step of more than ``last_step`` standard errors is not taken, because
-    the noise model does not describe the fit.
+    the noise model does not describe the fit; neither is a step that loses more than a nat per parameter.
     """
     model, parameters = fit.model, fit.parameters
     tangents = tangents_of(model, parameters, settings)
@@ -193,8 +193,9 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
             step, covariance = within_bounds(parameters, step, covariance, model.bounds)
         parameters = parameters - step
         residual, nearby = model.answer(parameters)
-        # the simulation may have no finite trajectory there
-        if bool(residual.isfinite().all()):
+        # the simulation may have no finite trajectory there, or the step be beyond the linear range
+        finite = bool(residual.isfinite().all())
+        if finite and agreed_innovation_gain(fit.residual, residual.detach()) > -len(parameters):
             moved = model if nearby is None else model.begun_with(nearby.bare)
             fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
     noise = found.search.noise_fit(found.series)
