@@ -189,15 +189,16 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     step, covariance = found.search.estimate(0, found.series)
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
     if float((step.abs() / error).max()) <= settings.last_step:
+        taken = covariance
         if model.bounds is not None:
-            step, covariance = within_bounds(parameters, step, covariance, model.bounds)
+            step, taken = within_bounds(parameters, step, covariance, model.bounds)
         parameters = parameters - step
         residual, nearby = model.answer(parameters)
         # the simulation may have no finite trajectory there, or the step be beyond the linear range
         finite = bool(residual.isfinite().all())
         if finite and agreed_innovation_gain(fit.residual, residual.detach()) > -len(parameters):
             moved = model if nearby is None else model.begun_with(nearby.bare)
-            fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
+            fit, covariance = replace(fit, model=moved, parameters=parameters, residual=residual.detach()), taken
     noise = found.search.noise_fit(found.series)
     spread = found.search.drift_spread(noise) if noise.size > 0 else 0.0
     plain = FinalEstimate(fit, covariance, noise, found.spectrum, spread, tuple({} for _ in fit.model.terms))
