@@ -41,7 +41,7 @@ def dynamic_context(effect, N=80, driven=False):
     names = ("angle", "speed", "other", "load", "rate")
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
-        "temperature": "speed", "level": "speed", "other": "other", "load": "load",
+        "temperature": "speed", "level": "speed", "other": "other", "other level": "other", "load": "load",
         "rate": "rate", "height": "angle", "sideways": "other", "surroundings": "other",
     }  # fmt: skip
     of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}

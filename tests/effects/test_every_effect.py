@@ -110,7 +110,7 @@ def test_ids_are_unchanged():
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
     several = (
         "unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss", "backlash", "delay", "offset",
-        "gravity_sag",
+        "gravity_sag", "overflow",
     )  # fmt: skip
     named = [effect.id for effect in CATALOGUE if effect.id not in several]
     assert len(set(named)) == len(named)

@@ -171,6 +171,13 @@ class ShapedModel(JointModel):
         values = [term.shape[name] for term, reach in zip(self.terms, self._reach, strict=True) for name in reach]
         return torch.cat([parameters, self._free(parameters.new_tensor(values))])
 
+    def moved(self, parameters: Float[Tensor, " p"], number: int, value: float) -> Float[Tensor, " p"]:
+        """Return the parameters with another value of a shape number, no less than its lower limit."""
+        low = [low for limits in self._reach for low, _ in limits.values()][number]
+        values = torch.full_like(parameters[self.joint :], max(value, low))
+        chosen = torch.arange(len(values)) == number
+        return torch.cat([parameters[: self.joint], torch.where(chosen, self._free(values), parameters[self.joint :])])
+
     def per_effect(self, values: Sequence[Any]) -> list[dict[str, Any]]:
         """Split values of the shape numbers into one mapping per effect, by name."""
         left = iter(values)

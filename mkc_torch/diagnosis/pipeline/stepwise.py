@@ -25,8 +25,9 @@ from mkc_torch.diagnosis.pipeline.series_order import in_better_order
 from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.pipeline.special_case import with_special_case
 from mkc_torch.diagnosis.search.open_loop_gain import enlarges_open_loop, improves_open_loop
-from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
-from mkc_torch.diagnosis.search.ranking import alike
+from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
+from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
+from mkc_torch.diagnosis.search.ranking import Ranked, alike
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
 from mkc_torch.diagnosis.search.with_process_noise import search_with_process_noise
 from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
@@ -136,46 +137,79 @@ def first_step(
     keep(first_step)
     if first is None:
         return first_step
-    try:
-        taken = _accept(first_step, base, first, options)
-    except NoFitError:  # a fit to a part of the recording has no finite trajectory
-        taken = replace(first_step, left=(), unconfirmed=first)
+    taken = _add(first_step, base, first, options)
     keep(taken)
-    if taken.found:
-        return _in_two_steps(first_step, taken, options, generator)
-    if options.quick:
-        return taken
-    cause = located_cause(base, first, options.level, options.surrogates)
-    if cause is None:
-        return taken
-    after = held_out(cause.fit, blocks, partial(course_without, base, cause))
-    # after a free course, little structure remains
-    return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
+    cause = None
+    if not taken.found and not options.quick:
+        cause = located_cause(base, first, options.level, options.surrogates)
+    if cause is not None:
+        after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+        # after a free course, little structure remains
+        return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
+    taken = _or_next_leader(first_step, taken, base, first, options, generator, free)
+    keep(taken)
+    return _with_another(first_step, taken, options, generator, free) if taken.found else taken
 
 
 def next_step(
     search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = _kept_nowhere
 ) -> StepwiseSearch:
-    """Run the next search with the findings in the model; skip it if the screening shows nothing.
-
-    A candidate that enlarges the open-loop residual is refused, and the search repeated once without its effect.
-    """
+    """Run the next search with the findings in the model; skip it if the screening shows nothing."""
     if _is_screened_out(search, options):
         return replace(search, left=())
-    fit, left = search.found[-1].fit, search.left
+    fit = search.found[-1].fit
     try:
-        located = _located(fit, left, options, generator, parts=False)
-        if located.p_value <= options.level and enlarges_open_loop(located.fit, fit):
-            search = replace(search, refused=(*search.refused, located))
-            left = tuple(term for term in left if term.key != located.term.key)
-            located = _located(fit, left, options, generator, parts=False)
-            if enlarges_open_loop(located.fit, fit):
-                return replace(search, left=())
-        taken = _accept(search, fit, located, options)
+        located = _located(fit, search.left, options, generator, parts=False)
+        taken = _or_next_leader(search, _add(search, fit, located, options), fit, located, options, generator)
         keep(taken)
-        return _in_two_steps(search, taken, options, generator)
+        return _with_another(search, taken, options, generator)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # keep the previous findings
+
+
+def _or_next_leader(
+    before: StepwiseSearch,
+    after: StepwiseSearch,
+    fit: FittedModel,
+    located: SearchResult,
+    options: SearchOptions,
+    generator: torch.Generator,
+    free: FittedModel | None = None,
+) -> StepwiseSearch:
+    """Return the search with the leader; where the leader was refused, with that of a search without its effect.
+
+    A leader is refused if held-out blocks do not confirm it, or if it enlarges the open-loop residual of the findings.
+
+    Args:
+        before, after: the search without and with the leader, as far as it counts.
+        fit: with the findings before.
+        located: the leader.
+        options: of the diagnosis.
+        generator: of the surrogates.
+        free: the open-loop fit of the simulation without findings.
+    """
+    left = tuple(term for term in before.left if term.key != located.term.key)
+    refused = after.unconfirmed is not before.unconfirmed or after.refused != before.refused
+    if not refused or not left:
+        return after
+    try:
+        second = _located(fit, left, options, generator, parts=False, free=free)
+        taken = _add(replace(after, left=before.left), fit, second, options)
+    except NoFitError:
+        return after
+    return replace(taken, unconfirmed=after.unconfirmed or taken.unconfirmed)
+
+
+def _add(search: StepwiseSearch, fit: FittedModel, located: SearchResult, options: SearchOptions) -> StepwiseSearch:
+    """Add a located candidate if it counts as a finding and does not enlarge the open-loop residual of findings."""
+    if search.found and located.p_value <= options.level and enlarges_open_loop(located.fit, fit):
+        return replace(search, left=(), refused=(*search.refused, located))
+    try:
+        return _accept(search, fit, located, options)
+    except NoFitError:
+        if search.found:
+            raise
+        return replace(search, left=(), unconfirmed=located)  # a fit to a part has no finite trajectory
 
 
 def _located(
@@ -308,6 +342,62 @@ def _accept(
     return replace(taken, left=()) if full else taken
 
 
+def _with_another(
+    before: StepwiseSearch,
+    after: StepwiseSearch,
+    options: SearchOptions,
+    generator: torch.Generator,
+    free: FittedModel | None = None,
+) -> StepwiseSearch:
+    """Add to the last finding the effect that it needs, or that it stands for in part.
+
+    Args:
+        before: the search without the last finding.
+        after: the search with it.
+        options: of the diagnosis.
+        generator: of the surrogates.
+        free: the open-loop fit of the simulation without findings.
+    """
+    try:
+        paired = _with_partner(before, after, options, free)
+    except NoFitError:
+        paired = after
+    return paired if paired is not after else _in_two_steps(before, after, options, generator)
+
+
+def _with_partner(
+    before: StepwiseSearch, after: StepwiseSearch, options: SearchOptions, free: FittedModel | None
+) -> StepwiseSearch:
+    """Add a partner to a last finding whose size is not determined, if the two together pay their price.
+
+    Held-out blocks can only reject the pair, as they can a first finding.
+    """
+    settings, count = options.settings, len(after.found)
+    room = len(before.found) < count < options.max_findings
+    if options.quick or not room or not after.found[-1].with_noise:
+        return after
+    last = after.found[-1]
+    free = before.found[-1].fit.open_loop if before.found else free
+    if free is None or not is_undetermined(last.fit, settings.noise):
+        return after
+    pair = with_partner(last, free, options.declared, settings)
+    if pair is None or enlarges_open_loop(pair, last.fit):
+        return after
+    term = pair.model.terms[-1]
+    number = next(number for number, other in enumerate(last.scene.terms) if other.key == term.key)
+    gain = pair.log_likelihood - last.fit.log_likelihood
+    partner = replace(last, term=term, fit=pair, ranking=(Ranked(number, gain, 0.0),), compared=())
+    both = _with_fit(after, (*after.found, partner), pair, options)
+    if both is None:
+        return after
+    difference = both.evidence[-1].log_likelihood - before.evidence[-1].log_likelihood
+    high = gain_interval(difference, before.blocks.block, torch.Generator().manual_seed(options.seed))[1][1]
+    if high < 0.0:
+        return after
+    both = _eliminated(replace(both, left=tuple(t for t in after.left if t.key != term.key)), options)
+    return replace(both, left=()) if len(both.found) == options.max_findings else both
+
+
 def _in_two_steps(
     before: StepwiseSearch, after: StepwiseSearch, options: SearchOptions, generator: torch.Generator
 ) -> StepwiseSearch:
@@ -370,29 +460,46 @@ def _score(fit: FittedModel, settings: Settings) -> float:
 
 
 def _eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
-    """Remove findings that the other findings make needless, and refit the remaining model.
+    """Remove findings, one or two at a time, that the others make needless, and refit the remaining model.
 
     A finding that clearly improves the open loop stays, even if process noise with another finding replaces it one step
     ahead.
     """
-    declared, settings = options.declared, options.settings
     while len(search.found) > 1:
         final = search.found[-1].fit
-        number = needless_term(final, declared, settings)
-        fit = None if number is None else without(final, number, declared, settings)
-        if number is None or fit is None or improves_open_loop(final, fit):
+        numbers = needless_terms(final, options.declared, options.settings)
+        fit = without(final, numbers, options.declared, options.settings) if numbers else None
+        if fit is None or improves_open_loop(final, fit):
             break
-        kept = [finding for place, finding in enumerate(search.found) if place != number]
-        fits = [fit]
-        while len(fits[0].model.terms) > 1:
-            less = without(fits[0], len(fits[0].model.terms) - 1, declared, settings)
-            if less is None:
-                return search
-            fits.insert(0, less)
-        found = tuple(replace(old, fit=new, term=new.model.terms[-1]) for old, new in zip(kept, fits, strict=True))
-        evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
-        search = replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)))
+        kept = [finding for number, finding in enumerate(search.found) if number not in numbers]
+        less = _with_fit(search, kept, fit, options)
+        if less is None:
+            break
+        search = less
     return search
+
+
+def _with_fit(
+    search: StepwiseSearch, findings: Sequence[SearchResult], fit: FittedModel, options: SearchOptions
+) -> StepwiseSearch | None:
+    """Return the search with other findings, estimated together; None if a fit with a part of them fails.
+
+    Args:
+        search: the search.
+        findings: the findings.
+        fit: with all of them, in this order.
+        options: of the diagnosis.
+    """
+    fits = [fit] if findings else []
+    while len(fits) < len(findings):
+        less = without(fits[0], (len(fits[0].model.terms) - 1,), options.declared, options.settings)
+        if less is None:
+            return None
+        fits.insert(0, less)
+    found = tuple(replace(old, fit=new, term=new.model.terms[-1]) for old, new in zip(findings, fits, strict=True))
+    evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
+    left = search.left if found else ()
+    return replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)), left=left)
 
 
 def _better_supported(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:

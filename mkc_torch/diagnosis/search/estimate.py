@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,7 @@ from mkc_torch.diagnosis.noise.outliers import (
     rejected_in_all,
     without_one_sided,
 )
-from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum, agreed_innovation_gain
 from mkc_torch.diagnosis.search.linearise import LinearisedSearch, linearise
 from mkc_torch.diagnosis.search.tangents import ModelTangents, SlowBasis, tangents_of
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -171,7 +172,7 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
 
     The M-estimate weighs samples as if they were independent. For coloured noise this step is more precise, and its
     covariance includes the autocorrelation. A step of more than ``last_step`` standard errors is not taken, because
-    the noise model does not describe the fit.
+    the noise model does not describe the fit; neither is a step that loses more than a nat per parameter.
     """
     model, parameters = fit.model, fit.parameters
     tangents = tangents_of(model, parameters, settings)
@@ -188,14 +189,16 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     step, covariance = found.search.estimate(0, found.series)
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
     if float((step.abs() / error).max()) <= settings.last_step:
+        taken = covariance
         if model.bounds is not None:
-            step, covariance = within_bounds(parameters, step, covariance, model.bounds)
+            step, taken = within_bounds(parameters, step, covariance, model.bounds)
         parameters = parameters - step
         residual, nearby = model.answer(parameters)
-        # the simulation may have no finite trajectory there
-        if bool(residual.isfinite().all()):
+        # the simulation may have no finite trajectory there, or the step be beyond the linear range
+        finite = bool(residual.isfinite().all())
+        if finite and agreed_innovation_gain(fit.residual, residual.detach()) > -len(parameters):
             moved = model if nearby is None else model.begun_with(nearby.bare)
-            fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
+            fit, covariance = replace(fit, model=moved, parameters=parameters, residual=residual.detach()), taken
     noise = found.search.noise_fit(found.series)
     spread = found.search.drift_spread(noise) if noise.size > 0 else 0.0
     plain = FinalEstimate(fit, covariance, noise, found.spectrum, spread, tuple({} for _ in fit.model.terms))
@@ -254,14 +257,14 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
     def residual(numbers: Tensor) -> Tensor:
         return shaped.residual(torch.cat([make_dual(parameters, numbers[0]), numbers]))
 
-    columns = torch.func.jacfwd(residual)(start[shaped.joint :])
+    columns, within = _with_secants(torch.func.jacfwd(residual)(start[shaped.joint :]), shaped, start, inside)
     if not bool(columns.isfinite().all()):
         return plain
     wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
     found = linearise(shaped, start, local.values, local.counts, wide, spectrum=local.noise.spectrum, joint=True)
     error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
     numbers = [term.shape[name] for term, reach in zip(model.terms, inside, strict=True) for name in reach]
-    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())
+    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).hypot(within).tolist())
     known = [
         {
             name: deviation
@@ -271,6 +274,30 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
         for term, reach, found in zip(model.terms, inside, errors, strict=True)
     ]
     return replace(plain.at_least(error[: shaped.joint]), shape_errors=tuple(known))
+
+
+def _with_secants(
+    columns: Float[Tensor, "N m s"],
+    shaped: ShapedModel,
+    start: Float[Tensor, " p"],
+    inside: Sequence[Mapping[str, tuple[float, float]]],
+) -> tuple[Float[Tensor, "N m s"], Float[Tensor, " s"]]:
+    """Return the derivatives by the shape numbers, a secant for each delay with a derivative of 0; and its resolution.
+
+    The residual is constant in the delay of a held input within a sample interval, and a step from one to the next. The
+    secant is taken over one interval to either side; the position within an interval is uniformly distributed.
+    """
+    inner = shaped.prepared.time.diff()
+    step = float(inner[inner > 0].median())
+    within = columns.new_zeros(columns.shape[-1])
+    names = [(term, name) for term, reach in zip(shaped.terms, inside, strict=True) for name in reach]
+    for number, (term, name) in enumerate(names):
+        if name not in term.effect.continuous or bool(columns[..., number].any()):
+            continue
+        low, high = (shaped.moved(start, number, term.shape[name] + by) for by in (-step, step))
+        secant = (shaped.residual(high) - shaped.residual(low)) / (high - low)[shaped.joint + number]
+        columns[..., number], within[number] = secant.detach(), step / math.sqrt(12.0)
+    return columns, within
 
 
 def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -44,11 +45,17 @@ def priced(fit: FittedModel, settings: Settings) -> float:
     )
 
 
-def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> int | None:
-    """Return the number of an effect that does not pay its penalty given the others; None if all do.
+def number_count(fit: FittedModel, number: int = -1) -> int:
+    """Number of sizes and fitted shape numbers of an effect, by default the last."""
+    return fit.model.sizes[number] + len(fit.model.terms[number].effect.fitted_shape)
+
+
+def needless_terms(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> tuple[int, ...]:
+    """Return the numbers of an effect, or of a pair, that does not pay its penalty given the others; empty if all do.
 
     The penalty of an effect is half the logarithm of the number of samples for each of its numbers and each fitted
-    number of its shape (Schwarz, Annals of Statistics 6, 1978, 461), plus the limit of separability.
+    number of its shape (Schwarz, Annals of Statistics 6, 1978, 461), plus the limit of separability. Two effects can
+    compensate each other, so that each pays its penalty given the other, but not both together.
 
     Args:
         fit: with several effects.
@@ -56,27 +63,32 @@ def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Set
         settings: thresholds.
     """
     count = len(fit.model.terms)
-    if count < 2:
-        return None
-    works = [partial(_loss, fit, number, declared, settings) for number in range(count)]
-    losses = run_parallel(works, fit.model.prepared, fit.model.terms)
-    weakest = min(range(count), key=losses.__getitem__)
-    return weakest if losses[weakest] < settings.naming.separable else None
+    for size in (1, 2) if count > 1 else ():
+        sets = list(combinations(range(count), size))
+        works = [partial(_loss, fit, numbers, declared, settings) for numbers in sets]
+        losses = run_parallel(works, fit.model.prepared, fit.model.terms)
+        weakest = min(range(len(sets)), key=losses.__getitem__)
+        if losses[weakest] < settings.naming.separable:
+            return sets[weakest]
+    return ()
 
 
-def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> float:
-    """Nats by which the fit without an effect is less likely, less the effect's penalty."""
-    less = without(fit, number, declared, settings)
+def _loss(fit: FittedModel, numbers: Sequence[int], declared: Mapping[str, float], settings: Settings) -> float:
+    """Nats by which the fit without some effects is less likely, less the effects' penalty."""
+    less = without(fit, numbers, declared, settings)
     if less is None:
         return math.inf
-    numbers = fit.model.sizes[number] + len(fit.model.terms[number].effect.fitted_shape)
-    price = 0.5 * numbers * math.log(len(fit.residual))
+    price = 0.5 * math.log(len(fit.residual)) * sum(number_count(fit, number) for number in numbers)
     return priced(fit, settings) - priced(less, settings) - price
 
 
-def without(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> FittedModel | None:
-    """Return the joint fit without one of its effects, under its remaining noise; None if it fails."""
-    start = without_term(fit, number)
+def without(
+    fit: FittedModel, numbers: Sequence[int], declared: Mapping[str, float], settings: Settings
+) -> FittedModel | None:
+    """Return the joint fit without some of its effects, under its remaining noise; None if it fails."""
+    start = fit
+    for number in sorted(numbers, reverse=True):
+        start = without_term(start, number)
     try:
         return with_own_noise(fitted(start.model, start.parameters, fit.bound, graduate=False), declared, settings)
     except NoFitError:

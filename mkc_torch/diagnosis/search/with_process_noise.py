@@ -27,7 +27,7 @@ from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.open_loop_gain import with_open_loop_gain
-from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, priced, with_own_noise
+from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, number_count, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
 from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, within_reach
 from mkc_torch.diagnosis.search.run import SearchResult
@@ -316,7 +316,7 @@ def _plain(
     works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
     alone, *fits = run_parallel(works, *known)
     samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
-    beyond = [priced(fit, settings) - _DOUBT - price(_numbers(fit), samples, kinds) for fit in fits]
+    beyond = [priced(fit, settings) - _DOUBT - price(number_count(fit), samples, kinds) for fit in fits]
     if max(beyond) <= priced(alone, settings):
         return False
     without = run_parallel([partial(_without_at_best, base, fit, declared, settings) for fit in fits], *known)
@@ -375,7 +375,7 @@ def _by_free_run(
     """
     gaps = {terms[rival.number].key: rival.gap for rival in ranking}
     alike = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
-    near = [fit for fit in alike if fit is best or _numbers(fit) <= _numbers(best)]
+    near = [fit for fit in alike if fit is best or number_count(fit) <= number_count(best)]
     keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
     if len(keys) < 2:
         return best, ranking
@@ -389,11 +389,6 @@ def _by_free_run(
         return best, ranking
     key = near[first].model.terms[-1].key
     return near[first], tuple(sorted(ranking, key=lambda rival: (terms[rival.number].key != key, rival.gap)))
-
-
-def _numbers(fit: FittedModel) -> int:
-    """Number of parameters of the last effect and its shape."""
-    return fit.model.sizes[-1] + len(fit.model.terms[-1].effect.fitted_shape)
 
 
 def _by_own_noise(

@@ -23,6 +23,7 @@ from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
 from mkc_torch.effects.dynamics.overflow import Overflow
+from mkc_torch.effects.dynamics.overflow_into import OverflowInto
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
@@ -56,6 +57,7 @@ DYNAMICS: tuple[Effect, ...] = (
     Coupling(),
     MagnusLift(),
     HardStop(),
+    OverflowInto(),
     Overflow(),
     ThermalLoss(to_surroundings=True),
     ThermalLoss(),

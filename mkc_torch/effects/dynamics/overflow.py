@@ -33,7 +33,7 @@ class Overflow(RateEffect):
     relative: Mapping[str, tuple[str, str]] = {"rim": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"rim": (0.4, 0.98), "exponent": (1.0, 3.0)}
     natural_ends: Mapping[str, tuple[str, ...]] = {"exponent": ("least",)}
-    needs = ("level",)
+    needs: tuple[str, ...] = ("level",)
     gain = "loss"
     power = 1.0
     equation = "δẋ = −γ h (h/c)ⁿ⁻¹,  h = max(x − c, 0)"

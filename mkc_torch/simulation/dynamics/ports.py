@@ -80,7 +80,9 @@ class PortContext:
         ]
         for first, second in pairs:
             sideways = {"sideways": second} if self._is_way(first) and self._is_way(second) else {}
-            port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways})
+            both = "level" in self._parts(first) and "level" in self._parts(second)
+            levels = {"level": first, "other level": second} if both else {}
+            port = self._rate_port(first, "exchange", {"own": first, "other": second, **sideways, **levels})
             places[f"exchange of {first} and {second}"] = replace(port, channels=(first, second))
         for name in system.inputs:
             places[f"input {name}"] = Port(

@@ -1,6 +1,7 @@
 """The delay of an input by a profile of the likelihood."""
 
 import functools
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,8 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
 from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted
+from mkc_torch.diagnosis.search.estimate import estimate
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -30,7 +33,7 @@ class Cart(Dynamics):
 
 
 @functools.cache
-def base():
+def base(noise=NOISE):
     """The fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
     generator = torch.Generator().manual_seed(0)
     N = 600
@@ -42,19 +45,19 @@ def base():
         for _ in range(20):
             speed += STEP / 20 * (now - 2.0 * place - 0.5 * speed)
             place += STEP / 20 * speed
-    noise = NOISE * torch.randn(N, generator=generator, dtype=torch.float64)
+    noise = noise * torch.randn(N, generator=generator, dtype=torch.float64)
     time = STEP * torch.arange(N, dtype=torch.float64)
     recording = Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
     prepared = Cart().prepare(recording)
     return fitted(JointModel(prepared), prepared.start())
 
 
-def with_effect(name, **shape):
+def with_effect(name, noise=NOISE, **shape):
     """The fit with an effect, at this shape."""
-    effect = next(effect for effect in DYNAMICS if effect.id == name)
-    term = candidate_terms(base().model.prepared, (), (effect,))[0]
-    model = base().model.with_term(replace(term, shape={**term.shape, **shape}))
-    return fitted(model, torch.cat([base().parameters, base().parameters.new_tensor([0.5])]), base().bound)
+    effect, alone = next(effect for effect in DYNAMICS if effect.id == name), base(noise)
+    term = candidate_terms(alone.model.prepared, (), (effect,))[0]
+    model = alone.model.with_term(replace(term, shape={**term.shape, **shape}))
+    return fitted(model, torch.cat([alone.parameters, alone.parameters.new_tensor([0.5])]), alone.bound)
 
 
 @pytest.mark.parametrize("start", [0.06, 0.0999])
@@ -70,3 +73,24 @@ def test_a_delay_is_found_beyond_the_next_local_maximum(start):
 def test_effects_without_a_delay_stay():
     fit = with_effect("dead_zone")
     assert with_profiled_shape(fit) is fit
+
+
+def delay_and_error(noise):
+    """The fit with the delay, and the delay's standard error."""
+    fit = with_profiled_shape(shape_fitted(with_effect("input_delay", noise, delay=0.15)))
+    (errors,) = estimate(fit, NoiseSettings()).shape_errors
+    return fit, errors["delay"]
+
+
+def test_the_error_of_a_well_known_delay_is_the_resolution_of_a_sample():
+    fit, error = delay_and_error(NOISE)
+    assert error == pytest.approx(STEP / math.sqrt(12.0), rel=0.1)
+    assert abs(fit.model.terms[-1].shape["delay"] - DELAYED * STEP) < 2.0 * error
+
+
+def test_the_error_of_a_delay_in_strong_noise_grows_with_the_noise():
+    """Within one sample interval nothing is known, so that part of the variance stays."""
+    within = STEP**2 / 12.0
+    (weak, strong) = (delay_and_error(noise)[1] for noise in (0.05, 0.1))
+    assert weak > STEP
+    assert math.sqrt((strong**2 - within) / (weak**2 - within)) == pytest.approx(2.0, rel=0.1)

@@ -2,13 +2,15 @@
 
 import dataclasses
 import functools
+import types
 
 import pytest
 import torch
 
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.process_noise import noise_of_fit
-from mkc_torch.diagnosis.search.own_noise import needless_term, priced, without
+from mkc_torch.diagnosis.search import own_noise
+from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
 from tests.diagnosis.swing import candidates, fitted_swing
@@ -29,15 +31,32 @@ def with_effects(*names):
 
 def test_a_needless_effect_is_dropped_and_the_true_one_stays():
     fit = with_effects("constant_force", "quadratic_drag")
-    assert needless_term(fit, {}, Settings()) == 0
-    less = without(fit, 0, {}, Settings())
+    assert needless_terms(fit, {}, Settings()) == (0,)
+    less = without(fit, (0,), {}, Settings())
     assert [term.effect.id for term in less.model.terms] == ["quadratic_drag"]
     (drag,) = less.model.gammas(less.parameters)[0].tolist()
     assert drag == pytest.approx(0.4, abs=0.15)
 
 
 def test_a_single_effect_is_never_dropped():
-    assert needless_term(with_effects("quadratic_drag"), {}, Settings()) is None
+    assert needless_terms(with_effects("quadratic_drag"), {}, Settings()) == ()
+
+
+def test_a_fit_without_two_effects():
+    fit = with_effects("constant_force", "quadratic_drag")
+    less = without(fit, (0, 1), {}, Settings())
+    assert less.model.terms == ()
+    assert len(less.parameters) == len(fit.parameters) - 2
+
+
+@pytest.mark.parametrize(("together", "needless"), [(-3.0, (0, 2)), (30.0, ())])
+def test_two_effects_that_only_hold_each_other_up_go_together(monkeypatch, together, needless):
+    """Each pays its penalty given the other two; 0 and 2 together do not."""
+    losses = {(0,): 40.0, (1,): 90.0, (2,): 25.0, (0, 1): 130.0, (0, 2): together, (1, 2): 120.0}
+    monkeypatch.setattr(own_noise, "_loss", lambda _fit, numbers, *_: losses[numbers])
+    monkeypatch.setattr(own_noise, "run_parallel", lambda works, *_: [work() for work in works])
+    fit = types.SimpleNamespace(model=types.SimpleNamespace(terms=(1, 2, 3), prepared=None))
+    assert needless_terms(fit, {}, Settings()) == needless
 
 
 def test_each_disturbance_of_a_fit_has_its_penalty():

@@ -1,5 +1,8 @@
 """The final step of generalised least squares."""
 
+import math
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,15 +16,15 @@ from tests.diagnosis.line import Line
 
 
 class Cliff(Line):
-    """A line that is finite at the fitted parameters only."""
+    """A line whose residual is this many times as large away from the fitted parameters."""
 
-    known = None
+    known, away = None, math.nan
 
     def residual(self, theta, changes):
         left = super().residual(theta, changes)
         if self.known is None or torch.equal(theta.detach(), self.known):
             return left
-        return left * torch.nan
+        return left * self.away
 
 
 def test_the_step_is_smaller_than_the_errors():
@@ -34,8 +37,10 @@ def test_the_step_is_smaller_than_the_errors():
     torch.testing.assert_close(found.fit.residual, found.fit.model.residual(found.fit.parameters))
 
 
-def test_a_step_to_a_residual_that_is_not_finite_is_rejected(monkeypatch):
+@pytest.mark.parametrize("away", [math.nan, 1.5])
+def test_a_step_to_a_worse_residual_is_rejected(monkeypatch, away):
     line = Cliff(600)
+    line.away = away
     fit = fitted(JointModel(line), line.start())
     monkeypatch.setattr("mkc_torch.diagnosis.search.estimate.tangents_of", tangents_before(line))
     found = estimate(fit, NoiseSettings())

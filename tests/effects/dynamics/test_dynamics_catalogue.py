@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.model.shapes import candidate_terms
 from mkc_torch.diagnosis.model.term import find_drivers
 from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import DYNAMICS
+from mkc_torch.effects.dynamics.overflow_into import OverflowInto
 from mkc_torch.simulation import Dynamics
 from tests.effects.contexts import dynamic_context, size_of
 
@@ -147,6 +148,14 @@ class TestPhysics:
     def test_overflow_acts_above_the_rim_only(self):
         assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=1.5) == pytest.approx([-1.0])
         assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=0.5) == [0.0]
+
+    def test_another_vessel_catches_a_part_of_an_overflow(self):
+        effect = OverflowInto()
+        context = dynamic_context(effect)
+        row = torch.tensor([{"speed": 1.5}.get(name, 0.0) for name in context.carries], dtype=torch.float64)
+        shape = {"rim": 1.0, "exponent": 2.0}
+        found = change(effect, [2.0, 0.4], shape, replace(context, signal=row.expand(N, -1)))
+        assert found[0].tolist() == pytest.approx([-0.5, 0.1])
 
     def test_exponents_of_overflow_and_stops(self):
         for lost, exponent in ((0.5, 1.0), (0.5**1.5, 1.5), (0.5**2.5, 2.5)):

@@ -383,7 +383,8 @@ class TestPorts:
         assert list(ports) == names
         both = ports["exchange of upper and lower"]
         assert (both.channels, both.kind, dict(both.parts)) == (
-            ("upper", "lower"), "exchange", {"own": "upper", "other": "lower"},
+            ("upper", "lower"), "exchange",
+            {"own": "upper", "other": "lower", "level": "upper", "other level": "lower"},
         )  # fmt: skip
         assert ports["rate of upper"].parts["level"] == "upper"
         assert ports["rate of upper"].unit == "m/s"
