@@ -132,7 +132,7 @@ def _advised(d: Diagnosis, start: str) -> list[str]:
 def _claimed_and_refused(d: Diagnosis) -> bool:
     """The advice is to correct for an effect and not to correct for it."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
-    corrected = set(re.split(", | for ", use)[1:])
+    corrected = set(re.split(" and | for ", use)[1:])
     refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
                for start in ("Do not correct", "Do not add") for item in _advised(d, start)]  # fmt: skip
     return bool(corrected.intersection(refused))
