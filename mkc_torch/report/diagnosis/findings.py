@@ -176,10 +176,13 @@ def acts_on(finding: Finding) -> str:
         >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, (), True, "")
         >>> acts_on(finding)
         "acts on x, y, z, the sensor's axes"
+        >>> acts_on(Finding("linear_drag", (), ("rate of speed",), (), None, "", "", (), 0.01, (), True, ""))
+        'acts on the rate of speed'
     """
     if not finding.channels:
         return ""
-    return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(finding.channels))
+    channels = [f"the {name}" if name.startswith("rate of ") else name for name in finding.channels]
+    return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(channels))
 
 
 def _and(each: Sequence[str]) -> str:
@@ -252,18 +255,15 @@ def shape(finding: Finding) -> str:
         >>> from mkc_torch.diagnosis.environment import ShapeCheck
         >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=ShapeCheck(1.2, 0.4))
         >>> shape(right)
-        'a free curve of the same variables is not clearly better (p = 0.4)'
+        'a free curve of the same variables gains only 1.20 nats (p = 0.4 if the name is right): the name is kept'
     """
     found = finding.shape
     if found is None:
         return ""
-    p = probability(found.p_value)
+    gain, p = size(max(found.free_curve_gain, 0.0)), probability(found.p_value)
     if found.curve is None:
-        return f"a free curve of the same variables is not clearly better ({p})"
-    return (
-        f"a free curve of the same variables at the same port gains {size(found.free_curve_gain)} "
-        f"nats ({p} if the name is right)"
-    )
+        return f"a free curve of the same variables gains only {gain} nats ({p} if the name is right): the name is kept"
+    return f"a free curve of the same variables at the same port gains {gain} nats ({p} if the name is right)"
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:

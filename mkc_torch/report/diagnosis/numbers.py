@@ -198,13 +198,13 @@ def largest(parameter: EffectParameter) -> str:
     Example:
         >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
         >>> largest(EffectParameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
-        'gradient up to ∂B_z/∂z: −1.06 ± 0.25 µT/m'
+        'gradient, largest ∂B_z/∂z: −1.06 ± 0.25 µT/m'
     """
     p = parameter
     if len(p.components) < _LONG:
         return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
     (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
-    return f"{parameter_name(p)} up to {_listed(p)[sizes.index(max(sizes))]}"
+    return f"{parameter_name(p)}, largest {_listed(p)[sizes.index(max(sizes))]}"
 
 
 def probability(value: float) -> str:
