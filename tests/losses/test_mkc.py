@@ -565,7 +565,7 @@ def test_parameters_of_the_density_are_recovered_from_samples():
         ({"sigma": torch.ones(2, 1)}, ValueError, r"`sigma` to be a number or of shape \(2,\) but got \(2, 1\)"),
         ({"sigma": INF}, ValueError, "finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0"),
         ({"sigma": torch.tensor([1.0, INF])}, ValueError, "finite `sigma` with `learn_sigma=True`"),
-        ({"d": "automatic"}, TypeError, "`d` to be a number, or a tensor of them, but got 'automatic'"),
+        ({"d": "automatic"}, TypeError, "`d` to be a number, a tensor of numbers or 'auto' but got 'automatic'"),
         ({"d": 0.0}, ValueError, r"`d` to be positive and finite but got 0\.0"),
         ({"d": INF}, ValueError, "`d` to be positive and finite"),
         ({"d": NAN}, ValueError, "`d` to be positive and finite"),
