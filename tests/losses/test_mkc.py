@@ -851,7 +851,7 @@ def test_data_that_are_not_tensors_are_refused_by_name(name, value):
 
 def test_a_missing_channel_dimension_is_refused_with_a_remedy():
     flat, column = torch.zeros(1000), torch.zeros(1000, 1)
-    with pytest.raises(ValueError, match=r"1 channels.*got \(1000,\);.*unsqueeze\(-1\)"):
+    with pytest.raises(ValueError, match=r"1 channel in.*got \(1000,\);.*unsqueeze\(-1\)"):
         MKCLoss(1)(flat, flat)
     with pytest.raises(ValueError, match=r"\(1000, 1\) and \(1000,\); unsqueeze\(-1\) the target"):
         MKCLoss(1)(column, flat)
