@@ -59,7 +59,7 @@ PAIRS = (
     Pair("varies between blocks by more", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
     Pair("not measured", r"nats per sample", "row"),
     # two sizes of the same name: of an output, robust, and of the fit's samples
-    Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
+    Pair(r"held-out blocks rms of the residual", r"→.*\), noise floor", "report"),
     # what is missing
     Pair("[Nn]o missing physics", CLAIM, "report"),
     Pair("[Nn]o missing physics", "[Nn]earest in the catalogue", "report"),
