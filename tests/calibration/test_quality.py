@@ -35,7 +35,7 @@ def test_bursts_shorter_than_half_a_second_are_no_disturbance(calibration):
     assert disturbances(changed) == rows[1:]
 
 
-def test_the_headline_says_that_it_counts_long_disturbances_only(calibration):
+def test_the_headline_counts_long_disturbances_and_states_their_length(calibration):
     long = tuple(RejectedInterval(10.0 * k, 10.0 * k + 2.0) for k in range(5))
     short = RejectedInterval(70.0, 70.2)
     verdicts = [

@@ -167,7 +167,7 @@ def test_two_drifts_of_an_output_share_a_sentence_and_have_numbered_headings():
     assert "Drift of angle , part 2 of 2" in text
 
 
-def test_a_shape_that_is_kept_is_not_called_worse_beside_a_small_p_value():
+def test_a_shape_that_is_kept_at_a_small_p_value_has_a_reason():
     kept = ShapeCheck(5.2, 0.0055)
     made = with_first(make_diagnosis(1, samples=200), lambda finding: dataclasses.replace(finding, shape=kept))
     text = text_of(diagnosis_report(made))
