@@ -212,6 +212,7 @@ PYTHON: dict[str, Callable[[], Any]] = {
     "`EllipsoidFit().fit(points.T)`": lambda: EllipsoidFit().fit(ONES.mT),
     "`EllipsoidFit().fit(points)`, eight of them": lambda: EllipsoidFit().fit(ONES[:8]),
     "`EllipsoidFit().fit(points)`, all equal": lambda: EllipsoidFit().fit(ONES),
+    "`EllipsoidFit().fit(points)` of 1e200": lambda: EllipsoidFit().fit(1e200 * TALL),
     "`fit(residual, start)`, a start of NaN": lambda: fit(
         lambda theta, data: data - theta, torch.tensor([math.nan]), data=ONES[:, :1]
     ),

@@ -108,7 +108,7 @@ def as_numbers(
             return torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise TypeError(
-                f"Expected argument `{name}` to be a number, or a tensor of them, but got {format_value(value)}."
+                f"Expected argument `{name}` to be a number or a tensor of numbers but got {format_value(value)}."
             ) from None
     refuse_complex(name, value)
     return value

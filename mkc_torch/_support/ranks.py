@@ -21,11 +21,11 @@ class RanksError(RuntimeError):
 
 
 class Ranks:
-    """The processes of a ``torch.distributed`` group, or this one alone.
+    """The processes of a ``torch.distributed`` group, or this process alone.
 
-    Every method returns on all ranks or raises on all ranks: before a result is used, the ranks exchange whether they
-    have a result. With gloo, a process that ends closes its connections, so the others raise at once. A process that
-    hangs, and any failure with nccl, is detected after the timeout of the group.
+    Every method returns on all ranks or raises on all ranks: the ranks exchange their errors before a result is used.
+    With gloo, a process that ends closes its connections, so the others raise at once. A process that hangs, and any
+    failure with nccl, is detected after the timeout of the group.
 
     Args:
         group: a ``torch.distributed`` group; None is the default group if it is initialised, else this process alone.
@@ -41,7 +41,9 @@ class Ranks:
         self.size = 1 if self.alone else dist.get_world_size(group)
         self.rank = 0 if self.alone else dist.get_rank(group)
         if self.rank < 0:
-            raise ValueError("Expected argument `group` to be one that this process is a member of.")
+            raise ValueError(
+                "Expected argument `group` to contain this process; call it on the ranks of the group only."
+            )
 
     def sum_of(self, work: Callable[[], Float64[Tensor, " k"]], length: int) -> Float64[Tensor, " k"]:
         """The elementwise sum over the ranks of the results of ``work``.

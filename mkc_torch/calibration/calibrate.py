@@ -270,8 +270,8 @@ def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_sha
     if rejected_share > MAX_REJECTED:
         warnings.append(
             f"{100.0 * rejected_share:.0f} % of the samples do not fit the ellipsoid: the sensor's offset may have "
-            "changed during the recording, or a magnetic object was near for long. `mkc diagnose` reports what changed "
-            "and when; or record again away from the object, or calibrate the parts of the recording separately."
+            "changed during the recording, or a magnetic object was near for a long time. `mkc diagnose` reports what "
+            "changed and when. Record again away from the object, or calibrate the parts of the recording separately."
         )
     scatter = float(robust_scale(residual.unsqueeze(-1))) / float(fit.radius_)
     if scatter > MUCH_SCATTER:
@@ -305,11 +305,11 @@ def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
     worst = 100.0 * float((torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_).max())
     known = f"to {worst:.1g} % of the radius" if worst < math.inf else "with unknown accuracy"
     if found.information >= ENOUGH_INFORMATION:
-        means = f"The others determine offset and semi-axes {known}, so the calibration is still valid"
+        means = f"The covered directions determine offset and semi-axes {known}, so the calibration is still valid"
     else:
         means = (
-            f"The others determine offset and semi-axes {known}, if nothing changed meanwhile: the worst-determined "
-            f"combination is {found.information**-0.5:.1g} times less accurate than from all directions, and "
-            "disturbances have that much more influence"
+            f"The covered directions determine offset and semi-axes {known}, if nothing changed during the recording. "
+            f"Their least determined combination is {found.information**-0.5:.1g} times less accurate than from all "
+            "directions, and disturbances have that much more influence"
         )
     return f"{NOT_COVERED}: {missing}. {means}. To be sure, turn the sensor so that the field points there too."

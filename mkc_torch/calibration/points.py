@@ -50,7 +50,18 @@ def prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tens
             f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
             f"({int((~finite).sum())} such values); drop those points."
         )
-    if weight is None:
-        return points, None
-    first_used = (weight > 0).to(torch.int64).argmax(-1)[..., None, None].expand(*points.shape[:-2], 1, 3)
-    return torch.where((weight > 0).unsqueeze(-1), points, points.gather(-2, first_used)), weight
+    if weight is not None:
+        first_used = (weight > 0).to(torch.int64).argmax(-1)[..., None, None].expand(*points.shape[:-2], 1, 3)
+        points = torch.where((weight > 0).unsqueeze(-1), points, points.gather(-2, first_used))
+    _refuse_magnitude(points)
+    return points, weight
+
+
+def _refuse_magnitude(points: Tensor) -> None:
+    """Raise an error if squared distances between the points would overflow or underflow."""
+    most, limit = float(points.detach().abs().max()), 0.1 * float(torch.finfo(points.dtype).max) ** 0.5
+    if most > limit or 0.0 < most < 1.0 / limit:
+        raise ValueError(
+            f"Expected argument `points` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {points.dtype} "
+            f"but got {most:.3g}; choose another unit."
+        )

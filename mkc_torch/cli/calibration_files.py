@@ -140,6 +140,11 @@ def _refuse_for_one(path: Path, request: CalibrationRequest, names: list[str]) -
             )
 
 
+def _holds_only_a_refusal(folder: Path, report: Path) -> bool:
+    """Whether a folder holds nothing but the report of a refused recording, which the next attempt may replace."""
+    return folder.is_dir() and list(folder.iterdir()) == [report] and "not identifiable" in report.read_text("utf-8")
+
+
 def _calibrate(
     path: Path,
     folder: Path,
@@ -165,6 +170,7 @@ def _calibrate(
     if request.old_file is not None and result.exists() and result.samefile(request.old_file):
         raise ValueError(f"--output would replace {result}, which --compare-with reads; choose another.")
     files = (report.name, result.name, *(EXPORTS[kind].file for kind in request.exports))
+    force = force or _holds_only_a_refusal(folder, report)
     claim_folder(folder, overwrite=force, files=files)
     with folder_written(folder):
         try:

@@ -33,6 +33,8 @@ _NOT_MEASURED = ("time", "experiment")
 _OTHER_LENGTH = 1.15
 """Ratio of field lengths, up or down, beyond which a recording is suspected to be of another unit or place."""
 
+_GIVE = "give a calibration.json of `mkc calibrate` or a model.json of `mkc diagnose`"
+
 
 def write_correction(
     recording: Path, output: Path, table: Recording, corrected: Corrected, *, topic: int = 0, force: bool
@@ -126,7 +128,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f"this is neither a calibration nor a model: it is not JSON ({error}).") from None
+        raise ValueError(f"this is neither a calibration nor a model: it is not JSON ({error}); {_GIVE}.") from None
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema == calibration_file.SCHEMA:
         return Calibration.from_json(text)
@@ -137,10 +139,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
     if schema == diagnosis_file.SCHEMA:
         raise ValueError("this is a diagnosis.json; give the model.json in the same folder.")
     found = "missing" if schema is None else json.dumps(schema)
-    raise ValueError(
-        f"this is neither a calibration nor a model: its schema is {found}; give a calibration.json of `mkc calibrate` "
-        "or a model.json of `mkc diagnose`."
-    )
+    raise ValueError(f"this is neither a calibration nor a model: its schema is {found}; {_GIVE}.")
 
 
 def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:

@@ -44,10 +44,11 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path], paths: top.R
         if len(d.findings) > 1:
             console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
-    console.print(_facts(_of_all(d, paths, console.width - _LABEL - 3)))
-    for file in files:
-        # outside the table, so that a long path is not broken and can be copied
-        console.print(Text.assemble(f"{'written':<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
+    console.print(_facts(_of_all(d, console.width - _LABEL - 3)))
+    # outside the table, so that a command or a long path is not broken and can be copied
+    command = top.apply_command(d, paths)
+    for label, text in [*([("to do", command)] if command else []), *(("written", str(file)) for file in files)]:
+        console.print(Text.assemble(f"{label:<{_LABEL + 3}}", (text, "cyan")), soft_wrap=True)
 
 
 def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
@@ -84,7 +85,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
     lines = [line for p in f.parameters for line in numbers.named_lines(p, f.channels)]
     if len(lines) > _MOST_LINES:
         lines = [numbers.largest(p) for p in f.parameters[:_MOST_LINES]]
-        lines.append("and more, see the report")
+        lines.append("further parameters: see the report")
     if lines:
         yield "size", "\n".join(lines)
     acts = f"; {sentences.acts_on(f)}" if f.channels else ""
@@ -114,11 +115,11 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield _striking("doubtful"), typeset(f.plausibility) or "no plausible size"
 
 
-def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Iterator[tuple[str, str]]:
+def _of_all(diagnosis: Diagnosis, width: int) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
         for change in unseen.residual_of_all(d):
-            yield "together", f"{change} on held-out data"
+            yield "together", f"on held-out data: {change}"
     if not d.findings and d.verdict != "unfit":
         evidence = numbers.evidence(d.p_value, d.surrogates)
         tried = f"{d.candidates_tried:,}"
@@ -132,9 +133,6 @@ def _of_all(diagnosis: Diagnosis, paths: top.RunPaths | None, width: int) -> Ite
         yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield "to do", sentence
-    command = top.apply_command(d, paths)
-    if command:
-        yield "to do", command
     for _, warning in warning_rows(top.warned(d), _REPORT):
         yield _striking("warning"), warning
     yield from note_rows([plain(note) for note in d.notes], _REPORT, width)

@@ -49,7 +49,8 @@ def doctor() -> None:
 
         from mkc_torch import __version__
     typer.echo(f"mkc_torch  {__version__}, Python {platform.python_version()}, {platform.system()}")
-    typer.echo(f"torch      {torch.__version__}, {torch.get_num_threads()} threads, {_devices()}")
+    threads = torch.get_num_threads()
+    typer.echo(f"torch      {torch.__version__}, {threads} thread{'' if threads == 1 else 's'}, {_devices()}")
     for extra in EXTRAS:
         missing = [package for package in extra.packages if not _installed(package)]
         state = "installed" if not missing else f"missing {', '.join(missing)}"

@@ -1,4 +1,4 @@
-"""The normaliser of a few channels in NumPy: for few numbers, torch's overhead per call dominates."""
+"""The normaliser of the density in NumPy, for a few channels, where torch's overhead per call would dominate."""
 
 from __future__ import annotations
 

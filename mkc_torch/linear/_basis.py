@@ -20,7 +20,15 @@ class RankDeficientError(ValueError):
 
 
 def orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Basis, and the matrix that maps its coefficients to those of the columns of X, on the samples in use."""
+    """Return an orthonormal basis of the columns of X, and the matrix from its coefficients to those of X.
+
+    Args:
+        X: (*, N, m, n).
+        weight: weights (*, N, m); the basis is orthonormal over the samples whose weight is positive.
+
+    Raises:
+        RankDeficientError: columns are linearly dependent on these samples.
+    """
     rows = X.flatten(-3, -2)
     used = rows
     if weight is not None and rows.shape[0] == weight.shape[:-2].numel():

@@ -90,13 +90,20 @@ class ChannelDensity(nn.Module):
             self._set_d(d)
 
     def _per_channel(self, name: str, value: object, *, low: float) -> Tensor:
+        if isinstance(value, str) and name in ("d", "bound"):
+            raise TypeError(
+                f"Expected argument `{name}` to be a number, a tensor of numbers or 'auto' but got {value!r}."
+            )
         (t,) = as_computed(as_numbers(name, value).detach())
         if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
             raise ValueError(
-                f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got {tuple(t.shape)}"
+                f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got "
+                f"{tuple(t.shape)}; pass one number for each channel, or a single number for all."
             )
         if not bool(((t > low) & torch.isfinite(t)).all()):
-            raise ValueError(f"Expected argument `{name}` to be positive and finite but got {value}.")
+            raise ValueError(
+                f"Expected argument `{name}` to be positive and finite but got {value}; its unit is that of the target."
+            )
         return t.expand(self.num_channels).clone()
 
     def _sigma_in_range(self, value: float | Tensor) -> Tensor:

@@ -114,7 +114,10 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         impl: Implementation = "auto",
     ) -> None:
         if isinstance(num_channels, bool) or not isinstance(num_channels, int) or num_channels < 1:
-            raise ValueError(f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}.")
+            raise ValueError(
+                f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}; it is the number "
+                "of outputs, the size of the input along `channel_dim`."
+            )
         refuse_other_reduction(reduction)
         refuse_no_dimension(-1 if channel_dim is None else channel_dim)
         learned = learn_sigma or learn_d
@@ -322,7 +325,8 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             if input.dim() > 2 and input.shape[1] == m:
                 fix = "; give the loss `channel_dim=1` where the channels are the second dimension, (N, C, ...)"
             raise ValueError(
-                f"Expected {m} channels in dimension {self.channel_dim} but got {tuple(input.shape)}{fix}."
+                f"Expected {m} channel{'' if m == 1 else 's'} in dimension {self.channel_dim} but got "
+                f"{tuple(input.shape)}{fix}."
             )
         if not self._named_dim and input.dim() > 3 and input.shape[1] == m:
             raise ValueError(

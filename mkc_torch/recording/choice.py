@@ -113,10 +113,14 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
     )
 
 
+_COUNTERS = {"experiment", "run", "sample", "row", "index", "id"}
+"""Names of columns that number rows or runs."""
+
+
 def _example(topics: Sequence[Topic]) -> dict[str, str]:
-    """Three columns of the first table that are neither a time nor another sensor, by axis; empty if there are none."""
+    """Three columns of the first table that are no time, no counter and no other sensor, by axis; else empty."""
     for topic in topics:
-        names = [name for name in topic.table.names if name and meaning(name) is None]
+        names = [n for n in topic.table.names if n and meaning(n) is None and n.casefold() not in _COUNTERS]
         if len(names) >= len(_MAG):
             return dict(zip(_MAG, names, strict=False))
     return {}

@@ -227,7 +227,7 @@ def _add_runs(
     more = f" and {len(begins) - _SHOWN} more" if len(begins) > _SHOWN else ""
     what = "The time starts again" if clock is not None else "There is no time, and the header is repeated"
     count = counted(len(begins) + 1, "run")
-    warnings.append(Note(f"{what} at {rows}{more}: {count}, numbered in the column `{EXPERIMENT}`."))
+    warnings.append(Note(f"{what} at {rows}{more}: {count}, numbered in an added column, `{EXPERIMENT}`."))
     return warnings
 
 

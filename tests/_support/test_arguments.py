@@ -47,7 +47,7 @@ def test_as_numbers_accepts_tensors_sequences_and_arrays():
         assert as_numbers("x", value, torch.float64).tolist() == [1.0, 2.0]
     assert as_numbers("x", 2).dtype == torch.get_default_dtype()
     for value in ("a", None, 1j, [[1.0], [1.0, 2.0]], torch.nn.Linear, 10**400):
-        with pytest.raises(TypeError, match="`x` to be a number, or a tensor of them, but got "):
+        with pytest.raises(TypeError, match="`x` to be a number or a tensor of numbers but got "):
             as_numbers("x", value)
 
 

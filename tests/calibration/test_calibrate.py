@@ -280,7 +280,7 @@ def test_a_warning_of_missing_directions_states_whether_the_result_is_valid():
     (warning,) = calibrate(recorded(small)).warnings
     assert re.search(r"semi-axes to 0\.0\d % of the radius, so the calibration is still valid", warning)
     (warning,) = calibrate(recorded(large)).warnings
-    assert "if nothing changed meanwhile" in warning
+    assert "if nothing changed during the recording" in warning
     assert "holds all the same" not in warning
 
 

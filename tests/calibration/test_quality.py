@@ -8,6 +8,7 @@ from mkc_torch.calibration.plain_values import ResidualSpread
 from mkc_torch.calibration.quality import disturbances, doubts
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.disturbance import RejectedInterval
+from mkc_torch.report.words.verdict import calibration_verdict
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,16 @@ def test_bursts_shorter_than_half_a_second_are_no_disturbance(calibration):
     rows = (RejectedInterval(10.0, 30.0), RejectedInterval(100.0, 140.0))
     changed = dataclasses.replace(calibration, disturbed=rows, disturbed_unit="row")
     assert disturbances(changed) == rows[1:]
+
+
+def test_the_headline_counts_long_disturbances_and_states_their_length(calibration):
+    long = tuple(RejectedInterval(10.0 * k, 10.0 * k + 2.0) for k in range(5))
+    short = RejectedInterval(70.0, 70.2)
+    verdicts = [
+        calibration_verdict(dataclasses.replace(calibration, disturbed=each)) for each in (long, (*long, short))
+    ]
+    assert "Disturbed in 5 intervals, the longest" in verdicts[0]
+    assert "Disturbed in 5 intervals of at least 0.5 s, the longest" in verdicts[1]
 
 
 def test_notes_of_the_recording_are_kept_apart_from_warnings_in_the_file():

@@ -299,6 +299,9 @@ def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "not identifiable" in page
     assert "+z" in page
+    refused(
+        mkc("calibrate", path, "--output", tmp_path), "Not identifiable"
+    )  # a refusal does not block another attempt
 
 
 @pytest.mark.e2e

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region
+from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section
 from tests.diagnosis.factory import (
     graded,
@@ -22,10 +23,10 @@ from tests.diagnosis.factory import (
 )
 
 
-def shown(diagnosis, files=(), *, width=100, terminal=False):
+def shown(diagnosis, files=(), *, width=100, terminal=False, paths=None):
     stream = io.StringIO()
     console = Console(file=stream, width=width, force_terminal=terminal, highlight=False)
-    show(console, diagnosis, [Path(file) for file in files])
+    show(console, diagnosis, [Path(file) for file in files], paths)
     return stream.getvalue()
 
 
@@ -50,7 +51,7 @@ def test_a_finding_in_a_dozen_lines():
         "unexplained nothing",
         "or current field (current): this recording cannot distinguish",
         "compare a smooth correction by all recorded columns and by time reaches",
-        "noise autoregressive: noise with a memory",
+        "noise noise with a memory",
         "If it is hard-iron step: look for what changed at that time; use the calibration from after the step.",
         "to do To distinguish hard-iron step from current field (current), record again: a step does not come",
         "The model found here corrects for hard-iron step: confirm it on a second recording.",
@@ -77,6 +78,12 @@ def test_nothing_found():
     assert "to do The simulation can be used" in text
 
 
+def test_a_command_is_not_broken_so_that_it_can_be_copied():
+    paths = top.RunPaths(f"/data/{'long_' * 30}.csv", "results/model.json", ())
+    text = shown(make_diagnosis(1), paths=paths)
+    assert any(f"mkc apply results/model.json {paths.recording} --output" in line for line in text.splitlines())
+
+
 def test_several_findings_are_numbered():
     text = shown(make_diagnosis(3))
     for line in (
@@ -86,7 +93,7 @@ def test_several_findings_are_numbered():
     ):
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
-    assert "together residual" in flat(text)
+    assert "together on held-out data: residual" in flat(text)
     assert "−0.0004 to 0.0046) Blocks of 4 s with gaps of 1 s." in flat(text)
     assert text.count("0 is no improvement") == 1
 
@@ -148,7 +155,7 @@ def test_a_long_list_of_numbers_shows_its_largest():
     text = flat(
         shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
     )
-    assert "size gradient up to c: 3.00 ± 0.10 µT/m and more, see the report" in text
+    assert "size gradient, largest c: 3.00 ± 0.10 µT/m further parameters: see the report" in text
 
 
 def answers(diagnosis):

@@ -124,7 +124,7 @@ def test_a_dynamics_diagnosis_reads_well(tank):
     for words in FOREIGN:
         assert words not in result.stdout
         assert words not in page
-    assert "acts on rate of level" in result.stdout
+    assert "acts on the rate of level" in result.stdout
     assert "Tank" in page
 
 

@@ -135,7 +135,7 @@ def test_a_coverage_below_one_is_refused(kind):
         (lambda: LeastEntropyLike([1.0]), TypeError, r"`start` .* got list; .*torch\.as_tensor\(start\)"),
         (lambda: LeastEntropyLike(torch.tensor([NAN])), ValueError, "`start` of finite values .* got NaN or infinity"),
         (lambda: LeastEntropyLike(starts=torch.ones(3)), ValueError, r"`starts` .* \(\*, S, n\) but got \(3,\)"),
-        (lambda: MinimumEntropy(bandwidth="a"), TypeError, "`bandwidth` to be a number, or a tensor of them"),
+        (lambda: MinimumEntropy(bandwidth="a"), TypeError, "`bandwidth` to be a number or a tensor of numbers"),
         (lambda: GeneralizedMaximumEntropy("a"), TypeError, "`coef_support` to be a number positive and finite"),
         (lambda: GeneralizedMaximumEntropy([-1.0, 1.0]), TypeError, r"torch\.as_tensor\(coef_support\)"),
         (lambda: GeneralizedMaximumEntropy(1.0, "a"), TypeError, "`error_support` to be a number"),

@@ -565,7 +565,7 @@ def test_parameters_of_the_density_are_recovered_from_samples():
         ({"sigma": torch.ones(2, 1)}, ValueError, r"`sigma` to be a number or of shape \(2,\) but got \(2, 1\)"),
         ({"sigma": INF}, ValueError, "finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0"),
         ({"sigma": torch.tensor([1.0, INF])}, ValueError, "finite `sigma` with `learn_sigma=True`"),
-        ({"d": "automatic"}, TypeError, "`d` to be a number, or a tensor of them, but got 'automatic'"),
+        ({"d": "automatic"}, TypeError, "`d` to be a number, a tensor of numbers or 'auto' but got 'automatic'"),
         ({"d": 0.0}, ValueError, r"`d` to be positive and finite but got 0\.0"),
         ({"d": INF}, ValueError, "`d` to be positive and finite"),
         ({"d": NAN}, ValueError, "`d` to be positive and finite"),
@@ -851,7 +851,7 @@ def test_data_that_are_not_tensors_are_refused_by_name(name, value):
 
 def test_a_missing_channel_dimension_is_refused_with_a_remedy():
     flat, column = torch.zeros(1000), torch.zeros(1000, 1)
-    with pytest.raises(ValueError, match=r"1 channels.*got \(1000,\);.*unsqueeze\(-1\)"):
+    with pytest.raises(ValueError, match=r"1 channel in.*got \(1000,\);.*unsqueeze\(-1\)"):
         MKCLoss(1)(flat, flat)
     with pytest.raises(ValueError, match=r"\(1000, 1\) and \(1000,\); unsqueeze\(-1\) the target"):
         MKCLoss(1)(column, flat)

@@ -99,6 +99,10 @@ BAD = {
         "time,speed\n0,1\n1,2\n",
         "no magnetometer is recognised among `time`, `speed`; it needs three columns",
     ),
+    "a counter of runs is no axis": (
+        "run,time,angle,torque\n1,0,1,2\n1,1,3,4\n",
+        "no magnetometer is recognised among `run`, `time`, `angle`, `torque`; it needs three columns",
+    ),
     "three that may be one": (
         "time,ux,uy,uz\n0,1,2,3\n1,2,3,4\n",
         "no magnetometer is recognised.*`--columns mag_x=ux,mag_y=uy,mag_z=uz`",

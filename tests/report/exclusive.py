@@ -59,7 +59,7 @@ PAIRS = (
     Pair("varies between blocks by more", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
     Pair("not measured", r"nats per sample", "row"),
     # two sizes of the same name: of an output, robust, and of the fit's samples
-    Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
+    Pair(r"held-out blocks rms of the residual", r"→.*\), noise floor", "report"),
     # what is missing
     Pair("[Nn]o missing physics", CLAIM, "report"),
     Pair("[Nn]o missing physics", "[Nn]earest in the catalogue", "report"),
@@ -132,7 +132,7 @@ def _advised(d: Diagnosis, start: str) -> list[str]:
 def _claimed_and_refused(d: Diagnosis) -> bool:
     """The advice is to correct for an effect and not to correct for it."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
-    corrected = set(re.split(", | for ", use)[1:])
+    corrected = set(re.split(" and | for ", use)[1:])
     refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
                for start in ("Do not correct", "Do not add") for item in _advised(d, start)]  # fmt: skip
     return bool(corrected.intersection(refused))

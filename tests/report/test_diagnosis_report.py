@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.result import (
     SmoothCorrection,
     StateMap,
 )
-from mkc_torch.report.diagnosis import noise, numbers
+from mkc_torch.report.diagnosis import noise, numbers, pictures
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section, Table
 from mkc_torch.report.diagnosis.page import bars, diagnosis_report, heat_map
@@ -34,6 +34,13 @@ from tests.report.test_calibration_report import parsed, text_of
 
 def page_of(findings=1, **options):
     return diagnosis_report(make_diagnosis(findings, **({"samples": 600} | options)))
+
+
+def test_a_small_residual_after_the_findings_has_a_scale_of_its_own():
+    made = make_diagnosis(1, samples=600)
+    small = dataclasses.replace(made.traces, after=0.01 * made.traces.after)
+    assert "enlarged" not in pictures.over_time(made)
+    assert "After, norm, enlarged" in pictures.over_time(dataclasses.replace(made, traces=small))
 
 
 def first_changed(diagnosis, *said, **changes):
@@ -119,7 +126,8 @@ def test_inseparable_rivals_are_in_the_headline():
     assert "hard-iron step or current field (current), which this recording cannot distinguish." in text
     assert "current field (current) 1.30 no" in text
     assert "not distinguished from finding 1" in text
-    assert "Left out of the simulation: hard-iron step, or a rival; current field (current)." in text_of(page_of(3))
+    headline = "Left out of the simulation: hard-iron step, or an alternative; current field (current)."
+    assert headline in text_of(page_of(3))
 
 
 def test_an_unexplained_diagnosis_reports_the_remaining_structure():

@@ -10,6 +10,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from mkc_torch.diagnosis.environment import ShapeCheck
 from mkc_torch.diagnosis.evidence import prediction
 from mkc_torch.diagnosis.result import DivergedBlock, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis import environment, unseen
@@ -153,6 +154,24 @@ def test_drift_of_a_sensor_is_reported_as_drift():
     assert "A drift of angle adds to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
+
+
+def test_two_drifts_of_an_output_share_a_sentence_and_have_numbered_headings():
+    slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad", correlation_time=29.0)
+    fast = dataclasses.replace(slow, correlation_time=1.5)
+    drifts = tuple(make_forcing(200, process) for process in (slow, fast))
+    text = text_of(diagnosis_report(disturbed(process_noise=(slow, fast), disturbance=drifts)))
+    assert text.count("in addition to its white noise") == 1
+    assert "correlation time 29 s; and" in text
+    assert "Drift of angle , part 1 of 2" in text
+    assert "Drift of angle , part 2 of 2" in text
+
+
+def test_a_shape_that_is_kept_at_a_small_p_value_has_a_reason():
+    kept = ShapeCheck(5.2, 0.0055)
+    made = with_first(make_diagnosis(1, samples=200), lambda finding: dataclasses.replace(finding, shape=kept))
+    text = text_of(diagnosis_report(made))
+    assert "gains only 5.20 nats (p = 0.0055 if the name is right): the name is kept" in text
 
 
 def test_an_effect_of_the_wrong_shape_is_only_nearest_and_its_curve_is_drawn():

@@ -15,7 +15,7 @@ from mkc_torch.calibration.aided.evidence import FittedResponse
 from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
 from mkc_torch.calibration.aided.length_model import LengthModel
 from mkc_torch.calibration.aided.misfit import robust_size
-from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
+from mkc_torch.calibration.aided.mounting import mounting, nearest_rotation, without_exchange
 from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, PlaceField
 from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.aided.select_response import SelectedResponse, select_response
@@ -309,10 +309,10 @@ def _result(
 
 def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...]:
     """A warning about exchanged axes of the magnetometer, or a note on axes that the matrix turns back."""
-    sentence, response = exchanged(best.model.response(best.fit.theta), by)
+    sentence, response = without_exchange(best.model.response(best.fit.theta), by)
     if sentence:
         return (f"{sentence} The matrix corrects this: the corrected field is in the axes of the {by}.",)
-    angle, axis = turned_by(response)
+    angle, axis = nearest_rotation(response)
     sure = math.degrees(float(spread[6:].square().mean().sqrt()))
     if best.model.name != "full matrix" or angle < max(MISALIGNED, 3.0 * sure):
         return ()

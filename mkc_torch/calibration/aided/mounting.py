@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 EXPLAINED = 0.08
-"""Largest residual per axis, as a share of the field, of correct axes: twice that of soft iron of 10 %."""
+"""Residual per axis, as a share of the field, below which the recorded axes are right: twice that of 10 % soft iron."""
 
-HALVES = 0.5
-"""Largest residual of reported other axes, as a share of the residual with the recorded axes."""
+IMPROVEMENT = 0.5
+"""Residual with other axes, as a share of that with the recorded axes, below which the other axes are reported."""
 
 _AXES = "xyz"
 
@@ -29,21 +29,22 @@ class Mounting(NamedTuple):
 
     Attributes:
         sentence: the probable fault.
-        left: residual per axis with the recorded axes, in the field's unit.
+        recorded: residual per axis with the recorded axes, in the field's unit.
         corrected: residual per axis with the corrected axes, in the field's unit.
     """
 
     sentence: str
-    left: float
+    recorded: float
     corrected: float
 
 
 def mounting(
     field: Float[Tensor, "N 3"], turns: Turns, stretch: Int[Tensor, " N"], length: float, by: str
 ) -> Mounting | None:
-    """Find axes of a magnetometer that explain how its field turns; None if its own axes do, or no axes do.
+    """Find exchanged axes or signs of a magnetometer; None if its own axes fit, or if no exchange fits.
 
-    This selects, of the 48 ways to exchange axes and signs, the way with the smallest residual of a constant field.
+    Turned back by the body's rotation, the field must be constant. Of the 48 exchanges of axes and signs, the exchange
+    with the smallest residual is selected.
 
     Args:
         field: measured field with any constant offset.
@@ -72,19 +73,19 @@ def mounting(
         "The magnetometer's x and y seem exchanged."
     """
 
-    def left(points: Tensor) -> float:
+    def residual(points: Tensor) -> float:
         if turns.vertical is None:
             return misfit_of_gyroscope(points, turns.to_frame, turns.window, stretch)
         return misfit_of_attitude(points, turns.to_frame, stretch)
 
-    own = left(field)
+    own = residual(field)
     if own < EXPLAINED * length:
         return None
     ways = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
-    tried = [(left(field[:, list(order)] * field.new_tensor(signs)), order, signs) for order, signs in ways]
+    tried = [(residual(field[:, list(order)] * field.new_tensor(signs)), order, signs) for order, signs in ways]
     # without tilts a rotation about the axis fits equally well: choose the simplest with about the smallest residual
     least = min(trial[0] for trial in tried)
-    if not least < HALVES * own:
+    if not least < IMPROVEMENT * own:
         return None
     plain = [trial for trial in tried if trial[0] <= 1.2 * least]
     best = min(plain, key=lambda trial: (sum(k != j for k, j in enumerate(trial[1])), sum(s < 0 for s in trial[2])))
@@ -106,15 +107,20 @@ def _sentence(order: tuple[int, ...], signs: tuple[float, ...], by: str) -> str:
     return f"The magnetometer's axes seem to differ from the {by}'s, of which {axes}."
 
 
-def exchanged(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Float[Tensor, "3 3"]]:
-    """A sentence about exchanged axes and signs in a response, empty without any, and the response without them.
+def without_exchange(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Float[Tensor, "3 3"]]:
+    """Remove exchanged axes and signs from a response.
+
+    Returns:
+        A sentence about the exchange, empty if there is none, and the response without it.
 
     Args:
         response: response from the field in the axes of a gyroscope or attitude to the magnetometer's axes.
         by: "gyroscope" or "attitude", for the sentence.
 
     Example:
-        >>> sentence, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), "gyroscope")
+        >>> sentence, rest = without_exchange(
+        ...     torch.tensor([[0.1, 9.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), "gyroscope"
+        ... )
         >>> sentence, rest[0].tolist()
         ("The magnetometer's x and y seem exchanged.", [9.0, 0.0, 0.0])
     """
@@ -126,11 +132,11 @@ def exchanged(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Float[Tenso
     return "" if plain else _sentence(order, signs, by), chosen * chosen.new_tensor(signs)[:, None]
 
 
-def turned_by(response: Float[Tensor, "3 3"]) -> tuple[float, Float[Tensor, " 3"]]:
+def nearest_rotation(response: Float[Tensor, "3 3"]) -> tuple[float, Float[Tensor, " 3"]]:
     """Angle in ° and axis of the rotation that is nearest to a matrix.
 
     Example:
-        >>> angle, axis = turned_by(torch.tensor([[0.0, -2.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]).double())
+        >>> angle, axis = nearest_rotation(torch.tensor([[0.0, -2.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]).double())
         >>> round(angle), axis.tolist()
         (90, [0.0, 0.0, 1.0])
     """

@@ -59,7 +59,7 @@ def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
     advice += _of_what_remains(d)
     use = [_called(f, d) for f in d.findings if transfers(f)]
     if use:
-        advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
+        advice.append(f"The model found here corrects for {' and '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
 
 
@@ -91,9 +91,8 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
 def _find_disturbance(process: ProcessNoise) -> str:
     size = f"{process.size:.2g} {tidy(process.unit)}".rstrip()
     return (
-        f"Look for the cause of the disturbance of the rate of `{process.place}` in its figure, and record it. Until "
-        f"then, use "
-        f"{size} as the process noise of that rate, for example in a filter."
+        f"Look for the cause of the disturbance of the rate of `{process.place}`, with the help of its figure, and "
+        f"record the cause. Until then, use {size} as the process noise of that rate, for example in a filter."
     )
 
 

@@ -53,11 +53,13 @@ def rejected_warnings(intervals: Sequence[RejectedInterval]) -> tuple[str, ...]:
     found = sorted(intervals, key=_length, reverse=True)
     if not found:
         return ()
-    text = ", ".join(f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED]))
+    text = " and ".join(
+        f"from {interval.start:.1f} to {interval.end:.1f} s" for interval in sorted(found[:_MOST_LISTED])
+    )
     more = f" and in {len(found) - _MOST_LISTED} shorter intervals" if len(found) > _MOST_LISTED else ""
     return (
-        f"Most samples were rejected {text}{more}. A disturbance of the measurement that no effect explains, such as a "
-        "passing object or a burst of outliers.",
+        f"Most samples were rejected {text}{more}. The cause is a disturbance of the measurement that no effect "
+        "explains, such as a passing object or a burst of outliers.",
     )
 
 

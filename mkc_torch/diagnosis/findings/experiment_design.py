@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-SAME = "They are identical in this recording: a recording in which they differ can distinguish them."
+SAME = "In this recording their effects are equal within the noise: only a recording in which they differ helps."
 
 _NOTHING = 0.05
 """Expected gain in nats below which no similar recording distinguishes two effects."""

@@ -163,15 +163,15 @@ def _lagged(series: Float[Tensor, "k N"]) -> Float[Tensor, "k N"]:
 
 
 def _sentences(process: ProcessNoise, course: DisturbancePath, prepared: PreparedDynamics) -> tuple[str, ...]:
-    what = f"rate of {process.place}" if process.at_rate else process.place
+    what = f"The disturbance of the rate of {process.place}" if process.at_rate else f"The drift of {process.place}"
     step = float(prepared.time.diff().median())
     if process.correlation_time > 0.0:
         sentences = [
-            f"The disturbance of {what} is not white: its correlation time is about "
+            f"{what} is not white: its correlation time is about "
             f"{sized(float(f'{process.correlation_time:.2g}'), 's')}."
         ]
     else:
-        sentences = [f"The disturbance of {what} is white."]
+        sentences = [f"{what} is white."]
     for name, values in zip(prepared.system.inputs, prepared.inputs_at_rows.unbind(-1), strict=True):
         lag, size, chance = _strongest(course.value, values, process.correlation_time / step if step > 0 else 0.0)
         if size > max(chance, _PLAIN):

@@ -1,4 +1,4 @@
-"""An unnamed force near the ends of the position's range."""
+"""Effect "unknown near ends": a free curve of the position that may be steep near the ends of its range."""
 
 from __future__ import annotations
 

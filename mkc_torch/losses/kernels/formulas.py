@@ -1,4 +1,4 @@
-"""Formulas of an element and of a channel as Triton functions."""
+"""Triton functions that the loss's kernels share: energy of an element, and log Z of a channel, with derivatives."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from mkc_torch._support.typesetting import plain
 from mkc_torch._support.unit_text import sized, tidy
@@ -103,8 +104,8 @@ def goodness_of_fit_table(environment: NoiseEnvironment) -> Table | None:
         tuple(key for key in _FOLLOWS_COLUMNS),
         rows,
         (
-            "Robust RMSE of the open-loop simulation. The noise floor is the sensor's. A residual as "
-            "large as that of the mean: the simulation does not predict that output."
+            "The residual is the robust RMSE of the open-loop simulation; the noise floor is the sensor's. Where "
+            "the residual is as large as the RMSE of the mean, the simulation does not predict the output."
         ),
     )
 
@@ -115,34 +116,41 @@ _FOLLOWS_COLUMNS = (
     "noise floor",
     "standard deviation of the output",
     "explained variance",
-    "RMSE of the mean",
-    "RMSE of the last value",
+    "RMSE if predicted by the mean",
+    "RMSE if predicted by the last value",
 )
 
 
-def process_noise_sentence(process: ProcessNoise) -> str:
-    """Format the process noise of a state or the drift of an output.
+def process_noise_sentences(processes: Sequence[ProcessNoise]) -> list[str]:
+    """Format process noise and drift, one sentence for each state and each output.
 
     Example:
-        >>> process_noise_sentence(ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
-        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s.'
-        >>> process_noise_sentence(ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
-        'Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white noise.'
-        >>> process_noise_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
-        'Drift of `angle` in addition to its white noise: 0.0100 ± 0.0020 rad, correlation time 30 s.'
-        >>> process_noise_sentence(ProcessNoise("temp", False, 463.0, 0.053, 0.0071, "°C", 12.0)).split(", ")[1]
-        'correlation time 460 s.'
+        >>> process_noise_sentences([ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0)])
+        ['Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², correlation time 0.7 s.']
+        >>> process_noise_sentences([ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0)])
+        ['Process noise on the rate of `rate`: 0.228 ± 0.021 rad/s², white noise.']
+        >>> slow = ProcessNoise("temp", False, 463.0, 0.053, 0.0071, "°C", 12.0)
+        >>> process_noise_sentences([slow])
+        ['Drift of `temp` in addition to its white noise: 0.0530 ± 0.0071 °C, correlation time 460 s.']
+        >>> process_noise_sentences([slow, ProcessNoise("temp", False, 30.0, 0.01, 0.002, "°C", 12.0)])[0][-75:]
+        ' °C, correlation time 460 s; and 0.0100 ± 0.0020 °C, correlation time 30 s.'
     """
+    sizes: dict[tuple[bool, str], list[str]] = {}
+    for process in processes:
+        sizes.setdefault((process.at_rate, plain(process.place)), []).append(_size_and_memory(process))
+    return [
+        f"Process noise on the rate of `{place}`: {'; and '.join(each)}."
+        if at_rate
+        else f"Drift of `{place}` in addition to its white noise: {'; and '.join(each)}."
+        for (at_rate, place), each in sizes.items()
+    ]
+
+
+def _size_and_memory(process: ProcessNoise) -> str:
     amount = measured(process.size, process.standard_error, tidy(process.unit))[0]
-    memory = "white noise"
-    if process.correlation_time > 0.0:
-        memory = f"correlation time {sized(float(f'{process.correlation_time:.2g}'))} s"
-    key = (
-        "Process noise on the rate of `{place}`: {size}, {memory}."
-        if process.at_rate
-        else "Drift of `{place}` in addition to its white noise: {size}, {memory}."
-    )
-    return key.format(place=plain(process.place), size=amount, memory=memory)
+    if not process.correlation_time > 0.0:
+        return f"{amount}, white noise"
+    return f"{amount}, correlation time {sized(float(f'{process.correlation_time:.2g}'))} s"
 
 
 def process_noise_table(environment: NoiseEnvironment) -> Table | None:
@@ -198,7 +206,7 @@ def remainder(diagnosis: Diagnosis) -> str:
     """State process noise and drift, or that the residual is the sensor's noise; empty if neither was tested."""
     d = diagnosis
     if d.environment.process_noise:
-        return " ".join(process_noise_sentence(process) for process in d.environment.process_noise)
+        return " ".join(process_noise_sentences(d.environment.process_noise))
     if d.verdict == "adequate" and d.environment.goodness_of_fit:
         return "The residual is the sensor's noise."
     return ""

@@ -16,6 +16,9 @@ from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
 _MOST_RUNS = 6
+_USUAL_LEVEL = 0.05
+"""p-value of a free curve up to which readers expect a reason why the name is kept."""
+
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "acts on {channels}, the sensor's axes",
     ("east", "north", "up"): "acts on {channels}, the axes x, y, z of the frame of the attitude",
@@ -176,10 +179,13 @@ def acts_on(finding: Finding) -> str:
         >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, (), True, "")
         >>> acts_on(finding)
         "acts on x, y, z, the sensor's axes"
+        >>> acts_on(Finding("linear_drag", (), ("rate of speed",), (), None, "", "", (), 0.01, (), True, ""))
+        'acts on the rate of speed'
     """
     if not finding.channels:
         return ""
-    return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(finding.channels))
+    channels = [f"the {name}" if name.startswith("rate of ") else name for name in finding.channels]
+    return _AXES.get(finding.channels, "acts on {channels}").format(channels=several(channels))
 
 
 def _and(each: Sequence[str]) -> str:
@@ -249,21 +255,23 @@ def shape(finding: Finding) -> str:
     """Return the test of the finding's shape against a free curve; empty if it was not tested.
 
     Example:
+        >>> from dataclasses import replace
         >>> from mkc_torch.diagnosis.environment import ShapeCheck
         >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=ShapeCheck(1.2, 0.4))
         >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
+        >>> shape(replace(right, shape=ShapeCheck(6.3, 0.005)))
+        'a free curve of the same variables gains only 6.30 nats (p = 0.005 if the name is right): the name is kept'
     """
     found = finding.shape
     if found is None:
         return ""
-    p = probability(found.p_value)
-    if found.curve is None:
+    gain, p = size(found.free_curve_gain), probability(found.p_value)
+    if found.curve is None and found.p_value > _USUAL_LEVEL:
         return f"a free curve of the same variables is not clearly better ({p})"
-    return (
-        f"a free curve of the same variables at the same port gains {size(found.free_curve_gain)} "
-        f"nats ({p} if the name is right)"
-    )
+    if found.curve is None:
+        return f"a free curve of the same variables gains only {gain} nats ({p} if the name is right): the name is kept"
+    return f"a free curve of the same variables at the same port gains {gain} nats ({p} if the name is right)"
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:

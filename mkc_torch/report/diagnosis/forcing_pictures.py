@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from mkc_torch._support.drawing import ORANGE, array, style
@@ -32,9 +33,18 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
         return panels.markup(f"forcing{index + 1}", "Disturbance over time, and its mean over each state and input")
 
 
+def titles(estimates: Sequence[DisturbanceEstimate]) -> list[str]:
+    """Return a heading for each disturbance and drift, numbered where a state or an output has several."""
+    names = [f"{'Disturbance of the rate of' if e.at_rate else 'Drift of'} `{e.place}`" for e in estimates]
+    return [
+        f"{name}, part {names[: i + 1].count(name)} of {names.count(name)}" if names.count(name) > 1 else name
+        for i, name in enumerate(names)
+    ]
+
+
 def _quantity(estimate: DisturbanceEstimate, unit: str) -> str:
-    """The label of an axis: the disturbance, or the drifting output, and its unit."""
-    return named("disturbance" if estimate.at_rate else estimate.place, tidy(unit))
+    """The label of an axis: the disturbance or drift, and its unit."""
+    return named("disturbance" if estimate.at_rate else "drift", tidy(unit))
 
 
 def _same_height(axes: list[Any]) -> None:
@@ -52,7 +62,7 @@ def of_shape(diagnosis: Diagnosis, index: int) -> str | None:
     if free is None:
         return None
     form = finding.curve if finding.curve is not None and _comparable(free, finding.curve) else None
-    panels = Panels(1)
+    panels = Panels(2)
     with style():
         ax = panels.axes()
         draw_curve(ax, free, diagnosis.traces.has_time, most=2 * MOST_LETTERS)

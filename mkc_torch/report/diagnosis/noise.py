@@ -16,16 +16,14 @@ _KINDS = {"white": "white", "ar": "autoregressive", "random_walk": "random walk"
 _NOISE = {"drift": "drift of the offset", "drift_period": "cut-off of the drift"}
 _CHANNELS = {
     "norm": "norm: measured length of the field minus the simulated length",
-    "along": "along: residual along the ambient field, which its length shows too",
+    "along": "along: residual along the ambient field (the field's length shows it too)",
     "across_1": "across_1 and across_2: the two perpendicular residuals, which include errors of the attitude",
 }
 
 
 def noise_model(noise: NoiseSummary) -> str:
-    """Return the noise model in words."""
-    kind = _KINDS[noise.model]
-    described = noise.description.strip()
-    return f"{kind}: {plain(described)}" if described else f"{kind} noise"
+    """Return the noise model in words: its description, or its kind."""
+    return plain(noise.description.strip()) or f"{_KINDS[noise.model]} noise"
 
 
 def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple[str, str]]:

@@ -17,6 +17,9 @@ _FEWEST_LARGE = 1e6
 _MOST_SMALL = 1e-3
 """Size below which a number is written with a power of ten."""
 
+_MOST_PLACES = 9
+"""Most decimals of an interval."""
+
 _MOST_NUMBERS = 12
 _LONG = 4
 """Length from which only the largest number of a list is shown."""
@@ -198,13 +201,13 @@ def largest(parameter: EffectParameter) -> str:
     Example:
         >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
         >>> largest(EffectParameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
-        'gradient up to ∂B_z/∂z: −1.06 ± 0.25 µT/m'
+        'gradient, largest ∂B_z/∂z: −1.06 ± 0.25 µT/m'
     """
     p = parameter
     if len(p.components) < _LONG:
         return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
     (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
-    return f"{parameter_name(p)} up to {_listed(p)[sizes.index(max(sizes))]}"
+    return f"{parameter_name(p)}, largest {_listed(p)[sizes.index(max(sizes))]}"
 
 
 def probability(value: float) -> str:
@@ -241,10 +244,14 @@ def gain(held_out: HeldOut) -> str:
     Example:
         >>> gain(HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT"))
         '+0.312 nats per sample (95 %: 0.281 to 0.350)'
+        >>> gain(HeldOut(0.25, (0.004, 0.5), 0.9, 0.5, "µT"))
+        '+0.250 nats per sample (95 %: 0.004 to 0.500)'
     """
     value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
+    while known and places < _MOST_PLACES and any(end and float(f"{end:.{places}f}") == 0.0 for end in (low, high)):
+        places += 1  # an end beyond 0 is not shown as 0
     text = number(value, places)
     signed = text if text.startswith("−") else f"+{text}"
     if not known:

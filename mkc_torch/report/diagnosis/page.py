@@ -94,6 +94,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "", paths: verdict.Run
         maps=drawn[count : 2 * count],
         shapes=drawn[2 * count : 3 * count],
         forced=drawn[3 * count :],
+        forced_titles=forcing_pictures.titles(d.environment.disturbance),
         floors=pictures.floors(d),
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
         curve_colors=[themed(color) for color in CURVE_COLORS],

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mkc_torch._support.drawing import DARK_ORANGE, array, style
 from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_curve, draw_map, named, of_time, units_of_outputs
 from mkc_torch.diagnosis.plot.residual import (
@@ -19,10 +21,13 @@ from mkc_torch.diagnosis.plot.residual import (
     onsets,
     unit_of_channel,
 )
-from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
 from mkc_torch.report.panels import Margins, Panels, title
 
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
+_SMALL = 0.25
+"""Residual after the findings, as a share of the scale before, below which its panel is enlarged."""
+
 _CLOSE = 0.03
 """Distance, as a share of the axis, below which numbers would overlap."""
 
@@ -50,13 +55,24 @@ def over_time(diagnosis: Diagnosis) -> str:
                 mark_findings(ax, findings)
                 mark_rejected(ax, diagnosis.rejected_intervals)
             draw_residuals(axes, t, array(t.time), row, unit_of_channel(t, diagnosis.environment, row))
-            for ax, moment in zip(axes, MOMENTS if findings else ("residual",), strict=True):
+            notes = ("", _enlarged(axes[-1], t, row)) if findings else ("",)
+            for ax, moment, note in zip(axes, MOMENTS if findings else ("residual",), notes, strict=True):
                 draw_floor(ax, known.get(t.channels[row]))
                 ax.set_xlabel(of_time(t.has_time))
-                title(ax, of_channel(moment, t.channels[row]), above=above)
+                title(ax, of_channel(moment, t.channels[row]) + note, above=above)
                 if above:
                     _number(ax, findings)
         return panels.markup("time", "Residual over time before and after the findings were added to the simulation")
+
+
+def _enlarged(ax: Any, t: Traces, channel: int) -> str:
+    """Enlarge the panel of a small residual after the findings, and return a note for its title; else empty."""
+    after = array(t.after[:, channel])[array(t.weight[:, channel]) >= 0.5]
+    size = 1.5 * float(np.quantile(np.abs(after[np.isfinite(after)]), 0.995)) if np.isfinite(after).any() else 0.0
+    if not 0.0 < size < _SMALL * ax.get_ylim()[1]:
+        return ""
+    ax.set_ylim(-size, size)
+    return ", enlarged"
 
 
 def floors(diagnosis: Diagnosis) -> dict[str, float]:
@@ -82,7 +98,7 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         return None
     together = curve is not None and len(rows) == 1
     panels = Panels(3 if together else 2)
-    alone = panels if together else Panels(1)
+    alone = panels if together else Panels(2)
     with style():
         for row in rows:
             axes = [panels.axes() for _ in MOMENTS]
@@ -105,7 +121,7 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
     found = diagnosis.findings[index].map
     if found is None:
         return None
-    panels = Panels(1, height=2.55, margins=Margins(right=1.1))
+    panels = Panels(2, height=2.55, margins=Margins(right=1.1))
     with style():
         ax = panels.axes()
         low, width = ax.get_position().y0, ax.get_position().x1

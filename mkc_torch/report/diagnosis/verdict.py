@@ -124,7 +124,7 @@ def _named(finding: Finding, *, alone: bool) -> str:
     if not others:
         return name
     if not alone:
-        return f"{name}, or a rival"
+        return f"{name}, or an alternative"
     if len(others) == 1:
         return f"{name} or {rivals(finding)}, which this recording cannot distinguish"
     return f"{name} or {len(others)} others, which this recording cannot distinguish"

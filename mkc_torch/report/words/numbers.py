@@ -203,11 +203,8 @@ def rejection(calibration: Calibration) -> str:
 
 def rest_bias(found: RestBias) -> str:
     """Format a gyroscope's bias from rest."""
-    return (
-        f"bias ({listed(found.value, found.standard_error)}) ± "
-        f"({', '.join(size(error) for error in found.standard_error)}) rad/s, from "
-        f"{size(found.seconds)} s of rest"
-    )
+    bias = ", ".join(with_errors(found.value, found.standard_error))
+    return f"bias ({bias}) rad/s, from {size(found.seconds)} s of rest"
 
 
 _RESPONSES = {"offset": "offset alone", "offset and scale": "offset and scale", "full matrix": "offset and full matrix"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mkc_torch.calibration.quality import Doubt, disturbances, doubts
+from mkc_torch.calibration.quality import LONG_SECONDS, Doubt, disturbances, doubts
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.report.words.numbers import change, share, when
@@ -17,11 +17,15 @@ def calibration_verdict(calibration: Calibration) -> str:
         first = f"Calibrated, but doubtful: {'; '.join(_reason(doubt, c) for doubt in reasons)}."
     else:
         first = "Calibrated, but read the warnings." if is_doubtful(c) else "Calibrated."
-    return " ".join(filter(None, [first, disturbed(disturbances(c), c.disturbed_unit)]))
+    long = disturbances(c)
+    text = disturbed(long, c.disturbed_unit)
+    if len(long) < len(c.disturbed):  # the text below the headline counts the shorter intervals too
+        text = text.replace(" intervals, ", f" intervals of at least {LONG_SECONDS:g} s, ")
+    return " ".join(filter(None, [first, text]))
 
 
 def result_in_a_word(calibration: Calibration) -> str:
-    """Return the result for a table of several sensors."""
+    """Return "calibrated", "doubtful" or "read the warnings", for a table of several sensors."""
     if doubts(calibration):
         return "doubtful"
     return "read the warnings" if is_doubtful(calibration) else "calibrated"

@@ -15,6 +15,9 @@ from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.parameter import Parameter, SimulationError
 
+MOST = 1e100
+"""Largest size of a recorded value: the squares of larger residuals, and their sums, overflow."""
+
 
 class Dynamics:
     """A system of ordinary differential equations; subclasses define names, parameters and ``derivative``.
@@ -128,7 +131,7 @@ class Dynamics:
         Raises:
             MissingColumnError: the recording lacks ``time``, an input or an output.
             SimulationError: inconsistent names, a ``derivative`` or ``output`` with a wrong shape or values that are
-                not finite, or too few samples.
+                not finite, a column beyond 1e100, or too few samples.
         """
         check_names(self)
         outputs = self.outputs or tuple(s for s in self.states if s in recording)
@@ -137,7 +140,15 @@ class Dynamics:
                 f"{self.name}: none of its states ({', '.join(self.states)}) is a column of the recording, which has "
                 f"{', '.join(recording.names)}. Name what is measured in `outputs`."
             )
-        return PreparedDynamics(self, recording.finite("time", *self.inputs, *outputs).sorted_by_time(), outputs)
+        used = recording.finite("time", *self.inputs, *outputs).sorted_by_time()
+        for name in (*self.inputs, *outputs):
+            largest = float(used[name].abs().max())
+            if largest > MOST:
+                raise SimulationError(
+                    f"{self.name}: column `{name}` reaches {largest:.3g}, but at most {MOST:g} is allowed, because "
+                    "squares of larger values overflow; leave out impossible values, or choose another unit."
+                )
+        return PreparedDynamics(self, used, outputs)
 
     def correction(self, _state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
         """Prepare the simulation for a new recording; see :class:`mkc_torch.simulation.Correction`."""

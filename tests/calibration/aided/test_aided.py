@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
 from mkc_torch.calibration.aided import select_response
-from mkc_torch.calibration.aided.mounting import exchanged, mounting
+from mkc_torch.calibration.aided.mounting import mounting, without_exchange
 from mkc_torch.calibration.aided.turns import turns_of_attitude, turns_of_gyroscope
 from mkc_torch.report import calibration_report
 from tests.calibration.aided.vehicle import changed, example, quaternions
@@ -157,10 +157,12 @@ def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
 
 
 def test_a_response_with_exchanged_axes_is_reported():
-    sentence, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope")
+    sentence, rest = without_exchange(
+        torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope"
+    )
     assert "x is z of the magnetometer, y is x of the magnetometer, z is minus y" in sentence
     assert bool((rest.diagonal() > 6.0).all())
-    assert exchanged(torch.eye(3).double(), "gyroscope")[0] == ""
+    assert without_exchange(torch.eye(3).double(), "gyroscope")[0] == ""
 
 
 @pytest.mark.parametrize(

@@ -98,10 +98,10 @@ def test_the_estimate_follows_a_slow_disturbance_better_than_a_white_one(disturb
 def test_the_first_sentence_states_whether_it_is_white(disturbance):
     first = forcing(disturbance, 1)[0].sentences[0]
     if disturbance == "white":
-        assert first == "The disturbance of rate of rate is white."
+        assert first == "The disturbance of the rate of rate is white."
     else:
         lasting = f"{TRUTH[disturbance].lasting:.2g} s"
-        assert first == f"The disturbance of rate of rate is not white: its correlation time is about {lasting}."
+        assert first == f"The disturbance of the rate of rate is not white: its correlation time is about {lasting}."
 
 
 @pytest.mark.parametrize("disturbance", ["white", "slow"])

@@ -731,6 +731,11 @@ BAD = {
         {"time": TIME, "tip": TRUTH[0]},
         r"Pendulum.output: `tip` should be a tensor of shape \(500,\)",
     ),
+    "a square that overflows": (
+        {},
+        {"time": TIME, "angle": 1e200 * TRUTH[0]},
+        r"column `angle` reaches .*e\+\d+, but at most 1e\+100 is allowed",
+    ),
 }
 
 
