@@ -242,19 +242,3 @@ class Descent:
             return self._moved(best, 0.25 * self.move, plain=True)
         move = _plain_move(self.fit_state, best, self.slopes, self.unit)
         return replace(self, alike=math.isinf(self.slow))._moved(best, move, plain=True)
-
-
-def sandwich_of(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
-    """Sandwich covariance of the coefficients for independent samples.
-
-    Args:
-        found: sums at the solution.
-        used: number of values in use.
-        left: degrees of freedom; without any, no residual is left to estimate the errors from.
-    """
-    if left <= 0:
-        return torch.full_like(found.curvature, torch.inf)
-    root = found.curvature.diagonal().rsqrt()
-    outer = root.unsqueeze(-1) * root
-    inverse = outer * torch.linalg.pinv(outer * found.curvature, hermitian=True)
-    return used / left * inverse @ found.spread @ inverse
