@@ -47,13 +47,9 @@ def fused_pass(
     with_curvature: bool,
     weights: Float[Tensor, "N 1"] | None = None,
 ) -> PassResult:
-    """The sums of a pass over rows of one channel; results are on the CPU, and the range is always included.
+    """The sums of a pass over rows of any strides, with the range; the point and the results are on the CPU.
 
-    Args:
-        x, y, weight: rows, of any strides.
-        beta, density: point of the pass, on the CPU.
-        with_curvature: whether to form the curvature sums.
-        weights: filled with the weights of the density, contiguous.
+    ``weights``, contiguous, are filled with the weights of the density.
     """
     n = x.shape[1]
     columns = max(1 << (n - 1).bit_length(), 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from mkc_torch._support.student_t import fisher_tail, student_quantile, student_
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
 from mkc_torch.linear._influence import ScaleInfluence, Scores, degrees_of_freedom, influence, robust_covariance
-from mkc_torch.linear.covariance import RobustCovarianceKind, checked_bandwidth, checked_robust_kind
+from mkc_torch.linear.covariance import RobustCovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.linear.summary import LIGHT, Summary, one_problem
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ class RobustInference(Inference):
     r_squared_: Float[Tensor, "*batch m"]
 
     def _set_covariance(self, covariance: RobustCovarianceKind, bandwidth: float | None) -> None:
-        self.covariance = checked_robust_kind(covariance)
+        self.covariance = checked_kind(covariance, get_args(RobustCovarianceKind))
         self.bandwidth = checked_bandwidth(bandwidth)
 
     def _infer(

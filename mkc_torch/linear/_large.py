@@ -16,12 +16,13 @@ from torch import Tensor
 
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
+from mkc_torch.linear._basis import nearly_dependent
 from mkc_torch.linear._blocks import Density, PassResult
 from mkc_torch.linear._descent import Descent, PassDerivatives
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._many_rows import RowsMaximum, descended, likelier_gaussian, maximum_of
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
-from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
+from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at, rows_of
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
 from mkc_torch.linear._rows import Rows
@@ -50,9 +51,6 @@ _TAILS = (0.1, 0.2, 0.4, 1.5)
 _FOR_SLOPES = 8
 """Rows for the first curvature, in multiples of the pilot's rows: each step then leaves a twentieth of the distance."""
 
-_CONDITION = 1e3
-"""Largest ratio of singular values of X, with scaled columns, at which sums are formed without a change of basis."""
-
 _SLACK = 2.0
 """Factor on the bound of the gain of least squares, since the pilot's products only approximate those of all."""
 
@@ -70,16 +68,10 @@ def is_large(values: CanonicalShapes) -> bool:
 
 def problem_in_basis(problem: LinearProblem) -> CanonicalShapes:
     """Return a problem whose X is the basis of ``problem``."""
-    basis, batch = problem.basis, problem.batch
-    if basis.shape[0] == 1:
-        basis = basis.expand(batch.numel(), *basis.shape[1:])
-    weight = problem.sample_weight
+    basis = problem.basis.expand(problem.Y.shape[0], -1, -1, -1)
+    weight = None if problem.sample_weight is None else problem.restore(problem.sample_weight)
     return CanonicalShapes(
-        basis.reshape(*batch, *basis.shape[1:]),
-        problem.Y.reshape(*batch, *problem.Y.shape[1:]),
-        None if weight is None else weight.reshape(*batch, *weight.shape[1:]),
-        batch,
-        problem.single_channel,
+        problem.restore(basis), problem.restore(problem.Y), weight, problem.batch, problem.single_channel
     )
 
 
@@ -112,7 +104,7 @@ def large_maximum(
     fitted exactly, d ends at its least, a Gaussian has a higher likelihood than the result, or the passes do not
     converge. An alternation over all rows then reports the error or finds the maximum.
     """
-    rows, passes = _rows_of(values), min(max_iter, _PASSES)
+    rows, passes = rows_of(values), min(max_iter, _PASSES)
     pilot = _pilot(values, known, max_iter, seed) if _is_valid(rows) else None
     if pilot is None:
         return None
@@ -130,8 +122,8 @@ def large_maximum(
         fit_state = replace(fit_state, log_bound=torch.log(half))
         if pilot.alike:
             end = descended(source, replace(descent, fit_state=fit_state), passes, begin, with_range=True)
-            if end.done and end.result is not None:
-                point, begin = end.point, end.result
+            if end.done and end.best is not None:
+                point, begin = end.point, end.best.result
                 fit_state = replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
         fit_state, same = _on_final_domain(pilot, known, fit_state, begin)
         first = begin if same else None
@@ -194,18 +186,8 @@ def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
     return found.extent.half()
 
 
-def _density(fit_state: FitState) -> Density:
-    return Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
-
-
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
-    return replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
-
-
-def _rows_of(values: CanonicalShapes) -> Rows:
-    X, Y, weight = values.X, values.Y, values.sample_weight
-    weight = None if weight is None else weight.reshape(weight.shape[-2:])
-    return Rows(X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:]), weight)
+    return replace(rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
 
 
 def _is_valid(rows: Rows) -> bool:
@@ -223,18 +205,13 @@ def _is_valid(rows: Rows) -> bool:
 
 def _d_is_at_its_least(end: Descent) -> bool:
     """Whether d ended at its least, which is that of the pilot."""
-    assert end.fit_state.log_d_min is not None
-    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.log_d_min).any())
+    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.limits[0]).any())
 
 
 def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
-    """The pilot's basis where columns of X are nearly dependent, such as a time in seconds and an intercept; else None.
-
-    The products of such columns would lose the digits that distinguish them.
-    """
-    upper = torch.linalg.inv(problem.to_coef[0])
-    singular = torch.linalg.svdvals(upper / upper.square().sum(0).sqrt())
-    return None if float(singular[0]) <= _CONDITION * float(singular[-1]) else problem.to_coef[0]
+    """The pilot's basis where columns of X are nearly dependent, else None."""
+    to_coef = problem.to_coef[0]
+    return to_coef if nearly_dependent(torch.linalg.inv(to_coef)) else None
 
 
 def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
@@ -242,10 +219,9 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    total, found, _ = rows.evaluate(fit_state.beta[0], _density(fit_state), with_curvature=True)
-    assert found is not None
-    unit = total.weight.sum()
-    return PassDerivatives(found.curvature / unit, found.tilt / unit, _grams(rows, fit_state) / unit)
+    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
+    result = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
+    return PassDerivatives.of(result, _grams(rows, fit_state) / result.total.weight.sum())
 
 
 def _grams(rows: Rows, fit_state: FitState) -> Float64[Tensor, "m n n"]:
@@ -266,5 +242,4 @@ def _gaussian_is_likelier(rows: Rows, end: Descent) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result."""
     if likelier_gaussian(end, end.slopes.grams, _SLACK) is None:
         return False
-    assert end.result is not None
-    return likelier_gaussian(end, _grams(rows, end.fit_state) / end.result.total.weight.sum()) is not None
+    return likelier_gaussian(end, _grams(rows, end.fit_state) / end.end[0].result.total.weight.sum()) is not None

@@ -37,15 +37,7 @@ class Source(Protocol):
 def descended(
     source: Source, descent: Descent, passes: int, first: PassResult | None = None, *, with_range: bool = False
 ) -> Descent:
-    """Make passes until the descent is done, at most ``passes``.
-
-    Args:
-        source: rows whose likelihood is maximised.
-        descent: state before the first pass.
-        passes: largest number of passes.
-        first: result at the starting point, if known; it counts as a pass.
-        with_range: whether passes find the range of the residuals too.
-    """
+    """Make passes until the descent is done, at most ``passes``; ``first`` is the result of the first, if known."""
     for _ in range(passes):
         if first is None:
             first = source.evaluate(descent, with_range=with_range)
@@ -69,12 +61,11 @@ class RowsMaximum:
     def attributes(self) -> dict[str, Tensor]:
         """Results of an estimator by name, without batch dimensions."""
         state = self.fit_state
-        assert state.log_bound is not None
         return {
             "coef_": state.beta[0],
             "sigma_": state.kappa[0].rsqrt(),
             "d_": torch.exp(state.log_d[0]),
-            "bound_": torch.exp(state.log_bound[0]),
+            "bound_": torch.exp(state.limits[1][0]),
             "log_likelihood_": self.log_likelihood,
             "covariance_": self.covariance,
             "dof_": self.dof,
@@ -82,40 +73,29 @@ class RowsMaximum:
 
 
 def maximum_of(end: Descent, used: int, frame: Float64[Tensor, "n n"] | None, *, with_last_step: bool) -> RowsMaximum:
-    """The maximum at the end of a descent.
+    """The maximum at the end of a descent, from ``used`` values of positive weight.
 
-    Args:
-        end: the descent, whose last pass computed the curvature.
-        used: number of values of positive weight.
-        frame: change of basis of the columns in the passes.
-        with_last_step: whether to make the step at which the descent ended.
+    ``with_last_step`` makes the step at which the descent ended.
     """
-    assert end.best is not None
-    assert end.result is not None
-    assert end.curvature_sums is not None
-    point = end.stepped() if with_last_step else end.best.point
+    best, sums = end.end
+    point = end.stepped() if with_last_step else best.point
     beta, left = point.beta, used - point.beta.shape[-1]
-    covariance = sandwich_of(end.curvature_sums, used, left)
+    covariance = sandwich_of(sums, used, left)
     if frame is not None:
         beta, covariance = beta @ frame.mT, frame @ covariance @ frame.mT
     return RowsMaximum(
         fit_state=replace(end.fit_state, beta=beta, kappa=point.kappa, log_d=point.log_d),
-        log_likelihood=-(end.result.total.weight * end.best.by_channel.value).sum(),
+        log_likelihood=-(best.result.total.weight * best.by_channel.value).sum(),
         covariance=covariance,
         dof=beta.new_tensor(float(left)),
         history=beta.new_tensor(end.history),
-        light=int(end.curvature_sums.light),
+        light=int(sums.light),
     )
 
 
 def sandwich_of(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
-    """Sandwich covariance of the coefficients for independent samples.
-
-    Args:
-        found: sums at the solution.
-        used: number of values in use.
-        left: degrees of freedom; without any, no residual is left to estimate the errors from.
-    """
+    """Sandwich covariance of the coefficients for independent samples: ``used`` values, ``left`` degrees of freedom."""
+    # no residual is left to estimate the errors from
     if left <= 0:
         return torch.full_like(found.curvature, torch.inf)
     root = found.curvature.diagonal().rsqrt()
@@ -134,16 +114,13 @@ def likelier_gaussian(end: Descent, grams: Float64[Tensor, "m n n"], slack: floa
         grams: G of each channel, per unit of weight.
         slack: factor on the gain of least squares, where ``grams`` are approximate.
     """
-    assert end.result is not None
-    assert end.curvature_sums is not None
-    state, found, weight = end.fit_state, end.curvature_sums, end.result.total.weight
-    assert state.log_bound is not None
-    assert state.log_d_min is not None
+    state, (best, found) = end.fit_state, end.end
+    weight, (log_least, log_bound) = best.result.total.weight, state.limits
     if not (state.free_kappa and state.free_d and bool((end.point.kappa > 0).any())):
         return None
     root = grams.diagonal(dim1=-2, dim2=-1).sum(0).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     gram = weight.sum() * root.unsqueeze(-1) * grams * root
-    moment, least = found.moment * root, torch.exp(state.log_d_min[0])
+    moment, least = found.moment * root, torch.exp(log_least[0])
     # weights of the channels, from their scales of the step before
     precision = torch.ones_like(weight)
     for _ in range(3 if len(weight) > 1 else 1):
@@ -152,7 +129,7 @@ def likelier_gaussian(end: Descent, grams: Float64[Tensor, "m n n"], slack: floa
         mean_square = ((found.square - gain - (slack - 1.0) * gain.abs()) / weight).clamp(min=0.0)
         d = torch.maximum(mean_square.sqrt(), least)
         precision = relative_precision(d)
-    norm = normaliser_derivatives(torch.zeros_like(d), torch.log(d), state.log_bound[0]).value
+    norm = normaliser_derivatives(torch.zeros_like(d), torch.log(d), log_bound[0]).value
     if float((0.5 * mean_square / d.square() + norm).sum()) >= end.history[-1]:
         return None
     beta = end.point.beta + root * move

@@ -134,12 +134,7 @@ class MKCRegression(Inference):
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MKCRegression:
-        """Fit ``Y ~ X coef``.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
-            Y: targets.
-            sample_weight: non-negative weights (*, N) or (*, N, m), multiplied to the log-density of each value.
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the log-density of each value.
 
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
@@ -153,18 +148,14 @@ class MKCRegression(Inference):
             values = checked_shapes(X, Y, sample_weight)
             known = FixedParameters(self.sigma, self.d, self.bound, self.start)
             # a time series needs the scores in their order
-            found = self._large_maximum(values, known) if self.covariance == "sandwich" else None
+            suits = is_large(values) and self.covariance == "sandwich"
+            found = large_maximum(values, known, max_iter=self.max_iter, seed=self.seed) if suits else None
             if found is not None:
                 self._keep_large(values, *found)
                 return self
             problem = linear_problem(X, Y, sample_weight)
             self._keep(problem, *self._maximise(problem, known))
         return self
-
-    def _large_maximum(self, values: CanonicalShapes, known: FixedParameters) -> tuple[RowsMaximum, Tensor] | None:
-        if not is_large(values):
-            return None
-        return large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
 
     def _maximise(self, problem: LinearProblem, known: FixedParameters) -> tuple[RobustStart, LikelihoodMaximum]:
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
@@ -174,7 +165,9 @@ class MKCRegression(Inference):
             known = FixedParameters(
                 given.sigma, given.d, given.bound, self.start if given.start is None else given.start
             )
-            found = self._large_maximum(problem_in_basis(problem), known.in_basis_of(problem))
+            values, in_basis = problem_in_basis(problem), known.in_basis_of(problem)
+            suits = is_large(values)
+            found = large_maximum(values, in_basis, max_iter=self.max_iter, seed=self.seed) if suits else None
             if found is not None:
                 rows_maximum, _ = found
                 self.n_iter_ = len(rows_maximum.history) - 1

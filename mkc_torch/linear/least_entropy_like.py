@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,7 +14,6 @@ from mkc_torch._support.side_by_side import at_once, side_by_side
 from mkc_torch._support.small_factors import solve
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._precision import in_double
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.losses.entropy_like import LEAST_TOTAL, orthogonal_starts
 
@@ -102,31 +102,20 @@ class LeastEntropyLike(LinearEstimator):
                     f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}n) but got "
                     f"{'NaN or infinity' if value.dim() >= least else tuple(value.shape)}."
                 )
-        self.start = start
-        self.starts = starts
+        self.start, self.starts = start, starts
         self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 gives the coefficients nine digits")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastEntropyLike:
-        """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
-            Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
-
-        Returns:
-            The estimator.
+        """Fit ``Y ~ X coef`` in float64; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample twice.
 
         Raises:
-            TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, there are fewer than n + 2 values (with n + 1 values
-                any fit through n of them has H = 0), weights total at most 1, or a start has the wrong shape.
-            RankDeficientError: columns of X are linearly dependent.
+            ValueError: fewer than n + 2 values (with n + 1 values any fit through n of them has H = 0), weights that
+                total at most 1, a start of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
-        problem = in_double(linear_problem(X, Y, sample_weight))
+        problem = linear_problem(X, Y, sample_weight).double()
         _check_counts(problem)
         least_squares = _least_squares(problem)
         starts = self._starts(problem, least_squares)
@@ -141,12 +130,7 @@ class LeastEntropyLike(LinearEstimator):
         per_problem = problem.Y[0].numel() * (n + 1) * (n + 4) // 2
         parts = torch.arange(starts.shape[0], device=starts.device).split(at_once(starts, per_problem, _CHUNK))
         found = [self._descend(problem.select(part), remainder[part], directions[part]) for part in parts]
-        minima = Minima(
-            torch.cat([f.point for f in found]),
-            torch.cat([f.value for f in found]),
-            torch.cat([f.n_iter for f in found]),
-            torch.cat([f.converged for f in found]),
-        )
+        minima = Minima(*(torch.cat([getattr(f, field.name) for f in found]) for field in fields(Minima)))
         # the last component is 0 only if the coefficients are infinite
         last = minima.point[:, -1:]
         last = torch.where(last.abs() > 1e-12, last, torch.where(last < 0, -1e-12, 1e-12))

@@ -195,12 +195,8 @@ class MEstimator(RobustInference):
         if start is not None:
             checked_start(start, get_args(MStart), ", or None,")
         check_iterations(max_iter, tol)
-        self.psi = psi
-        self.tuning = tuning
-        self.scale = scale
-        self.start = start
-        self.max_iter = max_iter
-        self.tol = tol
+        self.psi, self.tuning, self.scale, self.start = psi, tuning, scale, start
+        self.max_iter, self.tol = max_iter, tol
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
@@ -233,15 +229,7 @@ class MEstimator(RobustInference):
             # an exact fit of most values is kept; a scale of rounding errors would lose it
             return torch.where(exact, 0.0, median_scale(problem, residual))
 
-        found = reweight(
-            problem,
-            beta,
-            first,
-            psi.weight,
-            next_scale,
-            max_iter=self.max_iter,
-            tol=self.tol,
-        )
+        found = reweight(problem, beta, first, psi.weight, next_scale, max_iter=self.max_iter, tol=self.tol)
         self._set_common(problem, found.beta, found.weight)
         self.scale_ = problem.restore(found.scale)
         equation = scores(problem, found.beta, found.scale, psi)

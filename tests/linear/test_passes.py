@@ -37,7 +37,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     )
     slope = double(*gradient)
     hessian = torch.tensor([[[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 1.0]]], dtype=torch.float64)
-    move = _newton_move(fit_state, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None))
+    move = _newton_move(fit_state, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None, None))
     low, high = double(-torch.inf, -0.5, -1.0), double(torch.inf, 399.5, 2.0)
     assert bool(((move >= low) & (move <= high)).all())
     stopped = (move == low) | (move == high)

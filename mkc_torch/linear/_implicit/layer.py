@@ -87,14 +87,7 @@ def fit_layer(
     start: Tensor | None = None,
     covariance: tuple[CovarianceKind, float | None] = ("sandwich", None),
 ) -> Layer:
-    """Fit with derivatives by X, Y, the weights, and by σ, d and domain where they are given.
-
-    Args:
-        X, Y, sample_weight: as in :func:`linear_problem`.
-        solve: the fit, called with checked constants.
-        sigma, d, bound: a number, (m,) or (*, m); None lets the fit estimate it.
-        start: starting coefficients (n,) or (*, n), or None.
-        covariance: kind and bandwidth of the covariance of the coefficients.
+    """Fit by ``solve`` with derivatives by X, Y, the weights, and by σ, d and domain where they are given.
 
     Raises:
         ValueError: bad input, as in :func:`linear_problem`.

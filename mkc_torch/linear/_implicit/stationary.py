@@ -56,6 +56,13 @@ class FitState:
             extras,
         )
 
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Least log d, and log of the domain, of a likelihood."""
+        assert self.log_d_min is not None
+        assert self.log_bound is not None
+        return self.log_d_min, self.log_bound
+
     def to(self, device: torch.device) -> FitState:
         """The same on a device; ``extras`` stay where they are."""
         names = ("beta", "kappa", "log_d", "converged", "log_bound", "log_d_min")

@@ -173,12 +173,7 @@ def sums_pass(
 ) -> Float64[Tensor, " k"]:
     """Number of this rank's rows, their sums, and the least and largest residual of each channel if wanted.
 
-    Args:
-        batches: batches of this rank.
-        shape: shape of every batch.
-        frame: change of basis of the columns, if any.
-        beta, density: point of the pass.
-        wanted: results of the pass; with curvature it takes three times as long.
+    A pass with curvature takes three times as long.
     """
     memory, m = Memory(), shape.m
     flat = torch.zeros(1 + flat_length(m, shape.n, with_curvature=wanted.with_curvature), dtype=torch.float64)
