@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
-from mkc_torch.density.likelihood import normaliser_derivatives
+from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import CurvatureSums, PassResult
 from mkc_torch.linear._descent import Descent
 from mkc_torch.linear._implicit.stationary import FitState
@@ -129,7 +129,7 @@ def likelier_gaussian(end: Descent, grams: Float64[Tensor, "m n n"], slack: floa
         mean_square = ((found.square - gain - (slack - 1.0) * gain.abs()) / weight).clamp(min=0.0)
         d = torch.maximum(mean_square.sqrt(), least)
         precision = relative_precision(d)
-    norm = normaliser_derivatives(torch.zeros_like(d), torch.log(d), log_bound[0]).value
+    norm = torch.log(d) + log_partition_value(torch.zeros_like(d), torch.exp(log_bound[0]) / d)
     if float((0.5 * mean_square / d.square() + norm).sum()) >= end.history[-1]:
         return None
     beta = end.point.beta + root * move

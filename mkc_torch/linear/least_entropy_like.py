@@ -92,17 +92,7 @@ class LeastEntropyLike(LinearEstimator):
         super().__init__()
         if start is not None and starts is not None:
             raise ValueError("Expected argument `start` or `starts` but got both; pass one argument only.")
-        for name, value, least in (("start", start, 1), ("starts", starts, 2)):
-            if value is None:
-                continue
-            refuse_no_tensor(name, value, "a tensor")
-            refuse_complex(name, value)
-            if value.dim() < least or not seems_finite(value):
-                raise ValueError(
-                    f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}n) but got "
-                    f"{'NaN or infinity' if value.dim() >= least else tuple(value.shape)}."
-                )
-        self.start, self.starts = start, starts
+        self.start, self.starts = _checked_start("start", start, 1), _checked_start("starts", starts, 2)
         self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 gives the coefficients nine digits")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
@@ -171,14 +161,8 @@ class LeastEntropyLike(LinearEstimator):
     def _starts(self, problem: LinearProblem, least_squares: Tensor) -> Float[Tensor, "B S n"]:
         """Return the starts in the basis."""
         n = problem.num_coefficients
-        for name, value, least in (("start", self.start, 1), ("starts", self.starts, 2)):
-            if value is None:
-                continue
-            if value.dim() < least or value.shape[-1] != n or not bool(torch.isfinite(value).all()):
-                raise ValueError(
-                    f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}{n}) "
-                    f"but got {tuple(value.shape)}."
-                )
+        _checked_start("start", self.start, 1, n)
+        _checked_start("starts", self.starts, 2, n)
         if self.starts is not None:
             coef = self.starts.to(problem.Y)
             coef = coef.expand(*problem.batch, *coef.shape[-2:]).reshape(-1, *coef.shape[-2:])
@@ -188,6 +172,21 @@ class LeastEntropyLike(LinearEstimator):
         else:
             coef = orthogonal_starts(_coefficients(problem, least_squares.unsqueeze(1)).squeeze(1))
         return solve(problem.to_coef, coef.mT).mT
+
+
+def _checked_start(name: str, value: Tensor | None, least: int, n: int | None = None) -> Tensor | None:
+    """Return starts of at least ``least`` dimensions and, where known, n columns if they are valid, else raise."""
+    if value is None:
+        return None
+    refuse_no_tensor(name, value, "a tensor")
+    refuse_complex(name, value)
+    fits = value.dim() >= least and n in (None, value.shape[-1])
+    if not fits or not (seems_finite(value) if n is None else bool(torch.isfinite(value).all())):
+        raise ValueError(
+            f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}{'n' if n is None else n}) "
+            f"but got {tuple(value.shape) if not fits else 'NaN or infinity'}."
+        )
+    return value
 
 
 def _least_squares(problem: LinearProblem) -> Float[Tensor, "B n"]:

@@ -142,17 +142,8 @@ class _Search(NamedTuple):
         shared = problem.to_coef.shape[0] == 1
         lead = (1,) * len(problem.batch) if shared else tuple(problem.batch)
         covariance = coefficient_covariance(problem, at.beta, at.kappa, torch.exp(at.log_d), *self.covariance)
-        own = (
-            at.beta,
-            at.kappa,
-            at.log_d,
-            torch.zeros_like(at.log_d) if fit_state.log_bound is None else fit_state.log_bound,
-            at.unit,
-            at.total,
-            at.inverse,
-            at.cause,
-            fit_state.converged,
-        )
+        log_bound = torch.zeros_like(at.log_d) if fit_state.log_bound is None else fit_state.log_bound
+        own = (at.beta, at.kappa, at.log_d, log_bound, at.unit, at.total, at.inverse, at.cause, fit_state.converged)
         return (
             problem.to_coef.reshape(lead + tuple(problem.to_coef.shape[1:])),
             *(problem.restore(v) for v in own),

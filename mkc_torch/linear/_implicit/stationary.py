@@ -44,17 +44,8 @@ class FitState:
     @staticmethod
     def of(beta: Tensor, state: DensityState, converged: Tensor, extras: tuple[Tensor, ...] = ()) -> FitState:
         """Coefficients and a density fitted to their residuals."""
-        return FitState(
-            beta,
-            state.kappa,
-            state.log_d,
-            converged,
-            state.log_bound,
-            state.log_d_min,
-            state.free_kappa,
-            state.free_d,
-            extras,
-        )
+        limits, free = (state.log_bound, state.log_d_min), (state.free_kappa, state.free_d)
+        return FitState(beta, state.kappa, state.log_d, converged, *limits, *free, extras)
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
