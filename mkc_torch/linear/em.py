@@ -123,7 +123,10 @@ class MKCRegression(Inference):
         for name, value in (("d", d), ("bound", bound)):
             if value is not None:
                 refuse_out_of_range(name, value, advice="it is in the unit of Y; pass None to estimate it")
-        self.sigma, self.d, self.bound, self.start = sigma, d, bound, checked_start(start)
+        self.sigma = sigma
+        self.d = d
+        self.bound = bound
+        self.start = checked_start(start)
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
         self.tol = checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
         self.covariance = checked_kind(covariance)

@@ -194,7 +194,10 @@ class FixedPointLinear(Inference):
         refuse_out_of_range("d", d, advice="it is the scale of the noise, in the unit of Y")
         if noise_covariance is not None:
             _refuse_no_covariance(noise_covariance)
-        self.sigma, self.d, self.noise_covariance, self.start = sigma, d, noise_covariance, checked_start(start)
+        self.sigma = sigma
+        self.d = d
+        self.noise_covariance = noise_covariance
+        self.start = checked_start(start)
         self.max_iter = checked_whole("max_iter", max_iter, 1, "500 is ample")
         self.tol = checked_number("tol", tol, 0.0, 1.0, "[)", "1e-13 suits float64")
         self.covariance = checked_kind(covariance)

@@ -92,7 +92,8 @@ class LeastEntropyLike(LinearEstimator):
         super().__init__()
         if start is not None and starts is not None:
             raise ValueError("Expected argument `start` or `starts` but got both; pass one argument only.")
-        self.start, self.starts = _checked_start("start", start, 1), _checked_start("starts", starts, 2)
+        self.start = _checked_start("start", start, 1)
+        self.starts = _checked_start("starts", starts, 2)
         self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 gives the coefficients nine digits")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 

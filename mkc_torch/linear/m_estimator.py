@@ -195,8 +195,12 @@ class MEstimator(RobustInference):
         if start is not None:
             checked_start(start, get_args(MStart), ", or None,")
         check_iterations(max_iter, tol)
-        self.psi, self.tuning, self.scale, self.start = psi, tuning, scale, start
-        self.max_iter, self.tol = max_iter, tol
+        self.psi = psi
+        self.tuning = tuning
+        self.scale = scale
+        self.start = start
+        self.max_iter = max_iter
+        self.tol = tol
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 

@@ -101,7 +101,9 @@ class MinimumEntropy(LinearEstimator):
             raise ValueError(f"Expected argument `location` to be 'median' or 'symmetric' but got {location!r}.")
         if bandwidth is not None:
             refuse_out_of_range("bandwidth", bandwidth, advice="it is in the unit of Y; None takes Silverman's rule")
-        self.entropy, self.bandwidth, self.location = entropy, bandwidth, location
+        self.entropy = entropy
+        self.bandwidth = bandwidth
+        self.location = location
         self.start = checked_start(start)
         self.max_iter = checked_whole("max_iter", max_iter, 1, "100 is ample")
         self.seed = checked_whole("seed", seed)

@@ -78,9 +78,11 @@ class MMRegression(RobustInference):
     ) -> None:
         super().__init__()
         self.efficiency = checked_number("efficiency", efficiency, 0.3, 0.99, "[]", "0.95 is usual")
-        self.breakdown, self.starts = checked_breakdown(breakdown), checked_starts(starts)
+        self.breakdown = checked_breakdown(breakdown)
+        self.starts = checked_starts(starts)
         check_iterations(max_iter, tol)
-        self.max_iter, self.tol = max_iter, tol
+        self.max_iter = max_iter
+        self.tol = tol
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 

@@ -98,7 +98,8 @@ class ReweightedLeastSquares(RobustInference):
                 f"{format_value(start)}{remedy}."
             )
         checked_number("threshold", threshold, 1.0, math.inf, "[)", "it is a number of scales; 2.5 is usual")
-        self.start, self.threshold = start, threshold
+        self.start = start
+        self.threshold = threshold
         self.starts = None if starts is None else checked_starts(starts)
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)

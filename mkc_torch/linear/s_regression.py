@@ -353,7 +353,8 @@ class SRegression(RobustInference):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.breakdown, self.starts = checked_breakdown(breakdown), checked_starts(starts)
+        self.breakdown = checked_breakdown(breakdown)
+        self.starts = checked_starts(starts)
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
