@@ -152,14 +152,10 @@ def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, T
         given = tuple(float(t) for t in tuning) if isinstance(tuning, (tuple, list)) else (float(tuning),)
     except (TypeError, ValueError, OverflowError):
         given = ()
-    rising = all(0 < low <= high for low, high in itertools.pairwise(given))
+    rising = all(0 < low <= high for low, high in itertools.pairwise(given)) and given[-2:-1] != given[-1:]
     if len(given) != len(default) or not all(0 < t < math.inf for t in given) or not rising:
         expected = "three numbers 0 < a <= b < c" if name == "hampel" else "one positive number"
         raise ValueError(f"Expected argument `tuning` of {name!r} to be {expected} but got {tuning!r}.")
-    if name == "hampel" and given[1] == given[2]:
-        raise ValueError(
-            f"Expected argument `tuning` of 'hampel' to be three numbers 0 < a <= b < c but got {tuning!r}."
-        )
     return known, given
 
 

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
+from mkc_torch._support.arguments import checked_whole, refuse_out_of_range
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.side_by_side import at_once
 from mkc_torch._support.small_factors import pinv, symmetric_eigen
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._mkc import channel_parameter
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 
@@ -122,13 +123,7 @@ class MinimumEntropy(LinearEstimator):
         if self.bandwidth is None:
             h = 1.06 * begin.scale.double() * total.pow(-0.2)
         else:
-            h = as_numbers("bandwidth", self.bandwidth, problem.Y.dtype, problem.Y.device).to(problem.Y)
-            if h.dim() > 1 or h.numel() not in (1, problem.num_channels):
-                raise ValueError(
-                    f"Expected argument `bandwidth` to be a number or of shape ({problem.num_channels},) "
-                    f"but got {tuple(h.shape)}."
-                )
-            h = h.expand(total.shape)
+            h = channel_parameter("bandwidth", self.bandwidth, problem)
         free = self._identified(problem)
         beta = begin.beta.double()
         converged, n_iter = torch.ones_like(begin.exact), torch.zeros_like(begin.exact, dtype=torch.long)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 
@@ -33,15 +32,11 @@ _EXACT_PASSES = 8
 """Passes after which a fit through most values to rounding, whose precision is limited, ends."""
 
 
-class StreamedMaximum(NamedTuple):
-    """The maximum, and whether it was reached."""
+def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: int) -> tuple[RowsMaximum, bool]:
+    """Maximise the likelihood in at most ``max_passes`` passes; return the maximum and whether it was reached.
 
-    found: RowsMaximum
-    converged: bool
-
-
-def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: int) -> StreamedMaximum:
-    """Maximise the likelihood in at most ``max_passes`` passes; ``learns_domain``: the domain is to cover all rows."""
+    ``learns_domain``: the domain is to cover the residuals of all rows.
+    """
     pilot, survey = source.pilot, source.survey
     near = min(_NEAR * float(survey.weight.sum()) ** 0.5, _FURTHEST)
     options = {"near": near, "stop": 2.0 * near, "fresh": True, "slow": _SLOW}
@@ -70,10 +65,9 @@ def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: i
         assert end.best is not None
         last = replace(end, point=end.best.point, left=0.0)
         end = source.after(last, source.evaluate(last))
+    converged = end.done or pilot.exact
     return source.ranks.from_first(
-        lambda: StreamedMaximum(
-            maximum_of(end, survey.used, survey.frame(), with_last_step=end.done), end.done or pilot.exact
-        )
+        lambda: (maximum_of(end, survey.used, survey.frame(), with_last_step=end.done), converged)
     )
 
 
