@@ -21,11 +21,10 @@ _STALLED = 10
 
 @dataclass(frozen=True)
 class Minimax:
-    """Coefficients, largest absolute residual of the rows in use, number of exchanges, and whether it is optimal."""
+    """Coefficients, largest absolute residual of the rows in use, and whether it is optimal."""
 
     beta: Float[Tensor, "P n"]
     height: Float[Tensor, " P"]
-    n_iter: Tensor
     converged: Tensor
 
 
@@ -81,7 +80,6 @@ def minimax(
     height = target.new_zeros(P)
     best = target.new_full((P,), -1.0)
     stalled = torch.zeros(P, dtype=torch.long, device=target.device)
-    n_iter = torch.zeros_like(stalled)
     moving = torch.ones(P, dtype=torch.bool, device=target.device)
     last = torch.zeros(n + 1, dtype=target.dtype, device=target.device)
     last[-1] = 1.0
@@ -104,7 +102,6 @@ def minimax(
         if every == 1:
             at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
             left = left[left]
-        n_iter[at] += left
         grown = height[at] > best[at] + floor[at]
         stalled[at] = torch.where(grown, 0, stalled[at] + 1)
         best[at] = torch.maximum(best[at], height[at])
@@ -121,7 +118,7 @@ def minimax(
         stays = ~left.unsqueeze(-1)
         basis[at] = torch.where(stays, basis[at], basis[at].scatter(1, leave, enter))
         sign[at] = torch.where(stays, sign[at], sign[at].scatter(1, leave, enter_sign))
-    return Minimax(beta + guess, height, n_iter, ~moving)
+    return Minimax(beta + guess, height, ~moving)
 
 
 def _first_rows(
