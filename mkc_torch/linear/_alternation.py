@@ -58,14 +58,7 @@ def alternated(
     tol: float,
     patience: int,
 ) -> Alternated:
-    """Alternate until ``patience`` alternations of a problem gain no more than ``tol`` and rounding.
-
-    Args:
-        problem: small problems of one channel.
-        beta: coefficients in the basis at the start.
-        state: the density at the start.
-        max_iter, tol, patience: limits of the alternation.
-    """
+    """Alternate until ``patience`` alternations of a problem gain no more than ``tol`` and rounding."""
     given, count, device = kernel_data(problem), beta.shape[0], beta.device
     numbers = torch.zeros(len(_FIELDS) + 3, count, dtype=torch.float64, device=device)
     for row, name in zip(numbers, _FIELDS, strict=False):

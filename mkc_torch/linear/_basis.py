@@ -9,7 +9,6 @@ from torch import Tensor
 
 from mkc_torch._support.side_by_side import side_by_side
 from mkc_torch._support.small_factors import LARGEST, orthonormalising
-from mkc_torch.linear._rank import rank_tolerance
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -53,6 +52,16 @@ def orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
 _MOST_ROWS = 1000
 """Rows beyond which the tolerance of the rank does not grow, where sums are in float64."""
 
+_MOST_ROWS_OF_QR = 8192
+"""Rows beyond which the tolerance no longer grows in a QR: LAPACK adds up blocks of rows, whose errors nearly cancel.
+
+At 1e7 rows of float32 the tolerance would exceed 1, and every matrix would count as dependent."""
+
+
+def rank_tolerance(num_rows: int, columns: int, dtype: torch.dtype) -> float:
+    """Ratio of singular values up to which columns count as dependent."""
+    return max(min(num_rows, _MOST_ROWS_OF_QR), columns) * torch.finfo(dtype).eps
+
 
 def _inverse_triangle(rows: Float[Tensor, "B K n"], scale: Float[Tensor, "B n"]) -> Float[Tensor, "B n n"]:
     """Inverse of the R of rows divided by ``scale``; refuses dependent columns."""
@@ -63,12 +72,7 @@ def _inverse_triangle(rows: Float[Tensor, "B K n"], scale: Float[Tensor, "B n"])
 def refuse_dependent(
     upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*batch n"], num_rows: int
 ) -> Float[Tensor, "*batch n n"]:
-    """Return the inverse of the R of a QR decomposition; refuse linearly dependent columns.
-
-    Args:
-        upper: R of the columns divided by ``scale``.
-        scale: scale of each column; 0 for a column that is 0 on every row.
-        num_rows: number of rows.
+    """Return the inverse of the R of the columns divided by ``scale``, which is 0 for a column of zeros.
 
     Raises:
         RankDeficientError: columns are dependent, or a column is 0.
@@ -82,6 +86,21 @@ def refuse_dependent(
     inverse = torch.linalg.inv_ex(upper).inverse if k == n else upper.new_full((*upper.shape[:-2], n, n), torch.inf)
     _refuse_small_ratio(upper, inverse, tolerance)
     return inverse
+
+
+_CONDITION = 1e3
+"""Largest ratio of singular values of the scaled columns at which sums of their products keep ten digits.
+
+Sums of products of the columns lose digits by its square, six of sixteen here."""
+
+
+def nearly_dependent(upper: Float[Tensor, "k n"]) -> bool:
+    """Whether products of the columns of this R would lose the digits that distinguish them.
+
+    Columns such as a time in seconds and an intercept need a change of basis before sums are formed.
+    """
+    singular = torch.linalg.svdvals(upper / torch.linalg.vector_norm(upper, dim=0))
+    return not bool(singular[0] <= _CONDITION * singular[upper.shape[-1] - 1])
 
 
 def _refuse_small_ratio(upper: Tensor, inverse: Tensor, tolerance: float) -> None:

@@ -68,9 +68,6 @@ class ResidualRange(NamedTuple):
     low: Float64[Tensor, " m"]
     high: Float64[Tensor, " m"]
 
-    def with_others(self, other: ResidualRange) -> ResidualRange:
-        return ResidualRange(torch.minimum(self.low, other.low), torch.maximum(self.high, other.high))
-
     def half(self) -> Float64[Tensor, " m"]:
         """Half the range."""
         return 0.5 * (self.high - self.low)
@@ -82,6 +79,31 @@ class PassResult(NamedTuple):
     total: Sums
     curvature: CurvatureSums | None
     extent: ResidualRange | None
+
+    def flat(self) -> Float64[Tensor, " k"]:
+        """All sums as one vector, which adds up over blocks, batches and ranks."""
+        return torch.cat([value.reshape(-1) for value in (*self.total, *(self.curvature or ()))])
+
+    @staticmethod
+    def of_flat(flat: Float64[Tensor, " k"], m: int, n: int, extent: ResidualRange | None = None) -> PassResult:
+        """The sums of :meth:`flat`, of m channels of n columns."""
+        shapes = _shapes(m, n)
+        sizes = [torch.Size(shape).numel() for shape in shapes]
+        count = len(shapes) if len(flat) == sum(sizes) else len(Sums._fields)
+        fields = [part.reshape(shape) for part, shape in zip(flat.split(sizes[:count]), shapes, strict=False)]
+        total, more = fields[: len(Sums._fields)], fields[len(Sums._fields) :]
+        return PassResult(Sums(*total), CurvatureSums(*more) if more else None, extent)
+
+
+def _shapes(m: int, n: int) -> list[tuple[int, ...]]:
+    """Shapes of the fields of :class:`Sums` and of :class:`CurvatureSums`."""
+    return [(m,), (m,), (5, m), (m, n), (n, n), (n, n), (m, n), (m, n), (m,), (1,)]
+
+
+def flat_length(m: int, n: int, *, with_curvature: bool) -> int:
+    """Length of :meth:`PassResult.flat`."""
+    shapes = _shapes(m, n)[: None if with_curvature else len(Sums._fields)]
+    return sum(torch.Size(shape).numel() for shape in shapes)
 
 
 def energy_of(total: Sums, kappa: Float64[Tensor, " m"]) -> Derivatives:

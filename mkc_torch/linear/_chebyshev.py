@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.independent_rows import independent_rows, taken
 from mkc_torch._support.side_by_side import side_by_side, steps_between_tests
 from mkc_torch._support.small_factors import null_vector, solve
 
@@ -20,11 +21,10 @@ _STALLED = 10
 
 @dataclass(frozen=True)
 class Minimax:
-    """Coefficients, largest absolute residual of the rows in use, number of exchanges, and whether it is optimal."""
+    """Coefficients, largest absolute residual of the rows in use, and whether it is optimal."""
 
     beta: Float[Tensor, "P n"]
     height: Float[Tensor, " P"]
-    n_iter: Tensor
     converged: Tensor
 
 
@@ -52,18 +52,11 @@ def minimax(
     *,
     max_iter: int = 1000,
 ) -> Minimax:
-    """Minimise the largest ``|target - rows beta|`` over the rows in use, in float64.
+    """Minimise the largest ``|target - rows beta|`` over the rows in use, of full rank and more than n, in float64.
 
     The simplex method on the dual. A vertex is n + 1 rows with the signs of their residuals. The row of the largest
     residual enters, and the ratio test chooses the row that leaves. After some exchanges without growth of the height
-    the rows are taken in order (Bland's rule), which cannot cycle.
-
-    Args:
-        rows: of full column rank among the rows in use, of which there are more than n.
-        target: targets.
-        used: mask of the rows in use.
-        guess: coefficients whose largest residuals are a good first choice of rows.
-        max_iter: largest number of exchanges.
+    the rows are taken in order (Bland's rule), which cannot cycle. The largest residuals of ``guess`` choose the first.
 
     References:
         Stiefel, "Note on Jordan elimination, linear programming and Tchebycheff approximation", Numerische Mathematik 2
@@ -78,7 +71,7 @@ def minimax(
     basis = _first_rows(everywhere, centred, used)
     eps = torch.finfo(torch.float64).eps
     floor = 64 * eps * (target.abs() * used).amax(-1)
-    normal = null_vector(_take(everywhere, basis))
+    normal = null_vector(taken(everywhere, basis))
     sign = torch.where(normal < 0, -1.0, 1.0).to(target)
     negative = (normal * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
     sign = torch.where(negative, -sign, sign)
@@ -87,7 +80,6 @@ def minimax(
     height = target.new_zeros(P)
     best = target.new_full((P,), -1.0)
     stalled = torch.zeros(P, dtype=torch.long, device=target.device)
-    n_iter = torch.zeros_like(stalled)
     moving = torch.ones(P, dtype=torch.bool, device=target.device)
     last = torch.zeros(n + 1, dtype=target.dtype, device=target.device)
     last[-1] = 1.0
@@ -110,7 +102,6 @@ def minimax(
         if every == 1:
             at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
             left = left[left]
-        n_iter[at] += left
         grown = height[at] > best[at] + floor[at]
         stalled[at] = torch.where(grown, 0, stalled[at] + 1)
         best[at] = torch.maximum(best[at], height[at])
@@ -127,11 +118,7 @@ def minimax(
         stays = ~left.unsqueeze(-1)
         basis[at] = torch.where(stays, basis[at], basis[at].scatter(1, leave, enter))
         sign[at] = torch.where(stays, sign[at], sign[at].scatter(1, leave, enter_sign))
-    return Minimax(beta + guess, height, n_iter, ~moving)
-
-
-def _take(rows: Float[Tensor, "P R n"], index: Int[Tensor, "P k"]) -> Float[Tensor, "P k n"]:
-    return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
+    return Minimax(beta + guess, height, ~moving)
 
 
 def _first_rows(
@@ -140,16 +127,6 @@ def _first_rows(
     """n linearly independent rows, preferably with large residuals, and of the others that with the largest."""
     size = residual.abs() + 1e-3 * (residual.abs() * used).amax(-1, keepdim=True)
     size = torch.where(used, size.clamp(min=torch.finfo(size.dtype).tiny ** 0.5), 0.0)
-    free = rows * used.unsqueeze(-1)
-    dependent = 1e-8 * torch.linalg.vector_norm(free, dim=-1)
-    chosen: list[Tensor] = []
-    for _ in range(rows.shape[-1]):
-        length = torch.linalg.vector_norm(free, dim=-1)
-        pivot = torch.where(length > dependent, length * size, 0.0).argmax(-1)
-        chosen.append(pivot)
-        row = free.gather(1, pivot[:, None, None].expand(-1, 1, rows.shape[-1]))
-        direction = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
-        free = free - torch.matmul(free, direction.mT) * direction
-    taken = torch.stack(chosen, -1)
-    rest = size.scatter(1, taken, -1.0)
-    return torch.cat([taken, rest.argmax(-1, keepdim=True)], -1)
+    chosen = independent_rows(rows, size, used, 1e-8)
+    rest = size.scatter(1, chosen, -1.0)
+    return torch.cat([chosen, rest.argmax(-1, keepdim=True)], -1)

@@ -182,14 +182,7 @@ def concentrate(
 ) -> Concentrated:
     """Make concentration steps from every start, each until its log scale falls by no more than ``tolerance``.
 
-    Args:
-        problem: small problems of one channel.
-        beta: starts, in the basis.
-        options: the scale.
-        near: first guess of an M-scale at the starts.
-        max_iter: most steps; 0 computes the scale at the starts.
-        tolerance: minus infinity makes ``max_iter`` steps in any case.
-        keeps: whether the scale before a step is the first guess after it.
+    ``near`` is the first guess of an M-scale at the starts; ``keeps``: the scale before a step is that after it.
     """
     count, starts, n = beta.shape
     given = kernel_data(problem)

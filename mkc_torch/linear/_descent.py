@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.likelihood import DensityState, Derivatives, likelihood_derivatives, newton_proposal
-from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, Sums, energy_of
+from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, energy_of
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns, free_unknowns, inverse_where, moved
 
 if TYPE_CHECKING:
@@ -34,6 +34,13 @@ class PassDerivatives(NamedTuple):
     tilt: Float64[Tensor, "m n"]
     grams: Float64[Tensor, "m n n"]
 
+    @staticmethod
+    def of(result: PassResult, grams: Float64[Tensor, "m n n"]) -> PassDerivatives:
+        """The derivatives at the point of a pass with curvature."""
+        assert result.curvature is not None
+        unit = result.total.weight.sum()
+        return PassDerivatives(result.curvature.curvature / unit, result.curvature.tilt / unit, grams)
+
 
 class EvaluatedPoint(NamedTuple):
     """Mean negative log-likelihood at a point, with its derivatives; coefficients in units of the least d."""
@@ -44,27 +51,20 @@ class EvaluatedPoint(NamedTuple):
     gradient: Float64[Tensor, "1 p"]
     hessian: Float64[Tensor, "1 p p"]
     by_channel: Derivatives
+    result: PassResult
 
 
 def _state(fit_state: FitState, point: Unknowns) -> DensityState:
-    assert fit_state.log_bound is not None
-    assert fit_state.log_d_min is not None
-    kappa, log_d = point.kappa[0], point.log_d[0]
+    kappa, log_d, (least, bound) = point.kappa[0], point.log_d[0], fit_state.limits
     damping = torch.full_like(kappa, 1e-3)
-    return DensityState(
-        kappa,
-        log_d,
-        fit_state.log_bound[0],
-        fit_state.log_d_min[0],
-        damping,
-        damping,
-        fit_state.free_kappa,
-        fit_state.free_d,
-    )
+    free = fit_state.free_kappa, fit_state.free_d
+    return DensityState(kappa, log_d, bound[0], least[0], damping, damping, *free)
 
 
-def _place(fit_state: FitState, point: Unknowns, total: Sums, slopes: PassDerivatives, unit: Tensor) -> EvaluatedPoint:
-    kappa = point.kappa[0].unsqueeze(-1)
+def _place(
+    fit_state: FitState, point: Unknowns, result: PassResult, slopes: PassDerivatives, unit: Tensor
+) -> EvaluatedPoint:
+    total, kappa = result.total, point.kappa[0].unsqueeze(-1)
     total_weight = total.weight.sum()
     share = total.weight / total_weight
     by_channel = likelihood_derivatives(
@@ -82,19 +82,16 @@ def _place(fit_state: FitState, point: Unknowns, total: Sums, slopes: PassDeriva
     )
     gradient = torch.cat([-score.sum(0), share * by_channel.kappa, share * by_channel.log_d])
     value = by_channel.value
-    return EvaluatedPoint(
-        point, float((share * value).sum()), float(value.sum()), gradient.unsqueeze(0), hessian.unsqueeze(0), by_channel
-    )
+    mean, summed = float((share * value).sum()), float(value.sum())
+    return EvaluatedPoint(point, mean, summed, gradient.unsqueeze(0), hessian.unsqueeze(0), by_channel, result)
 
 
 def _newton_move(fit_state: FitState, at: EvaluatedPoint) -> Float64[Tensor, "1 p"] | None:
     """Newton step, with components that would cross a limit stopped there; None where the Hessian is not positive."""
-    assert fit_state.log_bound is not None
-    assert fit_state.log_d_min is not None
-    kappa, log_d = at.point.kappa, at.point.log_d
+    kappa, log_d, (least, bound) = at.point.kappa, at.point.log_d, fit_state.limits
     open_end = torch.full_like(at.point.beta, math.inf)
-    low = torch.cat([-open_end, -kappa, fit_state.log_d_min - log_d], -1)
-    high = torch.cat([open_end, KAPPA_MAX - kappa, fit_state.log_bound - log_d], -1)
+    low = torch.cat([-open_end, -kappa, least - log_d], -1)
+    high = torch.cat([open_end, KAPPA_MAX - kappa, bound - log_d], -1)
     keep = free_unknowns(fit_state, at.point, at.gradient)
     fixed = torch.zeros_like(at.gradient)
     while True:
@@ -148,7 +145,6 @@ class Descent:
         slow: share of the length of a step that the next may have; beyond it, the next pass computes the curvature.
         alike: whether ``slopes`` are of similar rows; otherwise the first pass computes the curvature too.
         best: the accepted point of least value.
-        result: sums at ``best``.
         curvature_sums: sums of the last pass near the maximum that computed the curvature.
         length, left: length of the last step and expected length of the next, in standard errors.
         move: the last step.
@@ -166,7 +162,6 @@ class Descent:
     slow: float = math.inf
     alike: bool = True
     best: EvaluatedPoint | None = None
-    result: PassResult | None = None
     curvature_sums: CurvatureSums | None = None
     length: float = math.inf
     left: float = math.inf
@@ -205,16 +200,15 @@ class Descent:
         total_weight, close = total.weight.sum(), self.close
         now = self
         if more is not None:
-            slopes = PassDerivatives(more.curvature / total_weight, more.tilt / total_weight, self.slopes.grams)
-            now = replace(self, slopes=slopes, alike=True)
+            now = replace(self, slopes=PassDerivatives.of(result, self.slopes.grams), alike=True)
         if more is not None or self.fresh:
             now = replace(now, curvature_sums=more if close else None)
-        here = _place(now.fit_state, now.point, total, now.slopes, now.unit)
+        here = _place(now.fit_state, now.point, result, now.slopes, now.unit)
         rounding = _rounding_length(now.point, now.slopes, total_weight)
         best = now.best
         if best is not None and not here.value <= best.value + _slack(best.value, rounding, total_weight) + slack:
             return now._shorter_step(best)
-        now = replace(now, best=here, result=result, history=(*now.history, here.per_sample))
+        now = replace(now, best=here, history=(*now.history, here.per_sample))
         move = _newton_move(now.fit_state, here)
         if move is None:
             return now._moved(here, _plain_move(now.fit_state, here, now.slopes, now.unit), plain=True)
@@ -225,11 +219,17 @@ class Descent:
         slow = rate > now.slow and more is None and not math.isinf(now.length)
         return replace(now, left=length * rate, length=length, alike=not slow)._moved(here, move, plain=False)
 
+    @property
+    def end(self) -> tuple[EvaluatedPoint, CurvatureSums]:
+        """The best point, and the curvature sums, of a descent that is done."""
+        assert self.best is not None
+        assert self.curvature_sums is not None
+        return self.best, self.curvature_sums
+
     def stepped(self) -> Unknowns:
         """The point after the step at which the descent ended."""
-        assert self.best is not None
         assert self.move is not None
-        return moved(self.fit_state, self.best.point, self.move, self.unit, self.point.kappa.shape[-1])
+        return moved(self.fit_state, self.end[0].point, self.move, self.unit, self.point.kappa.shape[-1])
 
     def _moved(self, start: EvaluatedPoint, move: Tensor, *, plain: bool) -> Descent:
         m = self.point.kappa.shape[-1]
@@ -242,19 +242,3 @@ class Descent:
             return self._moved(best, 0.25 * self.move, plain=True)
         move = _plain_move(self.fit_state, best, self.slopes, self.unit)
         return replace(self, alike=math.isinf(self.slow))._moved(best, move, plain=True)
-
-
-def sandwich_of(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
-    """Sandwich covariance of the coefficients for independent samples.
-
-    Args:
-        found: sums at the solution.
-        used: number of values in use.
-        left: degrees of freedom; without any, no residual is left to estimate the errors from.
-    """
-    if left <= 0:
-        return torch.full_like(found.curvature, torch.inf)
-    root = found.curvature.diagonal().rsqrt()
-    outer = root.unsqueeze(-1) * root
-    inverse = outer * torch.linalg.pinv(outer * found.curvature, hermitian=True)
-    return used / left * inverse @ found.spread @ inverse

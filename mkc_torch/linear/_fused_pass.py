@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._blocks import CurvatureSums, Density, PassResult, ResidualRange, Sums
+from mkc_torch.linear._blocks import Density, PassResult, ResidualRange, flat_length
 from mkc_torch.linear._pass_kernel import pass_kernel
 from mkc_torch.linear.summary import LIGHT
 from mkc_torch.losses.kernels.cached import CachedKernel
@@ -34,9 +34,6 @@ _PRODUCTS = 2048
 _LEAST_BLOCK = 4
 """Rows of a block, at least."""
 
-_SCALARS = 9
-"""Sums per program that are not of columns; two are the range of the residuals."""
-
 _KERNEL = CachedKernel(pass_kernel)
 
 
@@ -50,19 +47,16 @@ def fused_pass(
     with_curvature: bool,
     weights: Float[Tensor, "N 1"] | None = None,
 ) -> PassResult:
-    """The sums of a pass over rows of one channel; results are on the CPU, and the range is always included.
+    """The sums of a pass over rows of any strides, with the range; the point and the results are on the CPU.
 
-    Args:
-        x, y, weight: rows, of any strides.
-        beta, density: point of the pass, on the CPU.
-        with_curvature: whether to form the curvature sums.
-        weights: filled with the weights of the density, contiguous.
+    ``weights``, contiguous, are filled with the weights of the density.
     """
     n = x.shape[1]
     columns = max(1 << (n - 1).bit_length(), 2)
     block = min(_BLOCK, max(_LEAST_BLOCK, _PRODUCTS // columns**2)) if with_curvature else _BLOCK
     programs = min(_PROGRAMS, -(-len(y) // block))
-    length = _SCALARS + n + (2 * n * n + 2 * n + 2 if with_curvature else 0)
+    # the two ends of the range come first
+    length = 2 + flat_length(1, n, with_curvature=with_curvature)
     point = torch.cat([density.kappa, 0.5 / density.d.square(), beta]).to(y.device)
     partial = torch.empty(programs, length, dtype=torch.float64, device=y.device)
     _KERNEL.launch(
@@ -73,10 +67,4 @@ def fused_pass(
         _WARPS,
     )
     flat = torch.cat([partial[:, :1].amin(0), partial[:, 1:2].amax(0), partial[:, 2:].sum(0)]).cpu()
-    low, high, total, residual = (flat[i : i + 1] for i in range(4))
-    sums = Sums(total, residual, flat[4:_SCALARS].unsqueeze(-1), flat[_SCALARS : _SCALARS + n].unsqueeze(0))
-    if not with_curvature:
-        return PassResult(sums, None, ResidualRange(low, high))
-    curvature, spread, tilt, moment, square, light = flat[_SCALARS + n :].split([n * n, n * n, n, n, 1, 1])
-    more = CurvatureSums(curvature.view(n, n), spread.view(n, n), tilt.unsqueeze(0), moment.unsqueeze(0), square, light)
-    return PassResult(sums, more, ResidualRange(low, high))
+    return PassResult.of_flat(flat[2:], 1, n, ResidualRange(flat[:1], flat[1:2]))

@@ -22,16 +22,11 @@ def robust_r_squared(
     """Share of the weighted spread that the fit explains, consistent for Gaussian errors.
 
     ``(S - R) / (S + R (a - 1))``: S is the weighted sum of squares about the weighted mean (about 0 where the columns
-    contain no constant), R that of the residuals, and a is ``ratio``.
+    contain no constant), R that of the residuals, and a, ``ratio``, is
+    ``E w / E w z²`` for Gaussian errors: 1 for equal weights, 1.2076 for the bisquare at 95 % efficiency.
 
     Renaud & Victoria-Feser, "A robust coefficient of determination for regression", Journal of Statistical Planning and
     Inference 140 (2010) 1852-1862, the version with the correction for consistency.
-
-    Args:
-        problem: the regression.
-        beta: coefficients in the basis.
-        weight: weight of each value in the fit.
-        ratio: ``E w / E w z²`` for Gaussian errors: 1 for equal weights, 1.2076 for the bisquare at 95 % efficiency.
     """
     w = weighted(problem, weight)
     total = w.sum(-2, keepdim=True).clamp(min=torch.finfo(w.dtype).tiny)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import torch
 from torch import Tensor
@@ -15,8 +15,8 @@ from mkc_torch._support.student_t import fisher_tail, student_quantile, student_
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
 from mkc_torch.linear._influence import ScaleInfluence, Scores, degrees_of_freedom, influence, robust_covariance
-from mkc_torch.linear.covariance import RobustCovarianceKind, checked_bandwidth, checked_robust_kind
-from mkc_torch.linear.summary import LIGHT, Summary, one_problem
+from mkc_torch.linear.covariance import RobustCovarianceKind, checked_bandwidth, checked_kind
+from mkc_torch.linear.summary import LIGHT, Summary, coefficients_of, one_problem
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -166,18 +166,11 @@ class Inference(LinearEstimator):
         interval = self.confidence_interval(level)
         at = one_problem(problem, tuple(self.dof_.shape))
         names = self.__dict__.get("feature_names_in_") if names is None else names
-        squared = getattr(self, "r_squared_", None)
-        return Summary.of(
-            title=type(self).__name__,
-            names=names,
-            columns=(self.coef_[at], self.standard_error_[at], self.p_value_[at], interval[at]),
-            level=level,
-            light=self._light(at),
-            scale=self.scale_[at].tolist() if "scale_" in self.__dict__ else [],
-            r_squared=[] if squared is None else squared[at].tolist(),
-            dof=float(self.dof_[at]),
-            kind=str(self.__dict__["covariance"]),
-        )
+        rows = coefficients_of(names, (self.coef_[at], self.standard_error_[at], self.p_value_[at], interval[at]))
+        facts = (vars(self).get("scale_"), vars(self).get("r_squared_"))
+        scale, r_squared = (() if fact is None else tuple(fact[at].tolist()) for fact in facts)
+        dof, kind = float(self.dof_[at]), str(vars(self)["covariance"])
+        return Summary(type(self).__name__, rows, level, *self._light(at), scale, r_squared, dof, kind)
 
     def _light(self, problem: tuple[int, ...]) -> tuple[int, int]:
         """Number of values, and how many of them have a weight below :data:`LIGHT`."""
@@ -238,7 +231,7 @@ class RobustInference(Inference):
     r_squared_: Float[Tensor, "*batch m"]
 
     def _set_covariance(self, covariance: RobustCovarianceKind, bandwidth: float | None) -> None:
-        self.covariance = checked_robust_kind(covariance)
+        self.covariance = checked_kind(covariance, get_args(RobustCovarianceKind))
         self.bandwidth = checked_bandwidth(bandwidth)
 
     def _infer(

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.small_factors import pinv, symmetric_pinv
-from mkc_torch.linear.covariance import RobustCovarianceKind, andrews_bandwidth, long_run_covariance
+from mkc_torch.linear.covariance import RobustCovarianceKind, summed_products
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -47,10 +47,10 @@ class Scores:
     def by_scale(self, problem: LinearProblem) -> Float[Tensor, "B m n"]:
         """Negative derivative of the equation by the log scale of each channel."""
         part = weighted(problem, (self.slope * self.z + self.psi) * self.scale.unsqueeze(-2) * self.precision())
-        return _summed(problem, part)
+        return summed(problem, part)
 
 
-def _summed(problem: LinearProblem, values: Float[Tensor, "B N m"]) -> Float[Tensor, "B m n"]:
+def summed(problem: LinearProblem, values: Float[Tensor, "B N m"]) -> Float[Tensor, "B m n"]:
     """``Σ value x`` of each channel."""
     return torch.einsum("bkc,bkcn->bcn", values, problem.basis.expand(values.shape[0], -1, -1, -1))
 
@@ -90,14 +90,9 @@ def m_scale_influence(
     z: Float[Tensor, "B N m"],
     scale: Float[Tensor, "B m"] | None = None,
 ) -> ScaleInfluence:
-    """Influence on a scale that solves ``Σ ρ(z) = const``, z = r / s.
+    """Influence on a scale that solves ``Σ ρ(z) = const``, z = r / s, with ρ and its ``slope`` at z.
 
-    Args:
-        problem: the regression.
-        rho, slope: ρ and ρ' of the standardised residuals.
-        z: standardised residuals.
-        scale: the scale, if the residuals depend on the coefficients and these therefore move it; None where the scale
-            is at its minimum.
+    ``scale`` is given where the coefficients move the scale; None is for a scale at its minimum.
     """
     total = problem.total_weight().unsqueeze(-2)
     centre = weighted(problem, rho).sum(-2, keepdim=True) / total
@@ -105,7 +100,7 @@ def m_scale_influence(
     of_samples = (rho - centre) / slope_sum
     if scale is None:
         return ScaleInfluence(of_samples)
-    return ScaleInfluence(of_samples, -_summed(problem, weighted(problem, slope) / (slope_sum * scale.unsqueeze(-2))))
+    return ScaleInfluence(of_samples, -summed(problem, weighted(problem, slope) / (slope_sum * scale.unsqueeze(-2))))
 
 
 def influence(
@@ -114,14 +109,7 @@ def influence(
     of_scale: ScaleInfluence | None = None,
     share: Float[Tensor, "B N m"] | None = None,
 ) -> Float[Tensor, "B N n"]:
-    """Influence of each sample on the coefficients in the basis.
-
-    Args:
-        problem: the regression.
-        equation: estimating equation of the coefficients.
-        of_scale: influence on the log scales; None for known scales.
-        share: factor of each sample's influence, from :func:`shares`; 1 by default.
-    """
+    """Influence of each sample, times its ``share``, on the coefficients in the basis; scales are known by default."""
     values = equation.psi * equation.scale.unsqueeze(-2) * equation.precision()
     values = values if share is None else values * share
     moved = torch.matmul(values.unsqueeze(-2), problem.basis).squeeze(-2)
@@ -168,27 +156,17 @@ def robust_covariance(
     kind: RobustCovarianceKind,
     bandwidth: float | None,
 ) -> Float[Tensor, "*batch n n"]:
-    """Covariance of the user's coefficients.
+    """Covariance of the user's coefficients; ``influence_of`` returns influences in the basis, for given factors.
 
-    Args:
-        problem: the regression.
-        equation: estimating equation of the coefficients.
-        influence_of: returns the influence of each sample on the coefficients in the basis, for given factors.
-        kind: "sandwich" and "hac" sum the products of influences, times N / (N - n).
-        bandwidth: whole lags of "hac"; None takes Andrews' rule.
+    "sandwich" and "hac" sum the products of influences, times N / (N - n).
     """
     left = degrees_of_freedom(problem)
     if kind == "homoscedastic":
         in_basis = homoscedastic(problem, equation)
     else:
         moved = influence_of(shares(problem, in_time=kind == "hac"))
-        if kind == "hac":
-            lags = andrews_bandwidth(moved) if bandwidth is None else moved.new_full(moved.shape[:1], bandwidth)
-            in_basis = long_run_covariance(moved, lags)
-        else:
-            in_basis = torch.matmul(moved.mT, moved)
-        total = problem.total_weight().sum(-1)
-        in_basis = (total / left.clamp(min=1.0))[:, None, None] * in_basis
+        factor = problem.total_weight().sum(-1) / left.clamp(min=1.0)
+        in_basis = factor[:, None, None] * summed_products(moved, kind, bandwidth)
     covariance = torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT)
     # with as many coefficients as values no residual is left to estimate the errors from
     return problem.restore(torch.where((left > 0)[:, None, None], covariance, torch.inf))

@@ -1,4 +1,4 @@
-"""MKC-EM on many rows: a pilot fit to few rows, and Newton steps on all.
+"""MKC-EM on many rows in memory or on a GPU: a pilot fit to few rows, and Newton steps on all.
 
 The steps start at the result of the pilot, with the curvature of a few more rows, so that few passes over all rows are
 needed; four or five are usual. They end where a step with the curvature of all rows would be shorter than a millionth
@@ -16,12 +16,13 @@ from torch import Tensor
 
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
-from mkc_torch.density.normalizer import log_partition_value
+from mkc_torch.linear._basis import nearly_dependent
 from mkc_torch.linear._blocks import Density, PassResult
-from mkc_torch.linear._descent import Descent, PassDerivatives, sandwich_of
+from mkc_torch.linear._descent import Descent, PassDerivatives
 from mkc_torch.linear._implicit.stationary import FitState
+from mkc_torch.linear._many_rows import RowsMaximum, descended, likelier_gaussian, maximum_of
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
-from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
+from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at, rows_of
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
 from mkc_torch.linear._rows import Rows
@@ -50,9 +51,6 @@ _TAILS = (0.1, 0.2, 0.4, 1.5)
 _FOR_SLOPES = 8
 """Rows for the first curvature, in multiples of the pilot's rows: each step then leaves a twentieth of the distance."""
 
-_CONDITION = 1e3
-"""Largest ratio of singular values of X, with scaled columns, at which sums are formed without a change of basis."""
-
 _SLACK = 2.0
 """Factor on the bound of the gain of least squares, since the pilot's products only approximate those of all."""
 
@@ -70,99 +68,71 @@ def is_large(values: CanonicalShapes) -> bool:
 
 def problem_in_basis(problem: LinearProblem) -> CanonicalShapes:
     """Return a problem whose X is the basis of ``problem``."""
-    basis, batch = problem.basis, problem.batch
-    if basis.shape[0] == 1:
-        basis = basis.expand(batch.numel(), *basis.shape[1:])
-    weight = problem.sample_weight
+    basis = problem.basis.expand(problem.Y.shape[0], -1, -1, -1)
+    weight = None if problem.sample_weight is None else problem.restore(problem.sample_weight)
     return CanonicalShapes(
-        basis.reshape(*batch, *basis.shape[1:]),
-        problem.Y.reshape(*batch, *problem.Y.shape[1:]),
-        None if weight is None else weight.reshape(*batch, *weight.shape[1:]),
-        batch,
-        problem.single_channel,
+        problem.restore(basis), problem.restore(problem.Y), weight, problem.batch, problem.single_channel
     )
 
 
 @dataclass(frozen=True)
-class LargeMaximum:
-    """Maximum of the likelihood of all rows, for the columns of X; only ``fit_state`` is a batch, of size 1."""
+class _InMemory:
+    """Rows as a source of passes; a pass that may be the last fills ``weights``."""
 
-    coef: Float64[Tensor, " n"]
-    fit_state: FitState
+    rows: Rows
     weights: Float[Tensor, "N m"]
-    log_likelihood: Float64[Tensor, ""]
-    covariance: Float64[Tensor, "n n"]
-    dof: Float64[Tensor, ""]
-    history: Float64[Tensor, " k"]
+
+    def evaluate(self, descent: Descent, *, with_range: bool = False) -> PassResult:
+        return self.rows.evaluate(
+            descent.point.beta[0],
+            descent.density(),
+            with_curvature=descent.with_curvature,
+            with_range=with_range,
+            weights=self.weights if descent.close else None,
+        )
+
+    def after(self, descent: Descent, result: PassResult) -> Descent:
+        return descent.after(result)
 
 
-def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: int, seed: int) -> LargeMaximum | None:
-    """Maximise the likelihood of one problem of many rows.
+def large_maximum(
+    values: CanonicalShapes, known: FixedParameters, *, max_iter: int, seed: int
+) -> tuple[RowsMaximum, Float[Tensor, "N m"]] | None:
+    """Maximise the likelihood of one problem of many rows; return the maximum and the weights of the values.
 
     Returns None if values are not finite, no pilot represents all rows, the rough fit finds no head, most values are
     fitted exactly, d ends at its least, a Gaussian has a higher likelihood than the result, or the passes do not
     converge. An alternation over all rows then reports the error or finds the maximum.
     """
-    rows, passes = _rows_of(values), min(max_iter, _PASSES)
+    rows, passes = rows_of(values), min(max_iter, _PASSES)
     pilot = _pilot(values, known, max_iter, seed) if _is_valid(rows) else None
     if pilot is None:
         return None
     rows, fit_state = replace(rows, frame=pilot.frame), pilot.fit_state
+    source = _InMemory(rows, torch.empty_like(rows.Y))
     # rows drawn by leverage do not represent the curvature of all rows, and another draw may lack rare rows
     count = pilot.problem.num_samples
     slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
     first: PassResult | None = None
     if known.bound is None:
+        descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
         # the sums do not depend on the domain, so this is also the first pass of the descent
-        begin = rows.evaluate(fit_state.beta[0], _density(fit_state), with_range=True)
+        begin = source.evaluate(descent, with_range=True)
         half = torch.maximum(_half_range(begin), TIGHT * pilot.begin.scale)
         fit_state = replace(fit_state, log_bound=torch.log(half))
-        descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
-        end = _descended(rows, descent, passes, first=begin, with_range=True) if pilot.alike else None
-        if end is not None and end.result is not None:
-            fit_state, first = _moved(fit_state, end), end.result
-        fit_state, same = _on_final_domain(pilot, known, fit_state, begin if first is None else first)
-        first = first if same else None
-    weights = torch.empty_like(rows.Y)
+        if pilot.alike:
+            end = descended(source, replace(descent, fit_state=fit_state), passes, begin, with_range=True)
+            if end.done and end.best is not None:
+                point, begin = end.point, end.best.result
+                fit_state = replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
+        fit_state, same = _on_final_domain(pilot, known, fit_state, begin)
+        first = begin if same else None
     descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
-    end = _descended(rows, descent, passes, weights, first)
-    if end is None or _d_is_at_its_least(end) or _gaussian_is_more_likely(rows, end):
+    end = descended(source, descent, passes, first)
+    if not end.done or _d_is_at_its_least(end) or _gaussian_is_likelier(rows, end):
         return None
-    return _result(rows, end, weights)
-
-
-def _descended(
-    rows: Rows,
-    descent: Descent,
-    passes: int,
-    weights: Float[Tensor, "N m"] | None = None,
-    first: PassResult | None = None,
-    *,
-    with_range: bool = False,
-) -> Descent | None:
-    """The end of a descent; None if that takes too many passes.
-
-    Args:
-        rows: rows whose likelihood is maximised.
-        descent: state before the first pass.
-        passes: largest number of passes.
-        weights: filled with the weights at the end.
-        first: result at the starting point, if known.
-        with_range: whether to compute the range of the residuals too.
-    """
-    for _ in range(passes):
-        if first is None or descent.close:
-            first = rows.evaluate(
-                descent.point.beta[0],
-                descent.density(),
-                with_curvature=descent.with_curvature,
-                with_range=with_range,
-                weights=weights if descent.close else None,
-            )
-        descent, first = descent.after(first), None
-        if descent.done:
-            return descent
-    return None
+    used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
+    return maximum_of(end, used, rows.frame, with_last_step=False), source.weights
 
 
 @dataclass(frozen=True)
@@ -216,23 +186,8 @@ def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
     return found.extent.half()
 
 
-def _density(fit_state: FitState) -> Density:
-    return Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
-
-
 def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
-    return replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
-
-
-def _moved(fit_state: FitState, end: Descent) -> FitState:
-    point = end.point
-    return replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
-
-
-def _rows_of(values: CanonicalShapes) -> Rows:
-    X, Y, weight = values.X, values.Y, values.sample_weight
-    weight = None if weight is None else weight.reshape(weight.shape[-2:])
-    return Rows(X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:]), weight)
+    return replace(rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
 
 
 def _is_valid(rows: Rows) -> bool:
@@ -250,102 +205,41 @@ def _is_valid(rows: Rows) -> bool:
 
 def _d_is_at_its_least(end: Descent) -> bool:
     """Whether d ended at its least, which is that of the pilot."""
-    assert end.fit_state.log_d_min is not None
-    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.log_d_min).any())
+    return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.limits[0]).any())
 
 
 def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
-    """The pilot's basis where columns of X are nearly dependent, such as a time in seconds and an intercept; else None.
-
-    The products of such columns would lose the digits that distinguish them.
-    """
-    upper = torch.linalg.inv(problem.to_coef[0])
-    singular = torch.linalg.svdvals(upper / upper.square().sum(0).sqrt())
-    return None if float(singular[0]) <= _CONDITION * float(singular[-1]) else problem.to_coef[0]
+    """The pilot's basis where columns of X are nearly dependent, else None."""
+    to_coef = problem.to_coef[0]
+    return to_coef if nearly_dependent(torch.linalg.inv(to_coef)) else None
 
 
 def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
-    return FitState(
-        beta=beta,
-        kappa=state.kappa,
-        log_d=state.log_d,
-        converged=torch.zeros(1, dtype=torch.bool),
-        log_bound=state.log_bound,
-        log_d_min=state.log_d_min,
-        free_kappa=state.free_kappa,
-        free_d=state.free_d,
-    )
+    return FitState.of(beta, state, torch.zeros(1, dtype=torch.bool))
 
 
 def _slopes(rows: Rows, fit_state: FitState) -> PassDerivatives:
-    total, found, _ = rows.evaluate(fit_state.beta[0], _density(fit_state), with_curvature=True)
-    assert found is not None
-    total_weight = total.weight.sum()
-    grams = torch.stack([_gram(rows, fit_state, channel) for channel in range(rows.Y.shape[-1])])
-    return PassDerivatives(found.curvature / total_weight, found.tilt / total_weight, grams / total_weight)
+    density = Density(fit_state.kappa[0], torch.exp(fit_state.log_d[0]))
+    result = rows.evaluate(fit_state.beta[0], density, with_curvature=True)
+    return PassDerivatives.of(result, _grams(rows, fit_state) / result.total.weight.sum())
 
 
-def _gram(rows: Rows, fit_state: FitState, channel: int) -> Float64[Tensor, "n n"]:
-    """Sum of ``x xᵀ`` of a channel: the curvature of a Gaussian with d = 1."""
-    part = slice(channel, channel + 1)
-    weight = None if rows.weight is None else rows.weight[:, part]
-    own = Rows(rows.X[:, part], rows.Y[:, part], weight, rows.frame)
-    kappa = torch.zeros_like(fit_state.kappa[0, part])
-    found = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True).curvature
-    assert found is not None
-    return found.curvature
+def _grams(rows: Rows, fit_state: FitState) -> Float64[Tensor, "m n n"]:
+    """Sum of ``x xᵀ`` of each channel: the curvature of a Gaussian with d = 1."""
+    found = []
+    for channel in range(rows.Y.shape[-1]):
+        part = slice(channel, channel + 1)
+        weight = None if rows.weight is None else rows.weight[:, part]
+        own = Rows(rows.X[:, part], rows.Y[:, part], weight, rows.frame)
+        kappa = torch.zeros_like(fit_state.kappa[0, part])
+        more = own.evaluate(fit_state.beta[0], Density(kappa, torch.ones_like(kappa)), with_curvature=True).curvature
+        assert more is not None
+        found.append(more.curvature)
+    return torch.stack(found)
 
 
-def _gaussian_is_more_likely(rows: Rows, end: Descent) -> bool:
-    """Whether a Gaussian at least squares has a higher likelihood than the result; with several channels, may have."""
-    assert end.best is not None
-    assert end.result is not None
-    if not (end.fit_state.free_kappa and end.fit_state.free_d) or not bool((end.point.kappa > 0).any()):
+def _gaussian_is_likelier(rows: Rows, end: Descent) -> bool:
+    """Whether a Gaussian at least squares has a higher likelihood than the result."""
+    if likelier_gaussian(end, end.slopes.grams, _SLACK) is None:
         return False
-    value, grams = end.best.by_channel.value.sum(), end.slopes.grams
-    if _gaussian_value(end, grams * end.result.total.weight.sum(), _SLACK) >= value:
-        return False
-    if grams.shape[0] > 1:
-        return True
-    return _gaussian_value(end, _gram(rows, end.fit_state, 0).unsqueeze(0), 1.0) < float(value)
-
-
-def _gaussian_value(end: Descent, grams: Float64[Tensor, "m n n"], slack: float) -> float:
-    """Mean negative log-likelihood of a Gaussian at the least squares of each channel.
-
-    Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g`` with ``g = Σ e x`` and ``G = Σ x xᵀ``.
-    """
-    fit_state, found = end.fit_state, end.curvature_sums
-    assert fit_state.log_bound is not None
-    assert fit_state.log_d_min is not None
-    assert end.result is not None
-    assert found is not None
-    root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
-    inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
-    moment = (found.moment * root).unsqueeze(-1)
-    lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
-    variance = ((found.square - slack * lowered) / end.result.total.weight).clamp(min=0.0)
-    d = torch.maximum(variance.sqrt(), torch.exp(fit_state.log_d_min[0]))
-    norm = log_partition_value(torch.zeros_like(d), torch.exp(fit_state.log_bound[0]) / d)
-    return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
-
-
-def _result(rows: Rows, end: Descent, weights: Float[Tensor, "N m"]) -> LargeMaximum:
-    assert end.best is not None
-    assert end.result is not None
-    assert end.curvature_sums is not None
-    point = end.point
-    used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
-    left = used - point.beta.shape[-1]
-    coef, covariance = point.beta[0], sandwich_of(end.curvature_sums, used, left)
-    if rows.frame is not None:
-        coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
-    return LargeMaximum(
-        coef=coef,
-        fit_state=replace(end.fit_state, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
-        weights=weights,
-        log_likelihood=-(end.result.total.weight * end.best.by_channel.value).sum(),
-        covariance=covariance,
-        dof=coef.new_tensor(float(left)),
-        history=coef.new_tensor(end.history),
-    )
+    return likelier_gaussian(end, _grams(rows, end.fit_state) / end.end[0].result.total.weight.sum()) is not None

@@ -161,14 +161,7 @@ class FixedParameters:
 def maximise(
     problem: LinearProblem, known: FixedParameters, *, max_iter: int, tol: float, seed: int
 ) -> tuple[RobustStart, LikelihoodMaximum]:
-    """Return the robust start and the maximum of the likelihood.
-
-    Args:
-        problem: the regression.
-        known: parameters that the user gave.
-        max_iter, tol: limits of the alternation.
-        seed: seed of the start.
-    """
+    """Return the robust start and the maximum of the likelihood."""
     begin = robust_start(problem, known.start, seed=seed)
     d_min = least_d(problem, begin)
     if known.bound is None:
@@ -219,13 +212,6 @@ def rough_fit(
 
     The scale of a robust start is up to twice that of the head where outliers are many and one-sided. The rough fit
     therefore uses a tight domain, on which it finds the head, or the given domain.
-
-    Args:
-        problem: the regression.
-        known: parameters that the user gave.
-        begin: the robust start.
-        max_iter: largest number of alternations.
-        tails: κ of the candidate densities at the start.
     """
     if known.bound is None:
         bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)

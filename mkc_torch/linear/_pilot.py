@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch.linear._blocks import triangle
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDeficientError, linear_problem
-from mkc_torch.linear._rows import blocks
+from mkc_torch.linear._rows import Rows, blocks
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
@@ -47,6 +47,13 @@ def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShape
         values.batch,
         values.single_channel,
     )
+
+
+def rows_of(values: CanonicalShapes) -> Rows:
+    """The rows of a single problem."""
+    X, Y, weight = values.X, values.Y, values.sample_weight
+    weight = None if weight is None else weight.reshape(weight.shape[-2:])
+    return Rows(X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:]), weight)
 
 
 def pilot_problem(values: CanonicalShapes, seed: int) -> tuple[LinearProblem, bool] | None:
@@ -91,20 +98,18 @@ def _spans(problem: LinearProblem) -> bool:
 
 def _rows_of_leverage(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"] | None:
     """Rows drawn with probability proportional to their leverage; None where columns are linearly dependent."""
-    X, Y, weight = values.X, values.Y, values.sample_weight
-    X, Y = X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:])
-    weight = None if weight is None else weight.reshape(weight.shape[-2:])
+    rows = rows_of(values)
     upper: Tensor | None = None
-    for block in blocks(X, Y, weight):
+    for block in blocks(rows.X, rows.Y, rows.weight):
         upper = triangle(block, upper)
     assert upper is not None
     inverse, info = torch.linalg.inv_ex(upper)
     if int(info) or not bool(torch.isfinite(inverse).all()):
         return None
     found = []
-    for block in blocks(X, Y, weight):
+    for block in blocks(rows.X, rows.Y, rows.weight):
         of_values = torch.matmul(block.rows, inverse).square().sum(-1)
         found.append((of_values if block.weight is None else of_values * (block.weight > 0)).sum(-1))
     cumulated = torch.cat(found).cumsum(0).cpu()
     drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=cumulated.dtype)
-    return torch.searchsorted(cumulated, drawn * cumulated[-1]).clamp(max=Y.shape[0] - 1)
+    return torch.searchsorted(cumulated, drawn * cumulated[-1]).clamp(max=rows.Y.shape[0] - 1)

@@ -181,6 +181,12 @@ class LinearProblem:
         """Reshape values of the flattened problems to the user's batch dimensions."""
         return values.reshape((*self.batch, *values.shape[1:]))
 
+    def double(self) -> LinearProblem:
+        """The same problems in float64, for what float32 cannot resolve."""
+        weight = None if self.sample_weight is None else self.sample_weight.double()
+        basis, to_coef = self.basis.double(), self.to_coef.double()
+        return replace(self, basis=basis, to_coef=to_coef, Y=self.Y.double(), sample_weight=weight)
+
     def select(self, index: Tensor) -> LinearProblem:
         """Return the problems at ``index`` as a batch."""
         shared = self.basis.shape[0] == 1
@@ -317,7 +323,8 @@ def canonical_shapes(
     _check_finite("Y", Y)
     refuse_magnitude(Y.detach().abs().max())
     if sample_weight is not None:
-        _check_weight(sample_weight, values)
+        N, m = values.Y.shape[-2:]
+        _check_weight(_as_weight(sample_weight, N, m, values.single_channel, values.Y))
     return values
 
 
@@ -326,12 +333,7 @@ def linear_problem(
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None = None,
 ) -> LinearProblem:
-    """Check X, Y and weights, and orthonormalise the columns of X.
-
-    Args:
-        X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
-        Y: targets.
-        sample_weight: non-negative weights (*, N) of samples or (*, N, m) of values; weight 0 excludes a sample.
+    """Check X, Y and weights as :meth:`LeastSquares.fit` takes them, and orthonormalise the columns of X.
 
     Raises:
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
@@ -384,9 +386,7 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
     return weight
 
 
-def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
-    N, m = values.Y.shape[-2:]
-    weight = _as_weight(sample_weight, N, m, values.single_channel, values.Y)
+def _check_weight(weight: Float[Tensor, "*batch N m"]) -> None:
     _check_finite("sample_weight", weight)
     if (weight < 0).any():
         raise ValueError(f"Expected argument `sample_weight` to be >= 0 but got {weight.min().item()}.")

@@ -74,12 +74,6 @@ _WEIGHTS: dict[PsiName, Callable[..., Tensor]] = {
 }
 
 
-def psi_weight(name: PsiName, tuning: Tuning) -> Callable[[Tensor], Tensor]:
-    """Return the function that computes the weight ψ(z) / z in [0, 1] of standardised residuals."""
-    weight = _WEIGHTS[name]
-    return lambda z: weight(z, *tuning)
-
-
 def _huber_slope(z: Tensor, k: float) -> Tensor:
     return (z.abs() < k).to(z.dtype)
 
@@ -128,6 +122,10 @@ class Psi:
     def slope(self, z: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         return _SLOPES[self.name](z, *self.tuning)
 
+    def kinks(self) -> Tuning:
+        """Positive points at which ψ is not smooth."""
+        return (math.pi * self.tuning[0],) if self.name == "andrews" else self.tuning
+
     def ratio(self) -> float:
         """``E w / E w z²`` at Gaussian residuals: 1.2076 for the bisquare at 95 % efficiency."""
         return _ratio(self)
@@ -135,8 +133,7 @@ class Psi:
 
 @lru_cache
 def _ratio(psi: Psi) -> float:
-    kinks = (math.pi * psi.tuning[0],) if psi.name == "andrews" else psi.tuning
-    return _gaussian_mean(psi.weight, kinks) / _gaussian_mean(lambda z: z.square() * psi.weight(z), kinks)
+    return _gaussian_mean(psi.weight, psi.kinks()) / _gaussian_mean(lambda z: z * psi.value(z), psi.kinks())
 
 
 def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, Tuning]:
@@ -155,14 +152,10 @@ def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, T
         given = tuple(float(t) for t in tuning) if isinstance(tuning, (tuple, list)) else (float(tuning),)
     except (TypeError, ValueError, OverflowError):
         given = ()
-    rising = all(0 < low <= high for low, high in itertools.pairwise(given))
+    rising = all(0 < low <= high for low, high in itertools.pairwise(given)) and given[-2:-1] != given[-1:]
     if len(given) != len(default) or not all(0 < t < math.inf for t in given) or not rising:
         expected = "three numbers 0 < a <= b < c" if name == "hampel" else "one positive number"
         raise ValueError(f"Expected argument `tuning` of {name!r} to be {expected} but got {tuning!r}.")
-    if name == "hampel" and given[1] == given[2]:
-        raise ValueError(
-            f"Expected argument `tuning` of 'hampel' to be three numbers 0 < a <= b < c but got {tuning!r}."
-        )
     return known, given
 
 
@@ -180,10 +173,9 @@ def _gaussian_mean(values: Callable[[Tensor], Tensor], kinks: Tuning) -> float:
 
 def gaussian_efficiency(name: PsiName, tuning: Tuning) -> float:
     """(E ψ')² / E ψ² at Gaussian residuals of known scale; E ψ' = E zψ by Stein's identity."""
-    weight = psi_weight(name, tuning)
-    kinks = (math.pi * tuning[0],) if name == "andrews" else tuning
-    slope = _gaussian_mean(lambda z: z.square() * weight(z), kinks)
-    return slope**2 / _gaussian_mean(lambda z: (z * weight(z)).square(), kinks)
+    psi = Psi(name, tuning)
+    slope = _gaussian_mean(lambda z: z * psi.value(z), psi.kinks())
+    return slope**2 / _gaussian_mean(lambda z: psi.value(z).square(), psi.kinks())
 
 
 def _bisect(function: Callable[[float], float], low: float, high: float) -> float:
@@ -209,8 +201,3 @@ def bisquare_for_breakdown(breakdown: float) -> float:
 def bisquare_rho(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Tukey's bisquare ρ scaled to a maximum of 1, for u = residual / (c · scale)."""
     return 1.0 - (1.0 - u.square().clamp(max=1.0)).pow(3)
-
-
-def bisquare_weight(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """ψ(u) / u of the bisquare, scaled to 1 at 0."""
-    return tukey_weight(u, 1.0)

@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import format_value, refuse_complex, seems_finite
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._problem import LinearProblem
-from mkc_torch.linear._scale_search import SCREENED, ScaleSearch, minimise_scale
+from mkc_torch.linear._scale_search import SCREENED, ScaleSearch, minimise_scale, rounding_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
 
@@ -138,6 +138,5 @@ def robust_start(
         checked_start(method)
         beta = problem.weighted_fit(torch.ones_like(problem.Y))
     scale = residual_scale(problem, problem.residual(beta))
-    magnitude = problem.Y.abs().amax(-2)
-    floor = 1e3 * torch.finfo(scale.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
+    floor = rounding_scale(problem)
     return RobustStart(beta, torch.maximum(scale, floor), (scale <= floor).all(-1))

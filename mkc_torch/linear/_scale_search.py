@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.elemental_sets import drawn_of_used, drawn_samples
+from mkc_torch._support.independent_rows import taken
 from mkc_torch._support.side_by_side import at_once, side_by_side, steps_between_tests
 from mkc_torch._support.small_factors import solve
 from mkc_torch.linear._concentration import ScaleOptions, concentrate, runs_kernel
@@ -87,7 +88,7 @@ def values_of_sets(
     return rows.expand(y.shape[0], -1, -1)[batch, index], y[batch, index]
 
 
-def _log_product(scale: Tensor) -> Tensor:
+def log_product(scale: Tensor) -> Tensor:
     return torch.log(scale.clamp(min=torch.finfo(scale.dtype).tiny)).sum(-1)
 
 
@@ -141,10 +142,6 @@ def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule, near: Tensor | 
     return problem.weighted_fit(weight), scale
 
 
-def _of_starts(values: Float[Tensor, "B S k"], index: Float[Tensor, "B K"]) -> Float[Tensor, "B K k"]:
-    return values.gather(1, index.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
-
-
 def scale_of(
     problem: LinearProblem, beta: Float[Tensor, "B S n"], rule: ScaleRule, near: Tensor | None = None
 ) -> Float[Tensor, "B S m"]:
@@ -164,8 +161,8 @@ def _best(
 def _smallest(
     beta: Float[Tensor, "B S n"], scale: Float[Tensor, "B S m"], count: int
 ) -> tuple[Float[Tensor, "B K n"], Float[Tensor, "B K m"]]:
-    order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
-    return _of_starts(beta, order), _of_starts(scale, order)
+    order = log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
+    return taken(beta, order), taken(scale, order)
 
 
 @dataclass(frozen=True)
@@ -178,8 +175,8 @@ class _Candidates:
     n_iter: int = 0
 
     def of_starts(self, index: Tensor) -> _Candidates:
-        scale = None if self.scale is None else _of_starts(self.scale, index)
-        return replace(self, beta=_of_starts(self.beta, index), scale=scale, converged=self.converged.gather(1, index))
+        scale = None if self.scale is None else taken(self.scale, index)
+        return replace(self, beta=taken(self.beta, index), scale=scale, converged=self.converged.gather(1, index))
 
     def select(self, index: Tensor) -> _Candidates:
         scale = None if self.scale is None else self.scale[index]
@@ -189,7 +186,7 @@ class _Candidates:
         """The ``count`` candidates with the smallest scales."""
         if self.scale is None or count >= self.beta.shape[1]:
             return self
-        return self.of_starts(_log_product(self.scale).topk(count, dim=1, largest=False).indices)
+        return self.of_starts(log_product(self.scale).topk(count, dim=1, largest=False).indices)
 
 
 def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Candidates]) -> _Candidates:
@@ -315,7 +312,7 @@ def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) ->
         here = beta[at]
         known = scale[at] if near is not None or n_iter > 1 else None
         proposal, now = _step(some, here, search.final, known)
-        before = _log_product(now)
+        before = log_product(now)
         falls = (objective[at] - before > tolerance) & moving[at]
         objective[at] = torch.minimum(objective[at], before)
         beta[at] = torch.where(falls.unsqueeze(-1), proposal, here)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -15,19 +15,14 @@ if TYPE_CHECKING:
 
 CovarianceKind = Literal["sandwich", "hac"]
 RobustCovarianceKind = Literal["sandwich", "hac", "homoscedastic"]
+Kind = TypeVar("Kind", bound=str)
 
 
-def checked_kind(kind: CovarianceKind) -> CovarianceKind:
-    """Return ``kind`` if it is valid, else raise."""
-    if kind not in ("sandwich", "hac"):
-        raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {kind!r}.")
-    return kind
-
-
-def checked_robust_kind(kind: RobustCovarianceKind) -> RobustCovarianceKind:
-    """Return ``kind`` if it is valid, else raise."""
-    if kind not in ("sandwich", "hac", "homoscedastic"):
-        raise ValueError(f"Expected argument `covariance` to be 'sandwich', 'hac' or 'homoscedastic' but got {kind!r}.")
+def checked_kind(kind: Kind, kinds: tuple[str, ...] = get_args(CovarianceKind)) -> Kind:
+    """Return ``kind`` if it is one of ``kinds``, else raise."""
+    if kind not in kinds:
+        *others, last = map(repr, kinds)
+        raise ValueError(f"Expected argument `covariance` to be {', '.join(others)} or {last} but got {kind!r}.")
     return kind
 
 
@@ -94,10 +89,15 @@ def sandwich(
         kind: "sandwich" for independent samples, "hac" for a time series.
         bandwidth: whole lags in samples that "hac" reaches over; default by :func:`andrews_bandwidth`.
     """
-    if kind == "hac":
-        lags = andrews_bandwidth(score) if bandwidth is None else score.new_full(score.shape[:-2], bandwidth)
-        middle = long_run_covariance(score, lags)
-    else:
-        middle = torch.matmul(score.mT, score)
     inverse = symmetric_pinv(curvature)
-    return dof[..., None, None] * torch.matmul(torch.matmul(inverse, middle), inverse)
+    return dof[..., None, None] * torch.matmul(torch.matmul(inverse, summed_products(score, kind, bandwidth)), inverse)
+
+
+def summed_products(
+    score: Float[Tensor, "*batch N n"], kind: RobustCovarianceKind, bandwidth: float | None
+) -> Float[Tensor, "*batch n n"]:
+    """Sum of the products of the scores of each sample and, for "hac", of those within ``bandwidth`` of it."""
+    if kind != "hac":
+        return torch.matmul(score.mT, score)
+    lags = andrews_bandwidth(score) if bandwidth is None else score.new_full(score.shape[:-2], bandwidth)
+    return long_run_covariance(score, lags)

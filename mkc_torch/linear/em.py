@@ -16,7 +16,8 @@ from mkc_torch.density.likelihood import negative_log_likelihood
 from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
-from mkc_torch.linear._large import LargeMaximum, is_large, large_maximum, problem_in_basis
+from mkc_torch.linear._large import is_large, large_maximum, problem_in_basis
+from mkc_torch.linear._many_rows import RowsMaximum
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
@@ -133,12 +134,7 @@ class MKCRegression(Inference):
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MKCRegression:
-        """Fit ``Y ~ X coef``.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
-            Y: targets.
-            sample_weight: non-negative weights (*, N) or (*, N, m), multiplied to the log-density of each value.
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the log-density of each value.
 
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
@@ -149,23 +145,17 @@ class MKCRegression(Inference):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
-            values, known = (
-                checked_shapes(X, Y, sample_weight),
-                FixedParameters(self.sigma, self.d, self.bound, self.start),
-            )
+            values = checked_shapes(X, Y, sample_weight)
+            known = FixedParameters(self.sigma, self.d, self.bound, self.start)
             # a time series needs the scores in their order
-            found = self._large_maximum(values, known) if self.covariance == "sandwich" else None
+            suits = is_large(values) and self.covariance == "sandwich"
+            found = large_maximum(values, known, max_iter=self.max_iter, seed=self.seed) if suits else None
             if found is not None:
-                self._keep_large(values, found)
+                self._keep_large(values, *found)
                 return self
             problem = linear_problem(X, Y, sample_weight)
             self._keep(problem, *self._maximise(problem, known))
         return self
-
-    def _large_maximum(self, values: CanonicalShapes, known: FixedParameters) -> LargeMaximum | None:
-        if not is_large(values):
-            return None
-        return large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
 
     def _maximise(self, problem: LinearProblem, known: FixedParameters) -> tuple[RobustStart, LikelihoodMaximum]:
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
@@ -175,29 +165,19 @@ class MKCRegression(Inference):
             known = FixedParameters(
                 given.sigma, given.d, given.bound, self.start if given.start is None else given.start
             )
-            found = self._large_maximum(problem_in_basis(problem), known.in_basis_of(problem))
+            values, in_basis = problem_in_basis(problem), known.in_basis_of(problem)
+            suits = is_large(values)
+            found = large_maximum(values, in_basis, max_iter=self.max_iter, seed=self.seed) if suits else None
             if found is not None:
-                self.n_iter_ = len(found.history) - 1
+                rows_maximum, _ = found
+                self.n_iter_ = len(rows_maximum.history) - 1
                 flag = torch.ones_like(problem.Y[:, 0, 0], dtype=torch.bool)
-                return replace(
-                    found.fit_state.to(flag.device),
-                    converged=flag,
-                    extras=(~flag, found.history.unsqueeze(0).to(flag.device)),
-                )
+                extras = (~flag, rows_maximum.history.unsqueeze(0).to(flag.device))
+                return replace(rows_maximum.fit_state.to(flag.device), converged=flag, extras=extras)
             begin, maximum = self._maximise(problem, known)
             self.n_iter_ = len(maximum.history) - 1
-            state = maximum.state
-            return FitState(
-                beta=maximum.beta,
-                kappa=state.kappa,
-                log_d=state.log_d,
-                converged=maximum.converged | begin.exact,
-                log_bound=state.log_bound,
-                log_d_min=state.log_d_min,
-                free_kappa=state.free_kappa,
-                free_d=state.free_d,
-                extras=(begin.exact, torch.stack(maximum.history, -1)),
-            )
+            extras = (begin.exact, torch.stack(maximum.history, -1))
+            return FitState.of(maximum.beta, maximum.state, maximum.converged | begin.exact, extras)
 
         layer = fit_layer(
             X,
@@ -221,18 +201,14 @@ class MKCRegression(Inference):
         self.history_ = history.movedim(-1, 0)
         return self
 
-    def _keep_large(self, values: CanonicalShapes, found: LargeMaximum) -> None:
+    def _keep_large(self, values: CanonicalShapes, found: RowsMaximum, weights: Tensor) -> None:
         def restored(value: Tensor) -> Tensor:
             return value.to(values.Y).expand((*values.batch, *value.shape))
 
         self._single_channel = values.single_channel
-        self.coef_, self.weights_ = restored(found.coef), restored(found.weights)
-        fit_state = found.fit_state
-        assert fit_state.log_bound is not None
-        self.sigma_, self.d_ = restored(fit_state.kappa[0].rsqrt()), restored(torch.exp(fit_state.log_d[0]))
-        self.bound_ = restored(torch.exp(fit_state.log_bound[0]))
-        self.log_likelihood_ = restored(found.log_likelihood)
-        self.covariance_, self.dof_ = restored(found.covariance), restored(found.dof)
+        for name, value in found.attributes().items():
+            setattr(self, name, restored(value))
+        self.weights_ = restored(weights)
         self.history_ = torch.stack([restored(h) for h in found.history])
         self.n_iter_ = len(found.history) - 1
         flag = torch.ones(values.batch, dtype=torch.bool, device=values.Y.device)

@@ -205,12 +205,7 @@ class FixedPointLinear(Inference):
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> FixedPointLinear:
-        """Fit ``Y ~ X coef``.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
-            Y: targets.
-            sample_weight: non-negative weights (*, N) or (*, N, m), multiplied to the loss of each value.
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Weights multiply the loss of each value.
 
         Raises:
             ValueError: σ or d not positive or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.

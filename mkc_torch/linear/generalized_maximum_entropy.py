@@ -79,19 +79,12 @@ class GeneralizedMaximumEntropy(LinearEstimator):
 
     @torch.no_grad()
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> GeneralizedMaximumEntropy:
-        """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
+        """Fit ``Y ~ X coef`` in float64; X is of any rank, and otherwise as in :meth:`LeastSquares.fit`.
 
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N); of any rank.
-            Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
-
-        Returns:
-            The estimator.
+        A weight of 2 is a sample that occurs twice.
 
         Raises:
-            TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, or no coefficients within their supports explain Y
+            ValueError: bad input as in :meth:`LeastSquares.fit`, or no coefficients within their supports explain Y
                 with errors within theirs.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)

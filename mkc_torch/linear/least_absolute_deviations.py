@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.independent_rows import independent_rows, taken
 from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.small_factors import solve, solve_gram
 from mkc_torch.linear._estimator import LinearEstimator
@@ -62,21 +63,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
         self.max_iter = checked_whole("max_iter", max_iter, 1, "100 is ample")
 
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastAbsoluteDeviations:
-        """Fit ``Y ~ X coef``.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
-            Y: targets.
-            sample_weight: non-negative factors (*, N) or (*, N, m) of the absolute residuals; 0 excludes a value.
-
-        Returns:
-            The estimator, with ``coef_`` (*, n), ``weights_``, ``objective_``, ``n_iter_`` and ``converged_``.
-
-        Raises:
-            TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, there are fewer values than coefficients.
-            RankDeficientError: columns of X are linearly dependent.
-        """
+        """Fit ``Y ~ X coef``; shapes and errors as in :meth:`LeastSquares.fit`. Weights multiply absolute residuals."""
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         # the conditioning near the optimum is too bad for float32
@@ -243,29 +230,19 @@ def _longest(a: Tensor, d_a: Tensor, b: Tensor, d_b: Tensor) -> Float[Tensor, "B
 def _tight_rows(
     rows: Float[Tensor, "#B R n"], residual: Float[Tensor, "B R"], used: Bool[Tensor, "B R"]
 ) -> Int[Tensor, "B n"]:
-    """The n linearly independent rows with the smallest residuals: QR that pivots on ``row / |residual|``.
+    """The n linearly independent rows with the smallest residuals.
 
     The n rows with the smallest residuals alone may be dependent, as for repeated samples.
     """
     eps = torch.finfo(residual.dtype).eps
     size = residual.abs()
     size = size.clamp(min=eps * size.median(-1, keepdim=True).values + torch.finfo(size.dtype).tiny ** 0.5)
-    left = rows * used.unsqueeze(-1)
-    dependent = 1e-10 * torch.linalg.vector_norm(left, dim=-1)
-    chosen = []
-    for _ in range(rows.shape[-1]):
-        length = torch.linalg.vector_norm(left, dim=-1)
-        pivot = torch.where(length > dependent, length / size, torch.zeros_like(size)).argmax(-1)
-        chosen.append(pivot)
-        row = left.gather(-2, pivot[:, None, None].expand(-1, 1, rows.shape[-1]))
-        direction = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
-        left = left - torch.matmul(left, direction.mT) * direction
-    return torch.stack(chosen, dim=-1)
+    return independent_rows(rows, 1.0 / size, used, 1e-10)
 
 
 def _solve_through(
     rows: Float[Tensor, "#B R n"], target: Float[Tensor, "B R"], chosen: Int[Tensor, "B n"]
 ) -> Float[Tensor, "B n"]:
     """Coefficients that fit the chosen rows exactly."""
-    matrix = rows.expand(target.shape[0], -1, -1).gather(-2, chosen.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
+    matrix = taken(rows.expand(target.shape[0], -1, -1), chosen)
     return solve(matrix, target.gather(-1, chosen).unsqueeze(-1)).squeeze(-1)

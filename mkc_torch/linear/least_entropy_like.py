@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,7 +14,6 @@ from mkc_torch._support.side_by_side import at_once, side_by_side
 from mkc_torch._support.small_factors import solve
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._precision import in_double
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.losses.entropy_like import LEAST_TOTAL, orthogonal_starts
 
@@ -92,41 +92,21 @@ class LeastEntropyLike(LinearEstimator):
         super().__init__()
         if start is not None and starts is not None:
             raise ValueError("Expected argument `start` or `starts` but got both; pass one argument only.")
-        for name, value, least in (("start", start, 1), ("starts", starts, 2)):
-            if value is None:
-                continue
-            refuse_no_tensor(name, value, "a tensor")
-            refuse_complex(name, value)
-            if value.dim() < least or not seems_finite(value):
-                raise ValueError(
-                    f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}n) but got "
-                    f"{'NaN or infinity' if value.dim() >= least else tuple(value.shape)}."
-                )
-        self.start = start
-        self.starts = starts
+        self.start = _checked_start("start", start, 1)
+        self.starts = _checked_start("starts", starts, 2)
         self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 gives the coefficients nine digits")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastEntropyLike:
-        """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
-
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
-            Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
-
-        Returns:
-            The estimator.
+        """Fit ``Y ~ X coef`` in float64; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample twice.
 
         Raises:
-            TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, there are fewer than n + 2 values (with n + 1 values
-                any fit through n of them has H = 0), weights total at most 1, or a start has the wrong shape.
-            RankDeficientError: columns of X are linearly dependent.
+            ValueError: fewer than n + 2 values (with n + 1 values any fit through n of them has H = 0), weights that
+                total at most 1, a start of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
-        problem = in_double(linear_problem(X, Y, sample_weight))
+        problem = linear_problem(X, Y, sample_weight).double()
         _check_counts(problem)
         least_squares = _least_squares(problem)
         starts = self._starts(problem, least_squares)
@@ -141,12 +121,7 @@ class LeastEntropyLike(LinearEstimator):
         per_problem = problem.Y[0].numel() * (n + 1) * (n + 4) // 2
         parts = torch.arange(starts.shape[0], device=starts.device).split(at_once(starts, per_problem, _CHUNK))
         found = [self._descend(problem.select(part), remainder[part], directions[part]) for part in parts]
-        minima = Minima(
-            torch.cat([f.point for f in found]),
-            torch.cat([f.value for f in found]),
-            torch.cat([f.n_iter for f in found]),
-            torch.cat([f.converged for f in found]),
-        )
+        minima = Minima(*(torch.cat([getattr(f, field.name) for f in found]) for field in fields(Minima)))
         # the last component is 0 only if the coefficients are infinite
         last = minima.point[:, -1:]
         last = torch.where(last.abs() > 1e-12, last, torch.where(last < 0, -1e-12, 1e-12))
@@ -187,14 +162,8 @@ class LeastEntropyLike(LinearEstimator):
     def _starts(self, problem: LinearProblem, least_squares: Tensor) -> Float[Tensor, "B S n"]:
         """Return the starts in the basis."""
         n = problem.num_coefficients
-        for name, value, least in (("start", self.start, 1), ("starts", self.starts, 2)):
-            if value is None:
-                continue
-            if value.dim() < least or value.shape[-1] != n or not bool(torch.isfinite(value).all()):
-                raise ValueError(
-                    f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}{n}) "
-                    f"but got {tuple(value.shape)}."
-                )
+        _checked_start("start", self.start, 1, n)
+        _checked_start("starts", self.starts, 2, n)
         if self.starts is not None:
             coef = self.starts.to(problem.Y)
             coef = coef.expand(*problem.batch, *coef.shape[-2:]).reshape(-1, *coef.shape[-2:])
@@ -204,6 +173,21 @@ class LeastEntropyLike(LinearEstimator):
         else:
             coef = orthogonal_starts(_coefficients(problem, least_squares.unsqueeze(1)).squeeze(1))
         return solve(problem.to_coef, coef.mT).mT
+
+
+def _checked_start(name: str, value: Tensor | None, least: int, n: int | None = None) -> Tensor | None:
+    """Return starts of at least ``least`` dimensions and, where known, n columns if they are valid, else raise."""
+    if value is None:
+        return None
+    refuse_no_tensor(name, value, "a tensor")
+    refuse_complex(name, value)
+    fits = value.dim() >= least and n in (None, value.shape[-1])
+    if not fits or not (seems_finite(value) if n is None else bool(torch.isfinite(value).all())):
+        raise ValueError(
+            f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}{'n' if n is None else n}) "
+            f"but got {tuple(value.shape) if not fits else 'NaN or infinity'}."
+        )
+    return value
 
 
 def _least_squares(problem: LinearProblem) -> Float[Tensor, "B n"]:

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.independent_rows import taken
 from mkc_torch._support.side_by_side import at_once
 from mkc_torch._support.small_factors import symmetric_eigen
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import elemental_starts, scale_of, values_of_sets
+from mkc_torch.linear._scale_search import elemental_starts, log_product, scale_of, values_of_sets
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, checked_h
 
 if TYPE_CHECKING:
@@ -171,17 +172,12 @@ def _level_starts(problem: LinearProblem, count: int, seed: int) -> Float[Tensor
     return torch.cat([torch.where(usable, level, least_squares), least_squares], 1)
 
 
-def _log_product(scale: Tensor) -> Tensor:
-    return torch.log(scale.clamp(min=torch.finfo(scale.dtype).tiny)).sum(-1)
-
-
 def _best(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B S n"]) -> Float[Tensor, "B K n"]:
     """The candidates with the smallest objective, evaluated in parts that fit in memory."""
     values = problem.Y[0].numel() * problem.Y.shape[0]
     parts = beta.split(at_once(beta, values, _CHUNK), 1)
-    objective = torch.cat([_log_product(scale_of(problem, part, rule)) for part in parts], 1)
-    order = objective.topk(min(_CANDIDATES, beta.shape[1]), dim=1, largest=False).indices
-    return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
+    objective = torch.cat([log_product(scale_of(problem, part, rule)) for part in parts], 1)
+    return taken(beta, objective.topk(min(_CANDIDATES, beta.shape[1]), dim=1, largest=False).indices)
 
 
 def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B K n"], max_iter: int = 100) -> _Refined:
@@ -190,7 +186,7 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
     rows, target = problem.basis.flatten(-3, -2), problem.Y.flatten(-2)
     residual = problem.residual(beta)
     scale = rule.scale(problem, residual)
-    objective = _log_product(scale)
+    objective = log_product(scale)
     moving = torch.ones(B, K, dtype=torch.bool, device=beta.device)
     n_iter = 0
     while n_iter < max_iter and bool(moving.any()):
@@ -210,7 +206,7 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
         proposal = beta.index_put((at, of), fit.beta.to(beta))
         residual_to = problem.residual(proposal)
         scale_to = rule.scale(problem, residual_to)
-        objective_to = _log_product(scale_to)
+        objective_to = log_product(scale_to)
         moving = objective_to < objective - 64 * eps
         take = (objective_to < objective).unsqueeze(-1)
         beta, scale = torch.where(take, proposal, beta), torch.where(take, scale_to, scale)

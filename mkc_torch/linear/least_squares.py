@@ -38,9 +38,10 @@ class LeastSquares(Inference):
         """Fit ``Y ~ X coef``.
 
         Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
+            X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
             Y: targets.
-            sample_weight: weights (*, N) or (*, N, m), proportional to inverse variances.
+            sample_weight: non-negative weights (*, N) or (*, N, m), proportional to inverse variances; weight 0
+                excludes a value.
 
         Returns:
             The estimator, with ``coef_`` (*, n), its ``covariance_`` (*, n, n) and ``weights_``, all 1.

@@ -6,13 +6,14 @@ import itertools
 import math
 import numbers
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.independent_rows import taken
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.side_by_side import at_once, steps_between_tests
 from mkc_torch._support.small_factors import symmetric_pinv
@@ -24,7 +25,7 @@ from mkc_torch.linear._scale_search import ScaleSearch, minimise_scale, relative
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
 
 
 def stacked(weight: Tensor | None) -> Tensor | None:
@@ -45,16 +46,23 @@ def default_coverage(problem: LinearProblem) -> int:
 
 
 @dataclass(frozen=True)
-class TrimmedScale:
-    """Root mean square of the smallest ``fraction`` of each channel's residuals, and the mask of these residuals."""
+class _FractionScale:
+    """A scale of the smallest ``fraction`` of the residuals."""
 
     fraction: float
+    rule: ClassVar[int]
 
     def _count(self, problem: LinearProblem) -> int:
         return max(1, round(self.fraction * problem.num_samples))
 
     def options(self, problem: LinearProblem) -> ScaleOptions:
-        return ScaleOptions(TRIMMED, self._count(problem))
+        return ScaleOptions(self.rule, self._count(problem))
+
+
+class TrimmedScale(_FractionScale):
+    """Root mean square of the smallest ``fraction`` of each channel's residuals, and the mask of these residuals."""
+
+    rule = TRIMMED
 
     def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self.weighted(problem, residual)[0]
@@ -75,17 +83,10 @@ class TrimmedScale:
         return torch.sqrt(trimmed.clamp(min=0.0) / total), counts
 
 
-@dataclass(frozen=True)
-class QuantileScale:
+class QuantileScale(_FractionScale):
     """Quantile ``fraction`` of the absolute residuals: a cheap scale for ranking many starts."""
 
-    fraction: float
-
-    def _count(self, problem: LinearProblem) -> int:
-        return max(1, round(self.fraction * problem.num_samples))
-
-    def options(self, problem: LinearProblem) -> ScaleOptions:
-        return ScaleOptions(QUANTILE, self._count(problem))
+    rule = QUANTILE
 
     def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return order_statistic(residual.abs(), stacked(problem.sample_weight), self._count(problem))
@@ -103,14 +104,10 @@ class QuantileScale:
 
 def gaussian_consistency(fraction: float) -> float:
     """Factor that makes the root mean square of the smallest ``fraction`` of Gaussian residuals estimate their σ."""
-    if fraction >= 1.0:
-        return 1.0
-    q = torch.special.ndtri(torch.tensor((1.0 + fraction) / 2.0, dtype=torch.float64)).item()
-    variance = 1.0 - 2.0 * q * math.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi) / fraction
-    return variance**-0.5
+    return float(_gaussian_slope(torch.tensor(fraction, dtype=torch.float64)).rsqrt())
 
 
-def _gaussian_slope(fraction: Float[Tensor, "B m"]) -> Float[Tensor, "B m"]:
+def _gaussian_slope(fraction: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """``1 - 2 q φ(q) / fraction`` with P(|Z| <= q) = fraction: mean square of the Gaussian values within q.
 
     It is also the mean slope of a trimmed score, since a change of the fit moves values across the edge.
@@ -257,14 +254,8 @@ class LeastTrimmedSquares(RobustInference):
         self.objective_ = scale.square() * h / N * total
         self.scale_ = scale * gaussian_consistency(h / N)
         equation = trimmed_equation(problem, beta, weight, h / N)
-        self._infer(
-            problem,
-            beta,
-            weight,
-            equation,
-            gaussian_consistency(h / N) ** 2,
-            widening=1.0 + (_SMALL_SAMPLE * (N - h) / N * coefficients_a_value(problem)).square(),
-        )
+        wider = 1.0 + (_SMALL_SAMPLE * (N - h) / N * coefficients_a_value(problem)).square()
+        self._infer(problem, beta, weight, equation, gaussian_consistency(h / N) ** 2, widening=wider)
         self.exact_ = problem.num_channels == 1 and (h == N or _few_choices(problem, h))
         self.n_iter_ = n_iter
         self.converged_ = problem.restore(converged)
@@ -353,7 +344,7 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         mine = (rows if rows.shape[0] == 1 else rows[active]).expand(len(active), -1, -1)
         projected = torch.matmul(mine, inverse)
         own = (projected * mine).sum(-1)
-        leverage = torch.matmul(_taken(projected, used), _taken(mine, unused).mT)
+        leverage = torch.matmul(taken(projected, used), taken(mine, unused).mT)
         lost, gained = error.gather(1, used).unsqueeze(-1), error.gather(1, unused).unsqueeze(-2)
         out = (1.0 - own.gather(1, used)).clamp(min=0.0).unsqueeze(-1)
         into = (1.0 + own.gather(1, unused)).unsqueeze(-2)
@@ -368,8 +359,3 @@ def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -
         mask = keep[active].scatter(-1, out_of, False).scatter(-1, into_it, True)
         keep[active] = torch.where(falls.unsqueeze(-1), mask, keep[active])
     return beta
-
-
-def _taken(rows: Float[Tensor, "B N n"], index: Int[Tensor, "B k"]) -> Float[Tensor, "B k n"]:
-    """The rows of each problem at its indices."""
-    return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))

@@ -233,15 +233,7 @@ class MEstimator(RobustInference):
             # an exact fit of most values is kept; a scale of rounding errors would lose it
             return torch.where(exact, 0.0, median_scale(problem, residual))
 
-        found = reweight(
-            problem,
-            beta,
-            first,
-            psi.weight,
-            next_scale,
-            max_iter=self.max_iter,
-            tol=self.tol,
-        )
+        found = reweight(problem, beta, first, psi.weight, next_scale, max_iter=self.max_iter, tol=self.tol)
         self._set_common(problem, found.beta, found.weight)
         self.scale_ = problem.restore(found.scale)
         equation = scores(problem, found.beta, found.scale, psi)

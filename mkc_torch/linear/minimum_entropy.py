@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
+from mkc_torch._support.arguments import checked_whole, refuse_out_of_range
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.side_by_side import at_once
 from mkc_torch._support.small_factors import pinv, symmetric_eigen
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._precision import in_double
+from mkc_torch.linear._mkc import channel_parameter
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 
@@ -111,36 +111,19 @@ class MinimumEntropy(LinearEstimator):
 
     @torch.no_grad()
     def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MinimumEntropy:
-        """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
+        """Fit ``Y ~ X coef`` in float64; shapes and errors as in :meth:`LeastSquares.fit`.
 
-        Args:
-            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
-            Y: targets.
-            sample_weight: how often each sample or value counts, (*, N) or (*, N, m); weight 0 excludes it.
-
-        Returns:
-            The estimator.
-
-        Raises:
-            TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-            ValueError: shapes do not fit, values are not finite, there are fewer values than coefficients.
-            RankDeficientError: columns of X are linearly dependent.
+        A weight of 2 is a sample that occurs twice.
         """
         X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         given = linear_problem(X, Y, sample_weight)
         begin = robust_start(given, self.start, seed=self.seed)
-        problem = in_double(given)
+        problem = given.double()
         total = problem.total_weight()
         if self.bandwidth is None:
             h = 1.06 * begin.scale.double() * total.pow(-0.2)
         else:
-            h = as_numbers("bandwidth", self.bandwidth, problem.Y.dtype, problem.Y.device).to(problem.Y)
-            if h.dim() > 1 or h.numel() not in (1, problem.num_channels):
-                raise ValueError(
-                    f"Expected argument `bandwidth` to be a number or of shape ({problem.num_channels},) "
-                    f"but got {tuple(h.shape)}."
-                )
-            h = h.expand(total.shape)
+            h = channel_parameter("bandwidth", self.bandwidth, problem)
         free = self._identified(problem)
         beta = begin.beta.double()
         converged, n_iter = torch.ones_like(begin.exact), torch.zeros_like(begin.exact, dtype=torch.long)
@@ -168,12 +151,8 @@ class MinimumEntropy(LinearEstimator):
         rows = problem.basis
         if self.location == "symmetric":
             return torch.eye(n, dtype=rows.dtype, device=rows.device).unsqueeze(0)
-        weight = problem.sample_weight
-        if weight is not None:
-            used = (weight > 0).to(rows).unsqueeze(-1)
-            rows = used * (rows - (used * rows).sum(-3, keepdim=True) / used.sum(-3, keepdim=True))
-        else:
-            rows = rows - rows.mean(-3, keepdim=True)
+        used = _used(problem)
+        rows = used * (rows - _mean_row(problem).unsqueeze(-3))
         gram = torch.matmul(rows.flatten(-3, -2).mT, rows.flatten(-3, -2))
         values, vectors = symmetric_eigen(gram)
         # the basis is orthonormal, so a direction without a constant part has eigenvalue 1
@@ -186,15 +165,22 @@ class MinimumEntropy(LinearEstimator):
         half = 0.5 * problem.num_samples
         median = 0.5 * (order_statistic(residual, weight, half) - order_statistic(-residual, weight, half))
         hidden = torch.eye(problem.num_coefficients, dtype=free.dtype, device=free.device) - free
-        rows = problem.basis
-        if weight is None:
-            level = rows.mean(-3)
-        else:
-            used = (weight > 0).to(rows).unsqueeze(-1)
-            level = (used * rows).sum(-3) / used.sum(-3)
-        constant = torch.matmul(level, hidden)
+        constant = torch.matmul(_mean_row(problem), hidden)
         shift = torch.matmul(pinv(constant, rtol=1e-6), median.unsqueeze(-1)).squeeze(-1)
         return torch.matmul(hidden, shift.unsqueeze(-1)).squeeze(-1)
+
+
+def _used(problem: LinearProblem) -> Float[Tensor, "B N m 1"]:
+    """1 for values of positive weight, else 0."""
+    weight = problem.sample_weight
+    used = torch.ones_like(problem.Y[:1]) if weight is None else (weight > 0).to(problem.basis)
+    return used.unsqueeze(-1)
+
+
+def _mean_row(problem: LinearProblem) -> Float[Tensor, "#B m n"]:
+    """Mean of the rows of the basis in use, of each channel."""
+    used = _used(problem)
+    return (used * problem.basis).sum(-3) / used.sum(-3)
 
 
 class _Kernel:

@@ -14,7 +14,7 @@ from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._psi import Psi, bisquare_for_efficiency
 from mkc_torch.linear.covariance import RobustCovarianceKind
 from mkc_torch.linear.m_estimator import check_iterations, reweight
-from mkc_torch.linear.s_regression import check_breakdown, check_starts, m_scale_equation, minimise_m_scale
+from mkc_torch.linear.s_regression import checked_breakdown, checked_starts, m_scale_equation, minimise_m_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -77,13 +77,10 @@ class MMRegression(RobustInference):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        checked_number("efficiency", efficiency, 0.3, 0.99, "[]", "0.95 is usual")
-        check_breakdown(breakdown)
-        check_starts(starts)
+        self.efficiency = checked_number("efficiency", efficiency, 0.3, 0.99, "[]", "0.95 is usual")
+        self.breakdown = checked_breakdown(breakdown)
+        self.starts = checked_starts(starts)
         check_iterations(max_iter, tol)
-        self.efficiency = efficiency
-        self.breakdown = breakdown
-        self.starts = starts
         self.max_iter = max_iter
         self.tol = tol
         self._set_covariance(covariance, bandwidth)

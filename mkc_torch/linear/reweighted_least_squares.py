@@ -20,7 +20,7 @@ from mkc_torch.linear._scale_search import relative_precision, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 from mkc_torch.linear.least_median_of_squares import LeastMedianOfSquares
 from mkc_torch.linear.least_trimmed_squares import LeastTrimmedSquares, default_coverage, trimmed_equation
-from mkc_torch.linear.s_regression import SRegression, check_starts, m_scale_equation
+from mkc_torch.linear.s_regression import SRegression, checked_starts, m_scale_equation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -98,11 +98,9 @@ class ReweightedLeastSquares(RobustInference):
                 f"{format_value(start)}{remedy}."
             )
         checked_number("threshold", threshold, 1.0, math.inf, "[)", "it is a number of scales; 2.5 is usual")
-        if starts is not None:
-            check_starts(starts)
         self.start = start
         self.threshold = threshold
-        self.starts = starts
+        self.starts = None if starts is None else checked_starts(starts)
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 

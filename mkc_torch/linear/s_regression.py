@@ -22,10 +22,11 @@ from mkc_torch.linear._influence import (
     coefficients_a_value,
     m_scale_influence,
     scores,
+    summed,
     weighted,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
+from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, tukey_weight
 from mkc_torch.linear._scale_search import ScaleMinimum, ScaleSearch, descend, minimise_scale, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
@@ -253,16 +254,12 @@ def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) 
     """
     at = scores(problem, beta, torch.maximum(scale, rounding_scale(problem)), Psi("tukey", (c,)))
     w = weighted(problem, torch.ones_like(at.z))
-    basis = problem.basis.expand(beta.shape[0], -1, -1, -1)
-
-    def summed(values: Tensor) -> Float[Tensor, "B m n"]:
-        return torch.einsum("bkc,bkcn->bcn", w * values / at.scale.unsqueeze(-2), basis)
-
+    weight = w / at.scale.unsqueeze(-2)
     slope_sum = (w * at.psi * at.z).sum(-2).clamp(min=torch.finfo(beta.dtype).eps)
-    first = summed(at.psi) / slope_sum.unsqueeze(-1)
+    first = summed(problem, weight * at.psi) / slope_sum.unsqueeze(-1)
     with torch.no_grad():
         product_slope = at.slope * at.z + at.psi
-        cross = summed(product_slope).unsqueeze(-1) * (first / slope_sum.unsqueeze(-1)).unsqueeze(-2)
+        cross = summed(problem, weight * product_slope).unsqueeze(-1) * (first / slope_sum.unsqueeze(-1)).unsqueeze(-2)
         own = (
             ((w * product_slope * at.z).sum(-2) / slope_sum)[..., None, None]
             * first.unsqueeze(-1)
@@ -280,15 +277,17 @@ def m_scale_equation(
     c = bisquare_of(breakdown)
     at = scores(problem, beta, torch.maximum(scale, rounding_scale(problem)), Psi("tukey", (c,)))
     u = at.z / c
-    return at, m_scale_influence(problem, bisquare_rho(u), 6.0 * u * bisquare_weight(u) / c, at.z)
+    return at, m_scale_influence(problem, bisquare_rho(u), 6.0 * u * tukey_weight(u, 1.0) / c, at.z)
 
 
-def check_breakdown(breakdown: float) -> None:
-    checked_number("breakdown", breakdown, 0.01, 0.5, "[]", "0.5 withstands most outliers")
+def checked_breakdown(breakdown: float) -> float:
+    """Return ``breakdown`` if it is valid, else raise."""
+    return checked_number("breakdown", breakdown, 0.01, 0.5, "[]", "0.5 withstands most outliers")
 
 
-def check_starts(starts: int) -> None:
-    checked_whole("starts", starts, 1, "500 is usual")
+def checked_starts(starts: int) -> int:
+    """Return ``starts`` if it is valid, else raise."""
+    return checked_whole("starts", starts, 1, "500 is usual")
 
 
 _SMALL_SAMPLE = 12.0
@@ -354,10 +353,8 @@ class SRegression(RobustInference):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        check_breakdown(breakdown)
-        check_starts(starts)
-        self.breakdown = breakdown
-        self.starts = starts
+        self.breakdown = checked_breakdown(breakdown)
+        self.starts = checked_starts(starts)
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
@@ -369,15 +366,9 @@ class SRegression(RobustInference):
         self._set_common(problem, minimum.beta, minimum.weight)
         self.scale_ = problem.restore(minimum.scale)
         equation, of_scale = m_scale_equation(problem, minimum.beta, minimum.scale, self.breakdown)
-        self._infer(
-            problem,
-            minimum.beta,
-            minimum.weight,
-            equation,
-            Psi("tukey", (bisquare_of(self.breakdown),)).ratio(),
-            of_scale=of_scale,
-            widening=1.0 + _SMALL_SAMPLE * self.breakdown * coefficients_a_value(problem),
-        )
+        ratio = Psi("tukey", (bisquare_of(self.breakdown),)).ratio()
+        wider = 1.0 + _SMALL_SAMPLE * self.breakdown * coefficients_a_value(problem)
+        self._infer(problem, minimum.beta, minimum.weight, equation, ratio, of_scale=of_scale, widening=wider)
         self.n_iter_ = minimum.n_iter
         self.converged_ = problem.restore(minimum.converged)
         return self

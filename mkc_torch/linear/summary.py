@@ -61,31 +61,6 @@ class Summary:
     dof: float
     kind: str
 
-    @classmethod
-    def of(
-        cls,
-        title: str,
-        names: Sequence[str] | None,
-        columns: tuple[Tensor, Tensor, Tensor, Tensor],
-        *,
-        level: float,
-        light: tuple[int, int],
-        scale: Sequence[float],
-        r_squared: Sequence[float],
-        dof: float,
-        kind: str,
-    ) -> Summary:
-        """Build from the columns of the table: coefficients, standard errors, p-values (n,) and intervals (n, 2)."""
-        value, error, p_value, interval = (c.detach().cpu().double().tolist() for c in columns)
-        names = [f"x{k}" for k in range(len(value))] if names is None else list(names)
-        if len(names) != len(value):
-            raise ValueError(
-                f"Expected argument `names` to hold {len(value)} names but got {len(names)}; pass one per coefficient."
-            )
-        rows = zip(names, value, error, p_value, interval, strict=True)
-        coefficients = tuple(Coefficient(str(n), v, e, p, *ends) for n, v, e, p, ends in rows)
-        return cls(title, coefficients, level, *light, tuple(scale), tuple(r_squared), dof, kind)
-
     @property
     def heading(self) -> str:
         light = f", {self.num_light} with a weight below {LIGHT:g}" if self.num_light else ""
@@ -143,6 +118,20 @@ class Summary:
             f"<table><caption>{html.escape(self.heading)}</caption><thead><tr>{head}</tr></thead>"
             f"<tbody>{body}</tbody></table><p>{html.escape(self.footing)}</p>"
         )
+
+
+def coefficients_of(
+    names: Sequence[str] | None, columns: tuple[Tensor, Tensor, Tensor, Tensor]
+) -> tuple[Coefficient, ...]:
+    """Rows of the table from its columns: coefficients, standard errors, p-values (n,) and intervals (n, 2)."""
+    value, error, p_value, interval = (c.detach().cpu().double().tolist() for c in columns)
+    names = [f"x{k}" for k in range(len(value))] if names is None else list(names)
+    if len(names) != len(value):
+        raise ValueError(
+            f"Expected argument `names` to hold {len(value)} names but got {len(names)}; pass one per coefficient."
+        )
+    rows = zip(names, value, error, p_value, interval, strict=True)
+    return tuple(Coefficient(str(n), v, e, p, *ends) for n, v, e, p, ends in rows)
 
 
 def _cells(c: Coefficient) -> tuple[str, ...]:

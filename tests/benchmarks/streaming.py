@@ -30,11 +30,11 @@ import torch
 from torch import distributed as dist
 
 from mkc_torch._support.ranks import Ranks
-from mkc_torch.linear._blocks import Density
+from mkc_torch.linear._blocks import Density, flat_length
 from mkc_torch.linear.streaming import MemmapBatches, StreamedMKCRegression, from_memmap
 from mkc_torch.linear.streaming._batches import Shape
 from mkc_torch.linear.streaming._reservoir import Reservoir
-from mkc_torch.linear.streaming._sums import flat_length, sums_pass
+from mkc_torch.linear.streaming._rows import Wanted, sums_pass
 from mkc_torch.linear.streaming._survey import survey_rows
 
 COLUMNS = 8
@@ -76,7 +76,7 @@ def read_and_sum(table: np.ndarray) -> float:
 
 def passes(batches: MemmapBatches) -> dict[str, Callable[[], object]]:
     def one_pass(**wanted: bool) -> Callable[[], object]:
-        return lambda: sums_pass(batches, SHAPE, None, *POINT, **wanted)
+        return lambda: sums_pass(batches, SHAPE, None, *POINT, Wanted(**wanted))
 
     return {
         "gradient in float32": one_pass(rough=True),
@@ -131,10 +131,10 @@ def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, result
     torch.set_num_threads(1)
     dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=ranks)
     batches, best = batches_of(path, (rank, ranks)), {}
-    group, length = Ranks(), flat_length(SHAPE, with_curvature=False)
+    group, length = Ranks(), 1 + flat_length(1, COLUMNS, with_curvature=False)
     # a pass for the gradient includes its sum over ranks
     work: dict[str, Callable[[], object]] = {
-        "gradient": lambda: group.sum_of(lambda: sums_pass(batches, SHAPE, None, *POINT)[0], length),
+        "gradient": lambda: group.sum_of(lambda: sums_pass(batches, SHAPE, None, *POINT, Wanted()), length),
         "whole fit": lambda: StreamedMKCRegression().fit(batches),
     }
     for _ in range(repeats):

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mkc_torch.density.likelihood import energy_derivatives
 from mkc_torch.linear import MKCRegression, RankDeficientError, _block_sums, _large, _rows, em
 from mkc_torch.linear._blocks import Density, energy_of
-from mkc_torch.linear._descent import sandwich_of
+from mkc_torch.linear._many_rows import sandwich_of
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem
 from mkc_torch.linear._problem import checked_shapes, linear_problem

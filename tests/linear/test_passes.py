@@ -1,11 +1,16 @@
-"""Parts of a fit of many rows: a step within limits, and the triangle of the rows in use."""
+"""Parts of a fit of many rows: a step within limits, the Gaussian of the sums, the triangle of the rows in use."""
+
+import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from mkc_torch.linear._blocks import Block, triangle
-from mkc_torch.linear._descent import EvaluatedPoint, _newton_move
+from mkc_torch.linear._descent import Descent, EvaluatedPoint, PassDerivatives, _newton_move
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns
+from mkc_torch.linear._many_rows import likelier_gaussian
+from mkc_torch.linear._rows import Rows
 
 GRADIENTS = {
     "inside": [1.0, 0.1, -0.3],
@@ -37,7 +42,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     )
     slope = double(*gradient)
     hessian = torch.tensor([[[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 1.0]]], dtype=torch.float64)
-    move = _newton_move(fit_state, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None))
+    move = _newton_move(fit_state, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None, None))
     low, high = double(-torch.inf, -0.5, -1.0), double(torch.inf, 399.5, 2.0)
     assert bool(((move >= low) & (move <= high)).all())
     stopped = (move == low) | (move == high)
@@ -45,6 +50,43 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     torch.testing.assert_close(left[~stopped], torch.zeros_like(left[~stopped]), rtol=0, atol=1e-12)
     newton = -torch.linalg.solve(hessian, slope.unsqueeze(-1)).squeeze(-1)
     assert bool(stopped.any()) == bool(((newton < low) | (newton > high)).any())
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_the_likelier_gaussian_is_weighted_least_squares_of_all_channels(channels):
+    generator = torch.Generator().manual_seed(0)
+    X = torch.randn(300, channels, 3, generator=generator, dtype=torch.float64)
+    scales = torch.tensor([0.5, 3.0]).double()[:channels]
+    Y = X.sum(-1) + scales * torch.randn(300, channels, generator=generator, dtype=torch.float64)
+    weight = torch.rand(300, channels, generator=generator, dtype=torch.float64)
+    kappa, log_d = (torch.full((1, channels), value, dtype=torch.float64) for value in (0.3, 0.0))
+    fit_state = FitState(
+        double(0.9, 1.2, 1.0),
+        kappa,
+        log_d,
+        torch.tensor([False]),
+        log_d + 5.0,
+        log_d - 9.0,
+        free_kappa=True,
+        free_d=True,
+    )
+    grams = torch.einsum("kc,kci,kcj->cij", weight, X, X) / weight.sum()
+    begin = Descent.begin(fit_state, PassDerivatives(grams[0], grams[:, 0], grams), near=0.0, stop=1.0)
+    result = Rows(X, Y, weight).evaluate(begin.point.beta[0], begin.density(), with_curvature=True)
+    best = EvaluatedPoint(begin.point, 0.0, 0.0, double(0.0), double(0.0), None, result)
+    end = replace(begin, best=best, curvature_sums=result.curvature, history=(math.inf,))
+    gaussian = likelier_gaussian(end, grams)
+    precision = torch.ones(channels).double()
+    for _ in range(3):
+        root = (weight * precision).sqrt()
+        beta = torch.linalg.lstsq((root.unsqueeze(-1) * X).flatten(0, 1), (root * Y).flatten()).solution
+        mean_square = (weight * (Y - X @ beta).square()).sum(0) / weight.sum(0)
+        precision = 1.0 / mean_square if channels > 1 else precision
+    torch.testing.assert_close(gaussian.beta[0], beta, rtol=1e-10, atol=0)
+    torch.testing.assert_close(torch.exp(gaussian.log_d[0]), mean_square.sqrt(), rtol=1e-10, atol=0)
+    assert not gaussian.kappa.any()
+    assert likelier_gaussian(replace(end, history=(-1e9,)), grams) is None
+    assert likelier_gaussian(replace(end, point=replace(end.point, kappa=0.0 * kappa)), grams) is None
 
 
 @pytest.mark.parametrize("channels", [1, 2])

@@ -16,7 +16,6 @@ from mkc_torch.linear._psi import (
     bisquare_for_efficiency,
     checked_tuning,
     gaussian_efficiency,
-    psi_weight,
 )
 
 
@@ -53,11 +52,11 @@ KINKS = {"huber": 1, "hampel": 3, "tukey": 1, "andrews": 1, "welsch": 0}
 def test_weights_times_residuals_are_the_printed_formulas(name):
     tuning = TUNING_95[name]
     z = torch.cat([torch.linspace(-12, 12, 241), torch.tensor([*tuning, 1e-9, 1e9])]).double()
-    weight = psi_weight(name, tuning)(z)
+    weight = Psi(name, tuning).weight(z)
     expected = torch.tensor([PSI[name](float(t), *tuning) for t in z], dtype=torch.float64)
     torch.testing.assert_close(weight * z, expected, rtol=1e-12, atol=1e-12)
-    assert float(psi_weight(name, tuning)(torch.zeros(1))) == 1.0
-    outwards = psi_weight(name, tuning)(torch.linspace(0, 20, 500))
+    assert float(Psi(name, tuning).weight(torch.zeros(1))) == 1.0
+    outwards = Psi(name, tuning).weight(torch.linspace(0, 20, 500))
     assert bool((outwards.diff() <= 0).all())
     assert bool(((outwards >= 0) & (outwards <= 1)).all())
 

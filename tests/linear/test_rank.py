@@ -2,7 +2,7 @@
 
 import torch
 
-from mkc_torch.linear._rank import rank_tolerance
+from mkc_torch.linear._basis import rank_tolerance
 
 
 def test_many_rows_of_float32_are_not_refused_for_their_number():

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.linear import LeastSquares, SRegression
 from mkc_torch.linear._problem import linear_problem
-from mkc_torch.linear._psi import BISQUARE_50, bisquare_for_breakdown, bisquare_rho, bisquare_weight
+from mkc_torch.linear._psi import BISQUARE_50, bisquare_for_breakdown, bisquare_rho, tukey_weight
 from mkc_torch.linear.s_regression import MScale, starts_worth_drawing
 from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
@@ -109,7 +109,7 @@ def test_rho_and_weight_of_the_bisquare():
     torch.testing.assert_close(bisquare_rho(u), expected)
     leaf = u.clone().requires_grad_()
     (slope,) = torch.autograd.grad(bisquare_rho(leaf).sum(), leaf)
-    torch.testing.assert_close(6.0 * u * bisquare_weight(u) * inside, slope)
+    torch.testing.assert_close(6.0 * u * tukey_weight(u, 1.0) * inside, slope)
     assert abs(BISQUARE_50 - 1.547645) < 1e-7
 
 
@@ -271,7 +271,7 @@ def test_the_scale_does_not_depend_on_where_it_begins(off, dtype):
     again, weight = rule.weighted(problem, residual, off * scale)
     tolerance = 8 * torch.finfo(dtype).eps
     torch.testing.assert_close(again, scale, rtol=tolerance, atol=0.0)
-    expected = bisquare_weight(residual / (BISQUARE_50 * scale.unsqueeze(-2)))
+    expected = tukey_weight(residual, BISQUARE_50 * scale.unsqueeze(-2))
     torch.testing.assert_close(weight, expected, rtol=0.0, atol=100 * tolerance)
 
 

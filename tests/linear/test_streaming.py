@@ -346,6 +346,23 @@ def test_an_interrupted_fit_goes_on(passes, tmp_path):
     assert path.stat().st_size < 20_000
 
 
+@pytest.mark.parametrize("moved", [1e-14, 1e-2])
+def test_recorded_passes_are_made_again_only_at_other_points(moved):
+    """Rounding on another processor moves the points of a resumed fit; other steps lead to other points."""
+    X, Y = problem(5, N=2000)
+    whole, broken = StreamedMKCRegression(pilot=200).fit(cut(X, Y)), StreamedMKCRegression(pilot=200)
+    with pytest.raises(KeyboardInterrupt):
+        broken.fit(Interrupted(cut(X, Y), whole.n_iter_ - 2))
+    state = broken.state_dict()
+    state["passes"] = tuple((point * (1.0 + moved), sums) for point, sums in state["passes"])
+    again, counted = StreamedMKCRegression(pilot=200), Interrupted(cut(X, Y), 1000)
+    again.load_state_dict(state)
+    again.fit(counted)
+    assert 1000 - counted.left == (2 if moved < 1e-6 else whole.n_iter_ - 1)
+    assert again.n_iter_ == whole.n_iter_
+    torch.testing.assert_close(again.coef_, whole.coef_, rtol=1e-12, atol=0)
+
+
 def test_a_state_resumes_only_with_its_data_and_parameters(tmp_path):
     X, Y = problem(5, N=2000)
     path = tmp_path / "fit.pt"

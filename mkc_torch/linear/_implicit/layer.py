@@ -87,14 +87,7 @@ def fit_layer(
     start: Tensor | None = None,
     covariance: tuple[CovarianceKind, float | None] = ("sandwich", None),
 ) -> Layer:
-    """Fit with derivatives by X, Y, the weights, and by σ, d and domain where they are given.
-
-    Args:
-        X, Y, sample_weight: as in :func:`linear_problem`.
-        solve: the fit, called with checked constants.
-        sigma, d, bound: a number, (m,) or (*, m); None lets the fit estimate it.
-        start: starting coefficients (n,) or (*, n), or None.
-        covariance: kind and bandwidth of the covariance of the coefficients.
+    """Fit by ``solve`` with derivatives by X, Y, the weights, and by σ, d and domain where they are given.
 
     Raises:
         ValueError: bad input, as in :func:`linear_problem`.
@@ -149,17 +142,8 @@ class _Search(NamedTuple):
         shared = problem.to_coef.shape[0] == 1
         lead = (1,) * len(problem.batch) if shared else tuple(problem.batch)
         covariance = coefficient_covariance(problem, at.beta, at.kappa, torch.exp(at.log_d), *self.covariance)
-        own = (
-            at.beta,
-            at.kappa,
-            at.log_d,
-            torch.zeros_like(at.log_d) if fit_state.log_bound is None else fit_state.log_bound,
-            at.unit,
-            at.total,
-            at.inverse,
-            at.cause,
-            fit_state.converged,
-        )
+        log_bound = torch.zeros_like(at.log_d) if fit_state.log_bound is None else fit_state.log_bound
+        own = (at.beta, at.kappa, at.log_d, log_bound, at.unit, at.total, at.inverse, at.cause, fit_state.converged)
         return (
             problem.to_coef.reshape(lead + tuple(problem.to_coef.shape[1:])),
             *(problem.restore(v) for v in own),

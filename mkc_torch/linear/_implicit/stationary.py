@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.small_factors import definite_inverse
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
-from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
+from mkc_torch.density.likelihood import DensityState, energy_derivatives, normaliser_derivatives
 from mkc_torch.density.normalizer import _log_partition_and_slopes
 from mkc_torch.linear._implicit.refusal import _NO_MINIMUM, _NOT_CONVERGED
 from mkc_torch.linear._problem import LinearProblem
@@ -40,6 +40,19 @@ class FitState:
     free_kappa: bool = False
     free_d: bool = False
     extras: tuple[Tensor, ...] = ()
+
+    @staticmethod
+    def of(beta: Tensor, state: DensityState, converged: Tensor, extras: tuple[Tensor, ...] = ()) -> FitState:
+        """Coefficients and a density fitted to their residuals."""
+        limits, free = (state.log_bound, state.log_d_min), (state.free_kappa, state.free_d)
+        return FitState(beta, state.kappa, state.log_d, converged, *limits, *free, extras)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Least log d, and log of the domain, of a likelihood."""
+        assert self.log_d_min is not None
+        assert self.log_bound is not None
+        return self.log_d_min, self.log_bound
 
     def to(self, device: torch.device) -> FitState:
         """The same on a device; ``extras`` stay where they are."""

@@ -31,13 +31,12 @@ _HELD = 1e-3
 
 @dataclass(frozen=True)
 class PilotFit:
-    """Fit of a sample, as the start of the fit to all rows.
+    """Fit of a sample of ``rows`` rows, as the start of the fit to all rows.
 
     Attributes:
         fit_state: the sample's maximum with its domain and the least d, in the basis of the passes, a batch of 1.
         slopes: derivatives of the sample at its maximum, and the products of the columns of all rows.
         exact: whether most values lie on the fit to rounding.
-        rows: number of rows of the sample.
     """
 
     fit_state: FitState
@@ -47,12 +46,7 @@ class PilotFit:
 
 
 def fit_pilot(drawn: Drawn, survey: Survey, estimator: MKCRegression) -> PilotFit:
-    """Fit :class:`MKCRegression` to a sample.
-
-    Args:
-        drawn: the sample.
-        survey: the survey of all rows.
-        estimator: estimator with the parameters of the fit.
+    """Fit a sample by an estimator with the parameters of the fit.
 
     Raises:
         RankDeficientError: the sample's columns are linearly dependent.
@@ -69,26 +63,16 @@ def fit_pilot(drawn: Drawn, survey: Survey, estimator: MKCRegression) -> PilotFi
             "raise `pilot`."
         ) from None
     kappa, log_d, log_bound = fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
-    coef = fit.coef_
-    beta = coef if frame is None else torch.linalg.solve(frame, coef.unsqueeze(-1)).squeeze(-1)
-    total, more, _ = Rows(x, y, weight, frame).evaluate(beta, Density(kappa, fit.d_), with_curvature=True)
-    assert more is not None
+    beta = fit.coef_ if frame is None else torch.linalg.solve(frame, fit.coef_.unsqueeze(-1)).squeeze(-1)
+    result = Rows(x, y, weight, frame).evaluate(beta, Density(kappa, fit.d_), with_curvature=True)
+    total = result.total
     exact = bool(fit.exact_fit_)
     slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * total.terms[3] / total.weight
     held = log_d if exact else torch.where(slope > _HELD, log_d, torch.log(_LEAST_D * fit.d_))
-    fit_state = FitState(
-        beta=beta.unsqueeze(0),
-        kappa=kappa.unsqueeze(0),
-        log_d=log_d.unsqueeze(0),
-        converged=torch.zeros(1, dtype=torch.bool),
-        log_bound=log_bound.unsqueeze(0),
-        log_d_min=held.unsqueeze(0),
-        free_kappa=estimator.sigma is None,
-        free_d=estimator.d is None,
-    )
-    weight_sum = total.weight.sum()
-    slopes = PassDerivatives(more.curvature / weight_sum, more.tilt / weight_sum, survey.grams())
-    return PilotFit(fit_state, slopes, exact, len(x))
+    beta, kappa, log_d, log_bound, held = (v.unsqueeze(0) for v in (beta, kappa, log_d, log_bound, held))
+    free = estimator.sigma is None, estimator.d is None
+    fit_state = FitState(beta, kappa, log_d, torch.zeros(1, dtype=torch.bool), log_bound, held, *free)
+    return PilotFit(fit_state, PassDerivatives.of(result, survey.grams()), exact, len(x))
 
 
 def _columns(drawn: Drawn, shape: Shape) -> tuple[Tensor, Tensor, Float64[Tensor, "k m"] | None]:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch.linear._basis import nearly_dependent
 from mkc_torch.linear._block_sums import Memory, products
 from mkc_torch.linear._blocks import Block
 from mkc_torch.linear._problem import refuse_dependent, refuse_magnitude
@@ -26,11 +27,6 @@ from mkc_torch.linear.streaming._reservoir import Reservoir
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
-
-NEARLY_DEPENDENT = 1e3
-"""Ratio of the singular values of the scaled columns above which every block is transformed to an orthonormal basis.
-
-Sums of products of the original columns lose digits by its square, six of sixteen here."""
 
 _MANY_COLUMNS = 16
 """Number of columns from which the products of an array with itself are faster than those of two arrays."""
@@ -119,15 +115,12 @@ class Survey:
         stacked = self.triangle[:, :, :n].reshape(-1, n)
         scale = torch.linalg.vector_norm(stacked, dim=0)
         upper = torch.linalg.qr(stacked / torch.where(scale > 0, scale, 1.0), mode="r").R
-        refuse_dependent(upper, scale, self.rows * self.shape.m)
-        return torch.linalg.inv(upper) / scale.unsqueeze(-1)
+        return refuse_dependent(upper, scale, self.rows * self.shape.m) / scale.unsqueeze(-1)
 
     def frame(self) -> Float64[Tensor, "n n"] | None:
         """Change of basis of every block if the columns are nearly dependent, else None."""
         n = self.shape.n
-        stacked = self.triangle[:, :, :n].reshape(-1, n)
-        singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
-        return self.to_coef() if bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1]) else None
+        return self.to_coef() if nearly_dependent(self.triangle[:, :, :n].reshape(-1, n)) else None
 
     def sizes(self, coef: Float64[Tensor, " n"]) -> Float64[Tensor, " m"]:
         """Upper bound of the weighted sum of ``|y| + |x| |coef|`` of each channel, by Cauchy-Schwarz."""

@@ -17,10 +17,11 @@ from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._robust_start import Start
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._batches import checked_source
+from mkc_torch.linear.streaming._maximum import streamed_maximum
 from mkc_torch.linear.streaming._pilot import fit_pilot
-from mkc_torch.linear.streaming._progress import StreamChangedError, StreamProgress
 from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, largest_key, merged
-from mkc_torch.linear.streaming._sums import flat_length, sums_pass
+from mkc_torch.linear.streaming._rows import StreamChangedError, StreamedRows
+from mkc_torch.linear.streaming._state import StreamState
 from mkc_torch.linear.streaming._survey import Survey, survey_rows
 
 if TYPE_CHECKING:
@@ -113,8 +114,8 @@ class StreamedMKCRegression(Inference):
         self.max_passes = checked_whole("max_passes", max_passes, 4, "60 is ample")
         self.seed = checked_whole("seed", seed, 0)
         self._of_sample()
-        self._progress: StreamProgress | None = None
-        self._resume_from: StreamProgress | None = None
+        self._state: StreamState | None = None
+        self._resume_from: StreamState | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "weights_":
@@ -151,23 +152,24 @@ class StreamedMKCRegression(Inference):
         counts = ranks.gathered(lambda: getattr(checked_source(batches), "rows", None))
         source = checked_source(batches)
         resume_from, self._resume_from = self._resume_from, None
-        progress = ranks.from_first(lambda: self._resumed(resume_from, checkpoint))
-        if progress is None:
-            progress = self._after_survey(ranks, source, counts, checkpoint)
-        if progress.phase == "range":
-            progress = self._after_range_pass(ranks, source, progress, checkpoint)
-        while progress.phase != "done":
-            before, shape, frame = progress, progress.survey.shape, progress.survey.frame()
-            (beta, density, curvature), rough = progress.next_pass(), progress.rough
-            flat = ranks.sum_of(
-                lambda: sums_pass(source, shape, frame, beta, density, with_curvature=curvature, rough=rough)[0],  # noqa: B023
-                flat_length(shape, with_curvature=curvature),
-            )
-            progress = self._saved(ranks, lambda: before.after_sums(flat, self.max_passes), checkpoint)  # noqa: B023
-        self._single_channel = progress.survey.shape.single_channel
-        found = ranks.from_first(progress.results)
-        for name, value in found.items():
+        state = ranks.from_first(lambda: self._resumed(resume_from, checkpoint))
+        if state is None:
+            state = self._surveyed(ranks, source, counts)
+
+        def keep(state: StreamState) -> None:
+            ranks.from_first(lambda: None if checkpoint is None else state.save(checkpoint))
+            # without the last pass, which a resumed fit makes again and thereby detects other data
+            self._state = state
+
+        rows = StreamedRows(ranks, source, state, keep)
+        found, converged = streamed_maximum(rows, learns_domain=self.bound is None, max_passes=self.max_passes)
+        for name, value in found.attributes().items():
             setattr(self, name, value)
+        self._single_channel = state.survey.shape.single_channel
+        self.history_ = found.history
+        self.converged_, self.exact_fit_ = torch.tensor(converged), torch.tensor(state.pilot.exact)
+        self.n_iter_, self.n_light_ = rows.passes, found.light
+        self.n_rows_, self.n_pilot_ = state.survey.rows, state.pilot.rows
         self._name_columns(batches)
         return self
 
@@ -197,9 +199,9 @@ class StreamedMKCRegression(Inference):
         Raises:
             NotFittedError: no pass was made.
         """
-        if self._progress is None:
+        if self._state is None:
             raise NotFittedError("StreamedMKCRegression has no state yet; call fit(batches) first.")
-        return self._progress.state_dict()
+        return self._state.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Let the next ``fit`` resume from a state, with the same data.
@@ -207,9 +209,9 @@ class StreamedMKCRegression(Inference):
         Raises:
             ValueError: not such a state, or a state of a fit with other parameters.
         """
-        progress = StreamProgress.of(state)
-        progress.refuse_other_settings(self._settings())
-        self._resume_from = progress
+        resume_from = StreamState.of(state)
+        resume_from.refuse_other_settings(self._settings())
+        self._resume_from = resume_from
 
     def _of_sample(self) -> MKCRegression:
         """Estimator of the sample, which also checks the parameters."""
@@ -222,24 +224,16 @@ class StreamedMKCRegression(Inference):
         values = {name: getattr(self, name) for name in names}
         return {name: v.tolist() if isinstance(v, Tensor) else v for name, v in values.items()}
 
-    def _resumed(
-        self, given: StreamProgress | None, checkpoint: str | os.PathLike[str] | None
-    ) -> StreamProgress | None:
-        """Progress to resume from: an existing checkpoint, or a given state."""
-        progress = None if checkpoint is None else StreamProgress.load(checkpoint)
-        progress = given if progress is None else progress
-        if progress is not None:
-            progress.refuse_other_settings(self._settings())
-        return progress
+    def _resumed(self, given: StreamState | None, checkpoint: str | os.PathLike[str] | None) -> StreamState | None:
+        """State to resume from: an existing checkpoint, or a given state."""
+        state = None if checkpoint is None else StreamState.load(checkpoint)
+        state = given if state is None else state
+        if state is not None:
+            state.refuse_other_settings(self._settings())
+        return state
 
-    def _after_survey(
-        self,
-        ranks: Ranks,
-        batches: Iterable[Any],
-        counts: list[int | None],
-        checkpoint: str | os.PathLike[str] | None,
-    ) -> StreamProgress:
-        """Progress after the first pass."""
+    def _surveyed(self, ranks: Ranks, batches: Iterable[Any], counts: list[int | None]) -> StreamState:
+        """State after the first pass and the fit of the sample."""
         known = [count for count in counts if count is not None]
         first = sum(known[: ranks.rank]) if ranks.alone or len(known) == len(counts) else None
         rows = sum(known) if len(known) == len(counts) else None
@@ -248,38 +242,12 @@ class StreamedMKCRegression(Inference):
         surveys = [survey for survey in found if survey is not None]
         drawn = ranks.gathered(lambda: _likely(reservoir.drawn(), self.pilot, sum(survey.rows for survey in surveys)))
 
-        def begin() -> StreamProgress:
+        def begin() -> StreamState:
             survey = Survey.of_all(surveys)
             sample = merged([part for part in drawn if part is not None], self.pilot)
-            return StreamProgress.begin(self._settings(), survey, fit_pilot(sample, survey, self._of_sample()))
+            return StreamState(self._settings(), survey, fit_pilot(sample, survey, self._of_sample()))
 
-        return self._saved(ranks, begin, checkpoint)
-
-    def _after_range_pass(
-        self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
-    ) -> StreamProgress:
-        """Progress after the pass for the domain."""
-        survey, (beta, density, _), rough = progress.survey, progress.next_pass(), progress.rough
-        parts = ranks.gathered(
-            lambda: sums_pass(batches, survey.shape, survey.frame(), beta, density, with_range=True, rough=rough)
-        )
-        return self._saved(ranks, lambda: progress.after_range(parts), checkpoint)
-
-    def _saved(
-        self, ranks: Ranks, work: Callable[[], StreamProgress], checkpoint: str | os.PathLike[str] | None
-    ) -> StreamProgress:
-        """Compute progress on rank 0, write it to the checkpoint if there is one, and share it."""
-
-        def written() -> StreamProgress:
-            progress = work()
-            if checkpoint is not None and progress.phase != "done":
-                progress.save(checkpoint)
-            return progress
-
-        progress = ranks.from_first(written)
-        # a resumed state repeats the last pass, which detects other data
-        self._progress = self._progress if progress.phase == "done" else progress
-        return progress
+        return ranks.from_first(begin)
 
     def _light(self, problem: tuple[int, ...]) -> tuple[int, int]:  # noqa: ARG002
         return self.n_rows_ * self.d_.shape[0], self.n_light_
