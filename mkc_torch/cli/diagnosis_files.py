@@ -24,7 +24,7 @@ from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_f
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
-from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts
+from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts
 from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.recording.column_names import split_unit
 from mkc_torch.recording.join_recordings import joint_name

@@ -8,10 +8,9 @@ from time import monotonic
 
 from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.progress import counting
-from mkc_torch.diagnosis.pipeline.baseline import fit_baseline
 from mkc_torch.diagnosis.pipeline.partial import PartialResult, build_result, cut_short, estimate, run_tests
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions, prepare
-from mkc_torch.diagnosis.pipeline.search import stepwise_search
+from mkc_torch.diagnosis.pipeline.search import fit_baseline, stepwise_search
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE

@@ -20,7 +20,7 @@ from mkc_torch.linear._basis import nearly_dependent
 from mkc_torch.linear._blocks import Density, PassResult
 from mkc_torch.linear._descent import Descent, PassDerivatives
 from mkc_torch.linear._implicit.stationary import FitState
-from mkc_torch.linear._many_rows import RowsMaximum, descended, likelier_gaussian, maximum_of
+from mkc_torch.linear._many_rows import RowsMaximum, descended, maximum_of, more_likely_gaussian
 from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at, rows_of
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
@@ -129,7 +129,7 @@ def large_maximum(
         first = begin if same else None
     descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
     end = descended(source, descent, passes, first)
-    if not end.done or _d_is_at_its_least(end) or _gaussian_is_likelier(rows, end):
+    if not end.done or _d_is_at_its_least(end) or _gaussian_is_more_likely(rows, end):
         return None
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     return maximum_of(end, used, rows.frame, with_last_step=False), source.weights
@@ -238,8 +238,8 @@ def _grams(rows: Rows, fit_state: FitState) -> Float64[Tensor, "m n n"]:
     return torch.stack(found)
 
 
-def _gaussian_is_likelier(rows: Rows, end: Descent) -> bool:
+def _gaussian_is_more_likely(rows: Rows, end: Descent) -> bool:
     """Whether a Gaussian at least squares has a higher likelihood than the result."""
-    if likelier_gaussian(end, end.slopes.grams, _SLACK) is None:
+    if more_likely_gaussian(end, end.slopes.grams, _SLACK) is None:
         return False
-    return likelier_gaussian(end, _grams(rows, end.fit_state) / end.end[0].result.total.weight.sum()) is not None
+    return more_likely_gaussian(end, _grams(rows, end.fit_state) / end.end[0].result.total.weight.sum()) is not None

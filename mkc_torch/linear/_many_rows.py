@@ -104,7 +104,7 @@ def sandwich_of(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "
     return used / left * inverse @ found.spread @ inverse
 
 
-def likelier_gaussian(end: Descent, grams: Float64[Tensor, "m n n"], slack: float = 1.0) -> FitState | None:
+def more_likely_gaussian(end: Descent, grams: Float64[Tensor, "m n n"], slack: float = 1.0) -> FitState | None:
     """Gaussian density at weighted least squares if its likelihood is higher than at the end of a descent, else None.
 
     With the products ``G = Σ x xᵀ`` and moments ``g = Σ e x`` of the columns, least squares is ``G⁻¹ g`` away.

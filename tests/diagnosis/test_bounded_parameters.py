@@ -42,7 +42,7 @@ def flight(drag, seed, hertz=10, seconds=16, slow=2.0):
 
 
 @pytest.mark.e2e
-def test_drag_of_a_short_flight_is_named_beside_a_slow_error_of_the_sensor():
+def test_drag_of_a_short_flight_is_named_despite_a_slow_error_of_the_sensor():
     found = diagnose(Rocket(), flight(DRAG, 1))
     assert [finding.effect for finding in found.findings] == ["quadratic_drag"]
     (size,) = found.findings[0].parameters

@@ -9,7 +9,7 @@ import torch
 from mkc_torch.linear._blocks import Block, triangle
 from mkc_torch.linear._descent import Descent, EvaluatedPoint, PassDerivatives, _newton_move
 from mkc_torch.linear._implicit.stationary import FitState, Unknowns
-from mkc_torch.linear._many_rows import likelier_gaussian
+from mkc_torch.linear._many_rows import more_likely_gaussian
 from mkc_torch.linear._rows import Rows
 
 GRADIENTS = {
@@ -53,7 +53,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_the_likelier_gaussian_is_weighted_least_squares_of_all_channels(channels):
+def test_the_more_likely_gaussian_is_weighted_least_squares_of_all_channels(channels):
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(300, channels, 3, generator=generator, dtype=torch.float64)
     scales = torch.tensor([0.5, 3.0]).double()[:channels]
@@ -75,7 +75,7 @@ def test_the_likelier_gaussian_is_weighted_least_squares_of_all_channels(channel
     result = Rows(X, Y, weight).evaluate(begin.point.beta[0], begin.density(), with_curvature=True)
     best = EvaluatedPoint(begin.point, 0.0, 0.0, double(0.0), double(0.0), None, result)
     end = replace(begin, best=best, curvature_sums=result.curvature, history=(math.inf,))
-    gaussian = likelier_gaussian(end, grams)
+    gaussian = more_likely_gaussian(end, grams)
     precision = torch.ones(channels).double()
     for _ in range(3):
         root = (weight * precision).sqrt()
@@ -85,8 +85,8 @@ def test_the_likelier_gaussian_is_weighted_least_squares_of_all_channels(channel
     torch.testing.assert_close(gaussian.beta[0], beta, rtol=1e-10, atol=0)
     torch.testing.assert_close(torch.exp(gaussian.log_d[0]), mean_square.sqrt(), rtol=1e-10, atol=0)
     assert not gaussian.kappa.any()
-    assert likelier_gaussian(replace(end, history=(-1e9,)), grams) is None
-    assert likelier_gaussian(replace(end, point=replace(end.point, kappa=0.0 * kappa)), grams) is None
+    assert more_likely_gaussian(replace(end, history=(-1e9,)), grams) is None
+    assert more_likely_gaussian(replace(end, point=replace(end.point, kappa=0.0 * kappa)), grams) is None
 
 
 @pytest.mark.parametrize("channels", [1, 2])

@@ -139,7 +139,7 @@ def test_a_forcing_of_any_length_with_any_number_of_curves(samples, curves):
 
 
 def test_runs_are_not_joined_by_a_line():
-    from mkc_torch.diagnosis.plot.curves import _joined
+    from mkc_torch.diagnosis.plot.drawings import _joined
 
     time = torch.cat([torch.arange(5.0), torch.arange(5.0)]).numpy()
     assert math.isnan(_joined(time, time)[5])

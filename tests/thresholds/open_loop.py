@@ -30,7 +30,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.evidence.held_out import gain_interval
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.pipeline import stepwise
-from mkc_torch.diagnosis.search import open_loop_gain, with_process_noise
+from mkc_torch.diagnosis.search import with_process_noise
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -208,7 +208,7 @@ def seen(name: str, hidden: str, seed: int) -> dict[str, Any]:
         return {
             "effect": effect.id,
             "right": effect.id in right,
-            "ratio": math.exp(open_loop_gain._size(run) - open_loop_gain._size(free)),
+            "ratio": math.exp(ranks._size(run) - ranks._size(free)),
             "gain": agreed_innovation_gain(free.residual, run.residual) - price,
         }
 
@@ -222,11 +222,11 @@ def seen(name: str, hidden: str, seed: int) -> dict[str, Any]:
     def open_loop(best: Any, ranking: Any, rivals: Any, alone: Any, runs: Any, terms: Any) -> Any:
         known = {terms[number].key: fit for number, fit in runs.items()}
         for fit in (best, *(fit for fit in rivals if fit is not best)):
-            own = [open_loop_gain.refit_open_loop(fit), known.get(fit.model.terms[-1].key)]
+            own = [ranks.refit_open_loop(fit), known.get(fit.model.terms[-1].key)]
             finite = [run for run in own if run is not None]
             if finite:
-                row["paying"].append(described(min(finite, key=open_loop_gain._size), alone))
-        return open_loop_gain.with_open_loop_gain(best, ranking, rivals, alone, runs, terms)
+                row["paying"].append(described(min(finite, key=ranks._size), alone))
+        return ranks.with_open_loop_gain(best, ranking, rivals, alone, runs, terms)
 
     def special(located: Any, scores: Any, blocks: Any, seed: int, settings: Any) -> Any:
         gaps = {located.scene.terms[rival.number].key: rival.gap for rival in located.ranking}

@@ -2,7 +2,7 @@
 
 A new test is a function ``evidence(case) -> EvidenceResult`` and a line in :data:`TESTS`. It returns data, which
 ``diagnosis.json`` contains under ``evidence``, by the test's id. Its warnings are worded in
-:mod:`mkc_torch.diagnosis.findings.evidence_warnings`, its lines in the report and on the terminal in
+:mod:`mkc_torch.diagnosis.findings.warnings`, its lines in the report and on the terminal in
 :mod:`mkc_torch.report.diagnosis.evidence`. It does not change the verdict or the findings.
 """
 
@@ -14,9 +14,13 @@ from mkc_torch.diagnosis.evidence.prediction import (
     held_out_gain_evidence,
     without_finding,
 )
-from mkc_torch.diagnosis.evidence.rejected import localised_evidence, rejected_evidence
 from mkc_torch.diagnosis.evidence.remaining import remaining_evidence, within_reach
-from mkc_torch.diagnosis.evidence.residual_noise import density_evidence, whiteness_evidence
+from mkc_torch.diagnosis.evidence.residual_noise import (
+    density_evidence,
+    localised_evidence,
+    rejected_evidence,
+    whiteness_evidence,
+)
 from mkc_torch.diagnosis.evidence.timing import (
     driver_shift_evidence,
     driver_shift_of_finding,

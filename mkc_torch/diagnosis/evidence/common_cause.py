@@ -14,8 +14,8 @@ from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import ANY, Term
-from mkc_torch.diagnosis.noise.cosine_basis import course_of
 from mkc_torch.diagnosis.noise.drift import DriftStatistics
+from mkc_torch.diagnosis.noise.spectrum import course_of
 from mkc_torch.diagnosis.search.estimate import drift_residuals
 from mkc_torch.diagnosis.search.linear_search import log_survival
 from mkc_torch.diagnosis.search.linearise import LinearisedSearch, linearise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,10 +14,12 @@ from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.result import DensityCheck
-from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.settings import EvidenceSettings, Settings
+from mkc_torch.recording.disturbance import RejectedInterval, disturbed_intervals
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
 
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 """Candidate degrees of freedom."""
@@ -27,6 +29,12 @@ _ROUNDS, _NODES = 30, 2001
 
 _AT_ONCE = 10_000
 """Batch size of the distribution function, which integrates over tens of nodes per sample."""
+
+_FIRST = 20
+"""Number of lags of the portmanteau statistic."""
+
+_FARTHEST = 0.25
+"""Largest lag that is tested on its own, as a share of the recording."""
 
 
 def density_evidence(case: EvidenceContext) -> EvidenceResult:
@@ -150,13 +158,6 @@ def student_cdf(size: Float[Tensor, " N"], freedom: float) -> Float[Tensor, " N"
     return torch.lerp(total[left], total[left + 1], place - left) / total[-1]
 
 
-_FIRST = 20
-"""Number of lags of the portmanteau statistic."""
-
-_FARTHEST = 0.25
-"""Largest lag that is tested on its own, as a share of the recording."""
-
-
 @dataclass(frozen=True)
 class Whiteness:
     """Whiteness of a channel: the last significant lag in samples, 0 if white.
@@ -243,3 +244,55 @@ def _lagged_sums(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Return the lagged products of a series, summed over samples."""
     N = len(values)
     return torch.fft.irfft(torch.fft.rfft(values, n=2 * N).abs().square(), n=2 * N)[:N]
+
+
+def localised_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Return the interval to which the first candidate is confined, in s; None if it is not confined."""
+    located, time = case.first, case.prepared.time
+    if located is None or located.stretch is None:
+        return EvidenceResult("one_stretch")
+    begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
+    return EvidenceResult("one_stretch", (begin, end))
+
+
+class RejectedByFit(NamedTuple):
+    """Intervals in which most samples are rejected.
+
+    Attributes:
+        final: by the fit with all findings.
+        before: by the simulation without findings, which an unconfirmed finding may cover.
+    """
+
+    final: tuple[RejectedInterval, ...]
+    before: tuple[RejectedInterval, ...]
+
+
+def rejected_evidence(case: EvidenceContext) -> EvidenceResult:
+    """Return the intervals of rejected samples; None for a recording without times."""
+    if case.prepared.recording.time is None:
+        return EvidenceResult("rejected")
+    intervals, before = (
+        rejected_intervals(case.prepared.time, fit.weights, case.settings) for fit in (case.final.fit, case.base)
+    )
+    return EvidenceResult("rejected", RejectedByFit(intervals, before))
+
+
+def rejected_intervals(
+    time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings
+) -> tuple[RejectedInterval, ...]:
+    """Return the intervals in which most samples are rejected, without short bursts.
+
+    Args:
+        time: in s.
+        weights: of the residuals in the final fit, in [0, 1].
+        settings: weight below which a sample is rejected, and minimum length of an interval.
+
+    Example:
+        >>> import torch
+        >>> time = torch.arange(1000) / 50.0
+        >>> weights = torch.where((time > 4.0) & (time < 7.0), 0.0, 1.0).unsqueeze(-1)
+        >>> [(round(i.start, 1), round(i.end, 1)) for i in rejected_intervals(time, weights, Settings())]
+        [(4.0, 7.0)]
+    """
+    intervals = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
+    return tuple(interval for interval in intervals if interval.end - interval.start >= settings.evidence.disturbed)

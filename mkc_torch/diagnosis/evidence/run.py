@@ -11,8 +11,7 @@ from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.prediction import held_out_gain_evidence, held_out_gain_result
-from mkc_torch.diagnosis.evidence.rejected import localised_evidence, rejected_evidence
-from mkc_torch.diagnosis.evidence.residual_noise import whiteness_evidence
+from mkc_torch.diagnosis.evidence.residual_noise import localised_evidence, rejected_evidence, whiteness_evidence
 from mkc_torch.diagnosis.search.estimate import FinalEstimate, estimate
 
 

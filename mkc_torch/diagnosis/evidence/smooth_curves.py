@@ -13,7 +13,7 @@ from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
 from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Driver
-from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.diagnosis.noise.spectrum import cosines
 from mkc_torch.simulation.ports import Port
 
 if TYPE_CHECKING:

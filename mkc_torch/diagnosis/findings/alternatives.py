@@ -8,7 +8,7 @@ from functools import partial
 
 import torch
 
-from mkc_torch.diagnosis.evidence.open_loop import open_loop_at
+from mkc_torch.diagnosis.evidence.prediction import open_loop_at
 from mkc_torch.diagnosis.findings.finding import all_parameters
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel

@@ -14,10 +14,9 @@ from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import ratio, sized, tidy
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
-from mkc_torch.diagnosis.findings.experiment_design import SAME, distinguishing_state
+from mkc_torch.diagnosis.findings.advice import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.findings.sampling import FINE_POINTS, drawn_points
-from mkc_torch.diagnosis.findings.shape import formulas
+from mkc_torch.diagnosis.findings.shape import FINE_POINTS, drawn_points, formulas
 from mkc_torch.diagnosis.model.shapes import reach_of
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference, Separability

@@ -16,13 +16,13 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import has_process_noise
 from mkc_torch.diagnosis.model.term import Term, continuous, run_parallel
-from mkc_torch.diagnosis.search.open_loop_gain import improves_open_loop
-from mkc_torch.diagnosis.search.ranking import schwarz
+from mkc_torch.diagnosis.search.ranking import improves_open_loop, schwarz
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
 
 _MOST_TERMS = 3
 """Largest number of terms."""
@@ -34,13 +34,39 @@ _INSIDE = 0.95
 """Share of points in the band at which a formula is accepted."""
 
 _EVEN: dict[str, Callable[[Tensor], Tensor]] = {"{}": lambda x: x, "{}²": torch.square, "{}³": lambda x: x**3}
+
 _SIGNED: dict[str, Callable[[Tensor], Tensor]] = {
     **_EVEN, "|{}|": torch.abs, "{0} |{0}|": lambda x: x * x.abs(), "sign({})": torch.sign
 }  # fmt: skip
+
 _FROM_ZERO: dict[str, Callable[[Tensor], Tensor]] = {**_EVEN, "√{}": torch.sqrt}
+
 _POSITIVE: dict[str, Callable[[Tensor], Tensor]] = {
     **_FROM_ZERO, "/ {}": torch.reciprocal, "/ {}²": lambda x: x.square().reciprocal()
 }  # fmt: skip
+
+_POWERS = torch.arange(0.0, 4.001, 0.02, dtype=torch.float64)
+
+_POINTS = 60
+"""Number of points of a curve."""
+
+_NORMAL_95 = 1.96
+"""Half-width of a 95 % interval in standard errors."""
+
+FINE_POINTS = 800
+"""Number of evenly spaced points at which a curve is computed."""
+
+_DRAWN_POINTS = 80
+"""Number of points of a curve that are closer at bends."""
+
+_EVEN_POINTS = 160
+"""Number of evenly spaced points: of a free curve, and over time."""
+
+_FOR_BENDS = 0.8
+"""Share of the points that goes to bends; the others are evenly spaced."""
+
+_STRAIGHT = 1e-9
+"""Second difference, over the range of the curve, below which the curve is straight up to rounding."""
 
 
 def formulas(curve: Curve) -> tuple[str, ...]:
@@ -125,14 +151,6 @@ def _formula_text(names: tuple[str, ...], coefficients: Tensor, driver: str, siz
     first, *rest = terms
     start = ("−" if first[0] else "") + first[1]
     return start + "".join(f" {'−' if negative else '+'} {text}" for negative, text in rest)
-
-
-_POWERS = torch.arange(0.0, 4.001, 0.02, dtype=torch.float64)
-_POINTS = 60
-"""Number of points of a curve."""
-
-_NORMAL_95 = 1.96
-"""Half-width of a 95 % interval in standard errors."""
 
 
 def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> ShapeCheck | None:
@@ -246,3 +264,40 @@ def nearest_power(curve: Curve) -> str:
     if best is None or not math.isfinite(best[2]):
         return ""
     return f"{best[2]:.3g} |{curve.driver}|^{best[1]:.2g} sign({curve.driver}) plus a straight line"
+
+
+def drawn_points(value: Float[Tensor, "N n"], *, evenly: bool) -> Tensor:
+    """Return indices of the points that are kept of a finely sampled curve: evenly spaced, or closer at bends."""
+    if evenly:
+        return torch.linspace(0, len(value) - 1, min(_EVEN_POINTS, len(value))).long()
+    return bending_points(value, _DRAWN_POINTS)
+
+
+def bending_points(value: Float[Tensor, "N n"], count: int) -> Tensor:
+    """Return indices of at most ``count`` rows of a finely sampled curve, closer together where it bends.
+
+    The density of points follows the square root of the second difference, which makes the error of straight lines
+    between them equal everywhere. The first and the last row are included.
+
+    Args:
+        value: the curve's values at evenly spaced places, in any unit; channels count alike.
+        count: number of points.
+
+    Example:
+        >>> step = torch.linspace(-1.0, 1.0, 801).mul(50.0).tanh().unsqueeze(-1)
+        >>> chosen = bending_points(step, 80)
+        >>> int(((chosen > 350) & (chosen < 450)).sum()) > 40  # 10 if evenly spaced
+        True
+    """
+    N = len(value)
+    if count >= N:
+        return torch.arange(N)
+    bend = value.diff(n=2, dim=0).abs() / (value.amax(0) - value.amin(0)).clamp(min=torch.finfo(value.dtype).tiny)
+    bend = bend.amax(-1).nan_to_num(0.0, 0.0, 0.0)
+    density = torch.nn.functional.pad(torch.where(bend > _STRAIGHT, bend, 0.0).sqrt(), (1, 1))
+    total = density.sum()
+    share = density / total if float(total) > 0.0 else torch.zeros_like(density)
+    mixed = _FOR_BENDS * share + (1.0 - _FOR_BENDS * float(share.sum() > 0)) / N
+    at = torch.linspace(0.0, float(mixed.sum()), count, dtype=value.dtype)
+    chosen = torch.searchsorted(mixed.cumsum(0), at).clamp(max=N - 1)
+    return torch.cat([chosen, torch.tensor([0, N - 1])]).unique()

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, no_first_fit
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.no_first_fit import no_first_fit
 from mkc_torch.diagnosis.model.shapes import shape_fitted
 from mkc_torch.diagnosis.model.term import run_parallel
 from mkc_torch.diagnosis.settings import NoiseSettings

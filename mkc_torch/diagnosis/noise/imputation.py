@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.noise.cosine_basis import dct
-from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum, dct
 
 if TYPE_CHECKING:
     from jaxtyping import Float

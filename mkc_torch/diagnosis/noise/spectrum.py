@@ -10,17 +10,29 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.diagnosis.noise.cosine_basis import dct
 from mkc_torch.diagnosis.noise.outliers import running_median
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+
 
 MAX_ORDER = 12
 """Highest order of the autoregression."""
 
 _FILLED = 10
 """EM iterations for the coefficients that do not count."""
+
+_SHARED = 0.5
+"""Overlap of a port's axes at two samples from which their product informs about noise at the port."""
+
+_CLEARLY = 1.01
+"""Ratio of squares by which noise at a port has to explain the products better than the residual's own noise."""
+
+_CLIPPED = 3.0
+"""Robust standard deviations at which residuals are clipped around their running medians, and squares are clipped."""
+
+_NEAR = 10
+"""Samples to either side for the running median, which separates an outlier from a slow course."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +59,6 @@ class NoiseSpectrum:
         """Whiten values that are in the cosine basis already."""
         root = self.root.reshape(*self.root.shape, *[1] * (coefficients.dim() - 2)).to(coefficients.dtype)
         return (coefficients / root).flatten(0, 1)
-
-
-_SHARED = 0.5
-"""Overlap of a port's axes at two samples from which their product informs about noise at the port."""
-
-_CLEARLY = 1.01
-"""Ratio of squares by which noise at a port has to explain the products better than the residual's own noise."""
 
 
 def port_autoregression(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:
@@ -308,13 +313,6 @@ def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "ord
     return best
 
 
-_CLIPPED = 3.0
-"""Robust standard deviations at which residuals are clipped around their running medians, and squares are clipped."""
-
-_NEAR = 10
-"""Samples to either side for the running median, which separates an outlier from a slow course."""
-
-
 def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> float:
     """Return the log-likelihood gain of ``after`` over ``before`` in nats.
 
@@ -350,3 +348,92 @@ def agreed_innovation_gain(first: Float[Tensor, "N m"], other: Float[Tensor, "N 
     """
     gains = innovation_gain(first, other), -innovation_gain(other, first)
     return max(min(gains), 0.0) + min(max(gains), 0.0)
+
+
+def dct(values: Float[Tensor, N * rest], count: int | None = None) -> Float[Tensor, count * rest]:
+    """Orthonormal cosine transform (DCT-II) over the first dimension, or the first ``count`` of its coefficients.
+
+    Makhoul, "A fast cosine transform in one and two dimensions", IEEE Trans. ASSP 28 (1980).
+
+    Example:
+        >>> dct(torch.ones(4)).round(decimals=4) + 0.0
+        tensor([2., 0., 0., 0.])
+    """
+    N = values.shape[0]
+    count = N if count is None else min(count, N)
+    if values.numel() == 0:
+        return values[:count]
+    folded = torch.cat([values[::2], values[1::2].flip(0)]).movedim(0, -1)
+    spectrum = torch.fft.rfft(folded)
+    if count > spectrum.shape[-1]:
+        # the spectrum of a real series is symmetric
+        spectrum = torch.cat([spectrum, spectrum[..., 1 : (N + 1) // 2].conj().flip(-1)], -1)
+    angle = torch.arange(count, dtype=values.dtype, device=values.device) * (-math.pi / (2 * N))
+    real = spectrum.real[..., :count] * torch.cos(angle) - spectrum.imag[..., :count] * torch.sin(angle)
+    real = real * math.sqrt(2.0 / N)
+    real[..., 0] *= math.sqrt(0.5)
+    return real.movedim(-1, 0)
+
+
+def inverse_dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
+    """The inverse of :func:`dct`.
+
+    Example:
+        >>> inverse_dct(dct(torch.tensor([1.0, 2.0, 4.0]))).round(decimals=4)
+        tensor([1., 2., 4.])
+    """
+    N = values.shape[0]
+    scaled = values.movedim(0, -1) * math.sqrt(N / 2)
+    scaled[..., 0] *= math.sqrt(2.0)
+    mirrored = torch.cat([torch.zeros_like(scaled[..., :1]), scaled[..., 1:].flip(-1)], -1)
+    angle = torch.arange(N, dtype=values.dtype, device=values.device) * (math.pi / (2 * N))
+    spectrum = torch.complex(scaled, -mirrored) * torch.polar(torch.ones_like(angle), angle)
+    folded = torch.fft.ifft(spectrum).real
+    out = torch.empty_like(folded)
+    half = (N + 1) // 2
+    out[..., ::2], out[..., 1::2] = folded[..., :half], folded[..., half:].flip(-1)
+    return out.movedim(-1, 0)
+
+
+def cosines(count: int, N: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "N count"]:
+    """Return the first ``count`` slow cosines without the constant, (N, count), each with mean square 1."""
+    k = torch.arange(1, count + 1, dtype=dtype)
+    n = torch.arange(N, dtype=dtype) + 0.5
+    return math.sqrt(2.0) * torch.cos(math.pi / N * n.unsqueeze(-1) * k)
+
+
+def course_of(amplitudes: Float[Tensor, k * rest], N: int) -> Float[Tensor, N * rest]:
+    """Return ``cosines(k, N) @ amplitudes``, by one transform.
+
+    Example:
+        >>> amplitudes = torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64)
+        >>> torch.allclose(course_of(amplitudes, 20), cosines(2, 20) @ amplitudes)
+        True
+    """
+    slow = torch.cat([torch.zeros_like(amplitudes[:1]), amplitudes])
+    return inverse_dct(math.sqrt(N) * torch.cat([slow, slow.new_zeros(N - len(slow), *slow.shape[1:])]))
+
+
+def dct_of_courses(values: Float[Tensor, "N m c"], courses: int, count: int) -> Float[Tensor, "count m k"]:
+    """Return the slowest cosine coefficients of channels times slow cosines, k = courses · c, from c transforms.
+
+    The same as ``dct(values[:, :, None] * cosines(courses, N)[:, None, :, None], count)``: a product of two cosines is
+    the mean of the cosines of the sum and of the difference of their frequencies.
+
+    Example:
+        >>> values = torch.randn(20, 1, 1, dtype=torch.float64)
+        >>> torch.allclose(dct_of_courses(values, 3, 20), dct(values * cosines(3, 20)[:, None]))
+        True
+    """
+    N, m, c = values.shape
+    count = min(count, N)
+    known = dct(values).flatten(1).mT.contiguous()  # (m c, N)
+    known[:, 0] *= math.sqrt(2.0)
+    # beyond the N-th frequency the transform of N samples is mirrored, with the opposite sign
+    beyond = torch.cat([known, torch.zeros_like(known[:, :1]), -known[:, 1:].flip(-1)], -1)
+    both = torch.cat([known[:, 1 : courses + 1].flip(-1), beyond[:, : count + courses + 1]], -1)
+    sums = beyond[:, 1 : count + courses].unfold(-1, count, 1)
+    differences = both[:, : count + courses - 1].unfold(-1, count, 1).flip(1)
+    out = (sums + differences).unflatten(0, (m, c)) * math.sqrt(0.5)  # (m, c, courses, count)
+    out[..., 0] *= math.sqrt(0.5)
+    return out.permute(3, 0, 2, 1).flatten(2)

@@ -16,12 +16,11 @@ from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.alternatives import with_parameters
-from mkc_torch.diagnosis.findings.evidence_warnings import called, evidence_warnings
 from mkc_torch.diagnosis.findings.finding import finding_of, separability
-from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, with_shape
+from mkc_torch.diagnosis.findings.grading import grade_in_short, grade_of, is_zero_within_error, reasons_of, with_shape
 from mkc_torch.diagnosis.findings.noise import forcing_of, noise_summary, process_noise_of
-from mkc_torch.diagnosis.findings.reasons import reasons_of
 from mkc_torch.diagnosis.findings.shape import shape_of
+from mkc_torch.diagnosis.findings.warnings import called, evidence_warnings
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
 from mkc_torch.diagnosis.io.model import model_of
 from mkc_torch.diagnosis.model.fit import FittedModel

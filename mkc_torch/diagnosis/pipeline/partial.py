@@ -10,7 +10,7 @@ from mkc_torch._parallel.deadline import Reason, within
 from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, on_all
-from mkc_torch.diagnosis.evidence.open_loop import OpenLoop, open_loop_evidence, running_unjudged
+from mkc_torch.diagnosis.evidence.prediction import OpenLoop, open_loop_evidence, running_unjudged
 from mkc_torch.diagnosis.evidence.run import EvidenceReport, all_results, in_short, results_of_tests
 from mkc_torch.diagnosis.findings.noise import offsets_of, runs_of, shared_offsets
 from mkc_torch.diagnosis.model.fit import FittedModel

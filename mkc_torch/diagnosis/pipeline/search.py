@@ -1,4 +1,4 @@
-"""The third stage of a diagnosis: the stepwise search, its noise model and its step of integration."""
+"""The second and third stages of a diagnosis: the fit of the simulation, and the stepwise search."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from dataclasses import replace
 import torch
 
 from mkc_torch.diagnosis.goodness_of_fit import poor_fits
-from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, noise_of_fit
-from mkc_torch.diagnosis.pipeline.baseline import fit_baseline
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.process_noise import (
+    ProcessNoiseFit,
+    choose_input_hold,
+    estimate_noise,
+    fit_alone,
+    noise_of_fit,
+)
 from mkc_torch.diagnosis.pipeline.build import assess_baseline, impossible_rotations
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.pipeline.prepare import Problem
 from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch, first_step, next_step
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 
 def stepwise_search(problem: Problem, known: PartialResult, baseline: ProcessNoiseFit) -> StepwiseSearch:
@@ -62,3 +69,44 @@ def _under_better_noise(
     declared, settings = known.options.declared, known.options.settings
     noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
     return None if noise is None or noise.observer is None else replace(baseline, fit=fit, noise=noise)
+
+
+def fit_baseline(problem: Problem, known: PartialResult, prepared: PreparedSimulation | None = None) -> ProcessNoiseFit:
+    """Fit the simulation without findings, with a step of integration on which the fit does not depend.
+
+    Args:
+        problem: the input of the diagnosis.
+        known: receives the fits.
+        prepared: the simulation with another step of integration; None for that of the problem.
+
+    Raises:
+        NoFitError: no start has a finite result.
+        ValueError: a channel whose residual is constant.
+    """
+    prepared = problem.prepared if prepared is None else prepared
+    options = known.options
+    declared, noise = options.declared, options.settings.noise
+    while True:
+        known.restart()
+        problem.progress("fitting the simulation alone")
+        baseline = fit_alone(prepared, declared, noise, known.keep_baseline)
+        baseline = choose_input_hold(baseline, declared, options.fixed, noise)
+        known.keep_baseline(baseline, with_noise=True)
+        _refuse_no_noise(baseline.fit, problem.where)
+        finer = with_smaller_step(baseline.fit, noise)
+        if finer is None:
+            return baseline
+        prepared = finer
+
+
+def _refuse_no_noise(base: FittedModel, where: str) -> None:
+    """Raise ValueError for a channel whose residual is constant: no noise is left to test an effect against."""
+    same = (base.residual == base.residual[:1]).all(0)
+    nothing = base.d.square() < torch.finfo(base.d.dtype).tiny
+    exact = (same | nothing).tolist()
+    names = [name for name, is_exact in zip(base.model.prepared.channels, exact, strict=True) if is_exact]
+    if names:
+        raise ValueError(
+            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so no noise is left "
+            "to test effects against. Leave it out of the compared channels, or record it with its noise."
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,15 +18,18 @@ from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_n
 from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
-from mkc_torch.diagnosis.pipeline.doubted_driver import with_driver_or_time
+from mkc_torch.diagnosis.pipeline.elimination import eliminated, with_fit
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.pipeline.series_order import in_better_order
-from mkc_torch.diagnosis.pipeline.simpler_form import simpler_by_price, simplified
-from mkc_torch.diagnosis.pipeline.special_case import with_special_case
-from mkc_torch.diagnosis.search.open_loop_gain import enlarges_open_loop, improves_open_loop
-from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
+from mkc_torch.diagnosis.pipeline.simpler_form import (
+    in_better_order,
+    simpler_by_price,
+    simplified,
+    with_driver_or_time,
+    with_special_case,
+)
+from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
-from mkc_torch.diagnosis.search.ranking import Ranked, alike
+from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult, run_search, screening_p_value
 from mkc_torch.diagnosis.search.with_process_noise import search_with_process_noise
 from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
@@ -104,17 +106,13 @@ Keep = Callable[[StepwiseSearch], object]
 """A callback that receives the search so far, in case it is stopped."""
 
 
-def _kept_nowhere(_: StepwiseSearch) -> None:
-    """Ignore the search so far."""
-
-
 def first_step(
     base: FittedModel,
     terms: tuple[Term, ...],
     options: SearchOptions,
     generator: torch.Generator,
     free: FittedModel | None = None,
-    keep: Keep = _kept_nowhere,
+    keep: Keep = lambda _: None,
 ) -> StepwiseSearch:
     """Run the first search; its candidate is a finding if held-out blocks confirm it.
 
@@ -152,7 +150,7 @@ def first_step(
 
 
 def next_step(
-    search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = _kept_nowhere
+    search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = lambda _: None
 ) -> StepwiseSearch:
     """Run the next search with the findings in the model; skip it if the screening shows nothing."""
     if _is_screened_out(search, options):
@@ -176,9 +174,7 @@ def _or_next_leader(
     generator: torch.Generator,
     free: FittedModel | None = None,
 ) -> StepwiseSearch:
-    """Return the search with the leader; where the leader was refused, with that of a search without its effect.
-
-    A leader is refused if held-out blocks do not confirm it, or if it enlarges the open-loop residual of the findings.
+    """Return the search with the leader, or if held-out blocks or the open loop refuse it, with another effect's leader.
 
     Args:
         before, after: the search without and with the leader, as far as it counts.
@@ -336,7 +332,7 @@ def _accept(
     pairs = (*search.pairs, (before, paired))
     taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
     if located.with_noise:
-        taken = _eliminated(taken, options)
+        taken = eliminated(taken, options)
     found = taken.found
     full = len(found) == options.max_findings and not _shows_more(taken, options)
     return replace(taken, left=()) if full else taken
@@ -387,14 +383,14 @@ def _with_partner(
     number = next(number for number, other in enumerate(last.scene.terms) if other.key == term.key)
     gain = pair.log_likelihood - last.fit.log_likelihood
     partner = replace(last, term=term, fit=pair, ranking=(Ranked(number, gain, 0.0),), compared=())
-    both = _with_fit(after, (*after.found, partner), pair, options)
+    both = with_fit(after, (*after.found, partner), pair, options)
     if both is None:
         return after
     difference = both.evidence[-1].log_likelihood - before.evidence[-1].log_likelihood
     high = gain_interval(difference, before.blocks.block, torch.Generator().manual_seed(options.seed))[1][1]
     if high < 0.0:
         return after
-    both = _eliminated(replace(both, left=tuple(t for t in after.left if t.key != term.key)), options)
+    both = eliminated(replace(both, left=tuple(t for t in after.left if t.key != term.key)), options)
     return replace(both, left=()) if len(both.found) == options.max_findings else both
 
 
@@ -457,49 +453,6 @@ def _numbers(fit: FittedModel) -> int:
 def _score(fit: FittedModel, settings: Settings) -> float:
     """Log-likelihood less the penalty of the noise, and Schwarz's penalty of the effects' sizes and shapes."""
     return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * _numbers(fit)
-
-
-def _eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
-    """Remove findings, one or two at a time, that the others make needless, and refit the remaining model.
-
-    A finding that clearly improves the open loop stays, even if process noise with another finding replaces it one step
-    ahead.
-    """
-    while len(search.found) > 1:
-        final = search.found[-1].fit
-        numbers = needless_terms(final, options.declared, options.settings)
-        fit = without(final, numbers, options.declared, options.settings) if numbers else None
-        if fit is None or improves_open_loop(final, fit):
-            break
-        kept = [finding for number, finding in enumerate(search.found) if number not in numbers]
-        less = _with_fit(search, kept, fit, options)
-        if less is None:
-            break
-        search = less
-    return search
-
-
-def _with_fit(
-    search: StepwiseSearch, findings: Sequence[SearchResult], fit: FittedModel, options: SearchOptions
-) -> StepwiseSearch | None:
-    """Return the search with other findings, estimated together; None if a fit with a part of them fails.
-
-    Args:
-        search: the search.
-        findings: the findings.
-        fit: with all of them, in this order.
-        options: of the diagnosis.
-    """
-    fits = [fit] if findings else []
-    while len(fits) < len(findings):
-        less = without(fits[0], (len(fits[0].model.terms) - 1,), options.declared, options.settings)
-        if less is None:
-            return None
-        fits.insert(0, less)
-    found = tuple(replace(old, fit=new, term=new.model.terms[-1]) for old, new in zip(findings, fits, strict=True))
-    evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
-    left = search.left if found else ()
-    return replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)), left=left)
 
 
 def _better_supported(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:

@@ -10,24 +10,22 @@ from mkc_torch._support.typesetting import capital, plain
 from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.parts import CandidateScore, Finding, Separability, Traces
-from mkc_torch.diagnosis.plot.curves import (
+from mkc_torch.diagnosis.plot.drawings import (
+    MOMENTS,
     MOST_LETTERS,
+    acting_channels,
     draw_course,
     draw_curve,
-    draw_map,
-    named,
-    of_time,
-    short,
-    units_of_outputs,
-)
-from mkc_torch.diagnosis.plot.residual import (
-    MOMENTS,
-    acting_channels,
     draw_floor,
+    draw_map,
     draw_residual,
     mark_findings,
+    named,
     of_channel,
+    of_time,
+    short,
     unit_of_channel,
+    units_of_outputs,
 )
 from mkc_torch.effects import words_of
 

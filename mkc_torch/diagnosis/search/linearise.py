@@ -12,11 +12,11 @@ from torch import Tensor
 
 from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.noise.cosine_basis import dct
 from mkc_torch.diagnosis.noise.imputation import Imputation, MissingSamples
 from mkc_torch.diagnosis.noise.spectrum import (
     NoiseSpectrum,
     autoregressive,
+    dct,
     enters_at_port,
     port_autoregression,
     spectrum_of,

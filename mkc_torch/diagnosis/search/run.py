@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_with_effect
-from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
-from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.drift import NoiseFit
 from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum

@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.noise.cosine_basis import cosines, course_of, dct, dct_of_courses
+from mkc_torch.diagnosis.noise.spectrum import cosines, course_of, dct, dct_of_courses
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 

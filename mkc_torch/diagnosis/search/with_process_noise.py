@@ -22,14 +22,12 @@ from mkc_torch.diagnosis.model.process_noise import (
     refit_noise,
     refit_open_loop,
 )
-from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
-from mkc_torch.diagnosis.model.shapes import shape_fitted
+from mkc_torch.diagnosis.model.shapes import shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.model.term import Key, Term, continuous, run_parallel
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
-from mkc_torch.diagnosis.search.open_loop_gain import with_open_loop_gain
 from mkc_torch.diagnosis.search.own_noise import FreeRuns, free_runs, number_count, priced, with_own_noise
 from mkc_torch.diagnosis.search.problem import SearchProblem
-from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, within_reach
+from mkc_torch.diagnosis.search.ranking import ModelPrior, Ranked, in_order, with_open_loop_gain, within_reach
 from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.search.significance import price
 from mkc_torch.diagnosis.search.tangents import tangents_of

@@ -9,7 +9,7 @@ import torch
 from mkc_torch.linear._blocks import PassResult
 from mkc_torch.linear._descent import Descent
 from mkc_torch.linear._implicit.stationary import FitState
-from mkc_torch.linear._many_rows import RowsMaximum, descended, likelier_gaussian, maximum_of
+from mkc_torch.linear._many_rows import RowsMaximum, descended, maximum_of, more_likely_gaussian
 from mkc_torch.linear.streaming._rows import StreamedRows
 
 _NEAR = 2e-5
@@ -58,7 +58,7 @@ def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: i
             descent = source.begin(start, **options)
     end = descend(descent, first)
     if end.done and source.passes < max_passes - 1:
-        gaussian = source.ranks.from_first(lambda: likelier_gaussian(end, pilot.slopes.grams))
+        gaussian = source.ranks.from_first(lambda: more_likely_gaussian(end, pilot.slopes.grams))
         if gaussian is not None:
             end = descend(replace(source.begin(gaussian, alike=False, **options), history=end.history))
     if not end.done:

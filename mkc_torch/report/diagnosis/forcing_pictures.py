@@ -8,7 +8,7 @@ from typing import Any
 from mkc_torch._support.drawing import ORANGE, array, style
 from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate
-from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, named, short
+from mkc_torch.diagnosis.plot.drawings import MOST_LETTERS, draw_course, draw_curve, named, short
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.report.panels import Panels, title
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from mkc_torch._parallel.pool import shared
 from mkc_torch._support.typesetting import several, typeset
-from mkc_torch.diagnosis.plot.curves import CURVE_COLORS
+from mkc_torch.diagnosis.plot.drawings import CURVE_COLORS
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
     environment,

@@ -9,17 +9,22 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.drawing import DARK_ORANGE, array, style
-from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_curve, draw_map, named, of_time, units_of_outputs
-from mkc_torch.diagnosis.plot.residual import (
+from mkc_torch.diagnosis.plot.drawings import (
     MOMENTS,
+    MOST_LETTERS,
     acting_channels,
+    draw_curve,
     draw_floor,
+    draw_map,
     draw_residuals,
     mark_findings,
     mark_rejected,
+    named,
     of_channel,
+    of_time,
     onsets,
     unit_of_channel,
+    units_of_outputs,
 )
 from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
 from mkc_torch.report.panels import Margins, Panels, title

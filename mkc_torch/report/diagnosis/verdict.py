@@ -10,8 +10,8 @@ from typing import Literal, NamedTuple
 
 from mkc_torch._support.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import follows_all, nothing_shows
-from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
+from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.result import UNFINISHED, VERDICT_SENTENCES, Diagnosis, Finding, notices
 from mkc_torch.report.diagnosis.findings import NOT_TESTED, finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.diagnosis.unseen import residual_of_all

@@ -11,7 +11,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.common_cause import common_cause
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json, validate
 from mkc_torch.diagnosis.io.model import DiagnosedModel
-from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.diagnosis.noise.spectrum import cosines
 from mkc_torch.diagnosis.search.linear_search import LinearSearch
 from mkc_torch.diagnosis.search.tangents import SlowBasis
 from mkc_torch.diagnosis.settings import NoiseSettings

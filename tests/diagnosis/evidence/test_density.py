@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.evidence.residual_noise import (
     student_cdf,
     student_fit,
 )
-from mkc_torch.diagnosis.findings.evidence_warnings import density_warnings
+from mkc_torch.diagnosis.findings.warnings import density_warnings
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling

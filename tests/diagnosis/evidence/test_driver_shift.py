@@ -6,7 +6,7 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.timing import shifted
-from mkc_torch.diagnosis.findings.evidence_warnings import driver_shift_warnings
+from mkc_torch.diagnosis.findings.warnings import driver_shift_warnings
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shapes import candidate_terms

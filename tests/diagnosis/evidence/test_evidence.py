@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.evidence import TESTS
 from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.run import precompute, results_of_tests
-from mkc_torch.diagnosis.findings.evidence_warnings import evidence_warnings
+from mkc_torch.diagnosis.findings.warnings import evidence_warnings
 from mkc_torch.diagnosis.io.diagnosis_json import _json, json_schema
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel

@@ -6,7 +6,7 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.prediction import extrapolated
-from mkc_torch.diagnosis.findings.evidence_warnings import extrapolation_warnings
+from mkc_torch.diagnosis.findings.warnings import extrapolation_warnings
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Driver, Term, find_drivers

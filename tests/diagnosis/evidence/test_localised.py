@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import rejected
+from mkc_torch.diagnosis.evidence import residual_noise as rejected
 from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.evidence.run import EvidenceReport
-from mkc_torch.diagnosis.findings.evidence_warnings import evidence_warnings
+from mkc_torch.diagnosis.findings.warnings import evidence_warnings
 from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE

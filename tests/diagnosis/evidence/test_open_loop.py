@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import open_loop as module
+from mkc_torch.diagnosis.evidence import prediction as module
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
-from mkc_torch.diagnosis.evidence.open_loop import open_loop_evidence
+from mkc_torch.diagnosis.evidence.prediction import open_loop_evidence
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.process_noise import has_process_noise, refit_open_loop

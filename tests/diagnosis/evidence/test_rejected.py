@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.rejected import rejected_intervals
-from mkc_torch.diagnosis.findings.evidence_warnings import rejected_warnings
+from mkc_torch.diagnosis.evidence.residual_noise import rejected_intervals
+from mkc_torch.diagnosis.findings.warnings import rejected_warnings
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from mkc_torch.diagnosis.evidence.rejected import RejectedByFit
+from mkc_torch.diagnosis.evidence.residual_noise import RejectedByFit
 from mkc_torch.diagnosis.result import EvidenceResult
 from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.report.diagnosis.verdict import headline

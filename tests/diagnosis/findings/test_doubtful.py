@@ -6,7 +6,7 @@ import json
 import pytest
 
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.doubtful import diagnosis_doubts, rejected_share
+from mkc_torch.diagnosis.findings.warnings import diagnosis_doubts, rejected_share
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.report.diagnosis.verdict import headline, tone
 from tests.diagnosis.factory import make_diagnosis

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.experiment_design import SAME
+from mkc_torch.diagnosis.findings.advice import SAME, advice_of
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling

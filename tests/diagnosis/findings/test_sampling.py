@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.sampling import bending_points
+from mkc_torch.diagnosis.findings.shape import bending_points
 
 
 def drawn_error(value, chosen):

@@ -10,8 +10,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.profiled_shape import with_profiled_shape
-from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted
+from mkc_torch.diagnosis.model.shapes import candidate_terms, shape_fitted, with_profiled_shape
 from mkc_torch.diagnosis.search.estimate import estimate
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS

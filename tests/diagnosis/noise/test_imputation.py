@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.diagnosis.noise import imputation
-from mkc_torch.diagnosis.noise.cosine_basis import dct
 from mkc_torch.diagnosis.noise.imputation import MissingSamples
-from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum, dct
 
 N = 60
 

@@ -10,13 +10,16 @@ import torch
 from scipy import signal, stats
 
 from mkc_torch.density.fit import fit_density
-from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses, inverse_dct
 from mkc_torch.diagnosis.noise.outliers import pseudo_residual
 from mkc_torch.diagnosis.noise.spectrum import (
     NoiseSpectrum,
     _levinson,
     autoregressive,
+    cosines,
+    dct,
+    dct_of_courses,
     enters_at_port,
+    inverse_dct,
     port_autoregression,
     spectrum_of,
 )

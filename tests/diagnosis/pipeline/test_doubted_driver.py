@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from mkc_torch.diagnosis.pipeline import doubted_driver
-from mkc_torch.diagnosis.pipeline.doubted_driver import REACH, with_driver_or_time
+from mkc_torch.diagnosis.pipeline import simpler_form as doubted_driver
+from mkc_torch.diagnosis.pipeline.simpler_form import TIME_REACH, with_driver_or_time
 from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
 SETTINGS = Settings()
-NEAR, FAR = 0.9 * REACH * SETTINGS.naming.separable, 1.1 * REACH * SETTINGS.naming.separable
+NEAR, FAR = 0.9 * TIME_REACH * SETTINGS.naming.separable, 1.1 * TIME_REACH * SETTINGS.naming.separable
 DOUBTED, TIMED = DriverShift(38, 7, 22.5), DriverShift(38, 2, 22.5)
 
 

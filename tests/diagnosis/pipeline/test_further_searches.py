@@ -166,12 +166,12 @@ def test_a_further_search_also_starts_from_the_open_loop(monkeypatch, terms, sta
 
 
 def test_two_findings_that_only_hold_each_other_up_end_the_search(monkeypatch):
-    monkeypatch.setattr(stepwise, "needless_terms", lambda *_: (0, 1))
-    monkeypatch.setattr(stepwise, "without", lambda *_: "nothing")
-    monkeypatch.setattr(stepwise, "improves_open_loop", lambda *_: False)
+    monkeypatch.setattr(elimination, "needless_terms", lambda *_: (0, 1))
+    monkeypatch.setattr(elimination, "without", lambda *_: "nothing")
+    monkeypatch.setattr(elimination, "improves_open_loop", lambda *_: False)
     found = (SimpleNamespace(fit="first"), SimpleNamespace(fit="both"))
     search = stepwise.StepwiseSearch(None, found, None, None, ("without", "first", "both"), ("left",))
-    after = stepwise._eliminated(search, SimpleNamespace(declared={}, settings=None))
+    after = elimination.eliminated(search, SimpleNamespace(declared={}, settings=None))
     assert (after.found, after.evidence, after.pairs, after.left) == ((), ("without",), (), ())
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.evidence.held_out import blocks_of
-from mkc_torch.diagnosis.pipeline.special_case import REACH, with_special_case
+from mkc_torch.diagnosis.pipeline.simpler_form import REACH, with_special_case
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.settings import NamingSettings, Settings
 from mkc_torch.nonlinear import NoFitError

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.model.fit import fitted_with_effect
-from mkc_torch.diagnosis.search.open_loop_gain import (
+from mkc_torch.diagnosis.search.ranking import (
     LARGER,
+    Ranked,
     enlarges_open_loop,
     improves_open_loop,
     with_open_loop_gain,
 )
-from mkc_torch.diagnosis.search.ranking import Ranked
 from tests.diagnosis.search.test_free_runs import DRAG, all_terms, free_fit
 
 AHEAD = 20.0

@@ -1,0 +1,61 @@
+"""Backward elimination of findings that the other findings make needless."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from mkc_torch.diagnosis.evidence.held_out import held_out
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
+from mkc_torch.diagnosis.search.own_noise import needless_terms, without
+from mkc_torch.diagnosis.search.ranking import improves_open_loop
+from mkc_torch.diagnosis.search.run import SearchResult
+
+if TYPE_CHECKING:
+    from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch
+
+
+def eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
+    """Remove findings, one or two at a time, that the others make needless, and refit the remaining model.
+
+    A finding that clearly improves the open loop stays, even if process noise with another finding replaces it one step
+    ahead.
+    """
+    while len(search.found) > 1:
+        final = search.found[-1].fit
+        numbers = needless_terms(final, options.declared, options.settings)
+        fit = without(final, numbers, options.declared, options.settings) if numbers else None
+        if fit is None or improves_open_loop(final, fit):
+            break
+        kept = [finding for number, finding in enumerate(search.found) if number not in numbers]
+        less = with_fit(search, kept, fit, options)
+        if less is None:
+            break
+        search = less
+    return search
+
+
+def with_fit(
+    search: StepwiseSearch, findings: Sequence[SearchResult], fit: FittedModel, options: SearchOptions
+) -> StepwiseSearch | None:
+    """Return the search with other findings, estimated together; None if a fit with a part of them fails.
+
+    Args:
+        search: the search.
+        findings: the findings.
+        fit: with all of them, in this order.
+        options: of the diagnosis.
+    """
+    fits = [fit] if findings else []
+    while len(fits) < len(findings):
+        less = without(fits[0], (len(fits[0].model.terms) - 1,), options.declared, options.settings)
+        if less is None:
+            return None
+        fits.insert(0, less)
+    found = tuple(replace(old, fit=new, term=new.model.terms[-1]) for old, new in zip(findings, fits, strict=True))
+    evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
+    left = search.left if found else ()
+    return replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)), left=left)
