@@ -29,7 +29,7 @@ from mkc_torch.diagnosis.model.shapes import described
 from mkc_torch.diagnosis.model.term import Drivers, Term
 from mkc_torch.diagnosis.noise.spectrum import agreed_innovation_gain
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
-from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch
+from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
 from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Finding, Separability, Stop, Traces, notices
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
 from mkc_torch.diagnosis.search.run import SearchResult

@@ -18,7 +18,8 @@ from mkc_torch.diagnosis.model.process_noise import (
 from mkc_torch.diagnosis.pipeline.build import assess_baseline, impossible_rotations
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.pipeline.prepare import Problem
-from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch, first_step, next_step
+from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch
+from mkc_torch.diagnosis.pipeline.stepwise import first_step, next_step
 from mkc_torch.diagnosis.search.estimate import with_smaller_step
 from mkc_torch.simulation.protocol import PreparedSimulation
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,7 +18,6 @@ from mkc_torch.diagnosis.model.process_noise import first_samples, has_process_n
 from mkc_torch.diagnosis.model.shapes import within_a_sample
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.spectrum import correlation_time, innovation_gain
-from mkc_torch.diagnosis.pipeline.elimination import eliminated, with_fit
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.pipeline.simpler_form import (
     in_better_order,
@@ -27,6 +26,7 @@ from mkc_torch.diagnosis.pipeline.simpler_form import (
     with_driver_or_time,
     with_special_case,
 )
+from mkc_torch.diagnosis.pipeline.steps import StepwiseSearch, eliminated, with_fit
 from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.partner import is_undetermined, with_partner
 from mkc_torch.diagnosis.search.ranking import Ranked, alike, enlarges_open_loop
@@ -64,42 +64,6 @@ def _holds(
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
         return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
     return low > 0.0 or (gain > 0.0 and located.beyond > settings.further)
-
-
-@dataclass(frozen=True)
-class StepwiseSearch:
-    """The stepwise search so far.
-
-    Attributes:
-        first: result of the first search.
-        found: the findings.
-        unconfirmed: the last candidate that held-out blocks did not confirm.
-        blocks: the held-out blocks.
-        evidence: of the simulation without findings, and after each finding.
-        left: candidates that remain to be searched; empty once the search is over.
-        pairs: evidence without and with each finding under the same process noise, by which it was confirmed.
-        refused: candidates that passed the surrogates, but enlarge the open-loop residual.
-        given_up: why the next search failed; empty if it did not.
-        cut: whether there was a further finding beyond the limit.
-    """
-
-    first: SearchResult | None
-    found: tuple[SearchResult, ...]
-    unconfirmed: SearchResult | None
-    blocks: HeldOutBlocks
-    evidence: tuple[Evidence, ...]
-    left: tuple[Term, ...]
-    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
-    refused: tuple[SearchResult, ...] = ()
-    given_up: str = ""
-    cut: bool = False
-
-    @property
-    def parts(self) -> tuple[object, ...]:
-        """Everything that the next search needs."""
-        fits = [located.fit for located in self.found]
-        pairs = [evidence for pair in self.pairs for evidence in pair]
-        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
 
 
 Keep = Callable[[StepwiseSearch], object]
@@ -144,56 +108,30 @@ def first_step(
         after = held_out(cause.fit, blocks, partial(course_without, base, cause))
         # after a free course, little structure remains
         return replace(_accept(replace(taken, first=cause), base, cause, options, after), left=())
-    taken = _or_next_leader(first_step, taken, base, first, options, generator, free)
-    keep(taken)
     return _with_another(first_step, taken, options, generator, free) if taken.found else taken
 
 
 def next_step(
     search: StepwiseSearch, options: SearchOptions, generator: torch.Generator, keep: Keep = lambda _: None
 ) -> StepwiseSearch:
-    """Run the next search with the findings in the model; skip it if the screening shows nothing."""
+    """Run the next search with the findings in the model; skip it if the screening shows nothing.
+
+    After a candidate that enlarges the open-loop residual the search is repeated once without its effect.
+    """
     if _is_screened_out(search, options):
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
         located = _located(fit, search.left, options, generator, parts=False)
-        taken = _or_next_leader(search, _add(search, fit, located, options), fit, located, options, generator)
+        taken = _add(search, fit, located, options)
+        left = tuple(term for term in search.left if term.key != located.term.key)
+        if taken.refused != search.refused and left:
+            located = _located(fit, left, options, generator, parts=False)
+            taken = _add(replace(search, refused=taken.refused), fit, located, options)
         keep(taken)
         return _with_another(search, taken, options, generator)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # keep the previous findings
-
-
-def _or_next_leader(
-    before: StepwiseSearch,
-    after: StepwiseSearch,
-    fit: FittedModel,
-    located: SearchResult,
-    options: SearchOptions,
-    generator: torch.Generator,
-    free: FittedModel | None = None,
-) -> StepwiseSearch:
-    """Return the search with the leader, or if held-out blocks or the open loop refuse it, with another effect's leader.
-
-    Args:
-        before, after: the search without and with the leader, as far as it counts.
-        fit: with the findings before.
-        located: the leader.
-        options: of the diagnosis.
-        generator: of the surrogates.
-        free: the open-loop fit of the simulation without findings.
-    """
-    left = tuple(term for term in before.left if term.key != located.term.key)
-    refused = after.unconfirmed is not before.unconfirmed or after.refused != before.refused
-    if not refused or not left:
-        return after
-    try:
-        second = _located(fit, left, options, generator, parts=False, free=free)
-        taken = _add(replace(after, left=before.left), fit, second, options)
-    except NoFitError:
-        return after
-    return replace(taken, unconfirmed=after.unconfirmed or taken.unconfirmed)
 
 
 def _add(search: StepwiseSearch, fit: FittedModel, located: SearchResult, options: SearchOptions) -> StepwiseSearch:

@@ -15,6 +15,7 @@ from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
 
 stepwise = importlib.import_module("mkc_torch.diagnosis.pipeline.stepwise")
+steps = importlib.import_module("mkc_torch.diagnosis.pipeline.steps")
 
 
 ANYWAY = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
@@ -126,9 +127,8 @@ def test_an_effect_that_makes_the_fit_diverge_is_found_from_the_initial_values(r
 
 
 @pytest.mark.parametrize("refused", [(), ("first",), ("first", "second")])
-@pytest.mark.parametrize("by_blocks", [False, True])
-def test_a_refused_leader_gives_way_to_the_next(monkeypatch, refused, by_blocks):
-    """The names are those of the candidates that enlarge the open loop, or that held-out blocks do not confirm."""
+def test_a_candidate_that_enlarges_the_open_loop_residual_gives_way_to_the_next(monkeypatch, refused):
+    """The names are those of the candidates that enlarge it; the search is repeated once."""
     terms = tuple(SimpleNamespace(key=name) for name in ("first", "second", "third"))
     known = SimpleNamespace(fit="without", term=SimpleNamespace(key="known"))
 
@@ -136,19 +136,16 @@ def test_a_refused_leader_gives_way_to_the_next(monkeypatch, refused, by_blocks)
         return SimpleNamespace(term=left[0], fit=left[0].key, p_value=0.01)
 
     def accept(search, _fit, found, _options):
-        if by_blocks and found.term.key in refused:
-            return replace(search, left=(), unconfirmed=found)
         return replace(search, found=(*search.found, found))
 
     monkeypatch.setattr(stepwise, "_located", located)
     monkeypatch.setattr(stepwise, "_accept", accept)
     monkeypatch.setattr(stepwise, "_with_another", lambda _, after, *__: after)
     monkeypatch.setattr(stepwise, "_is_screened_out", lambda *_: False)
-    monkeypatch.setattr(stepwise, "enlarges_open_loop", lambda fit, _: not by_blocks and fit in refused)
-    before = stepwise.StepwiseSearch(None, (known,), None, None, (), terms)
+    monkeypatch.setattr(stepwise, "enlarges_open_loop", lambda fit, _: fit in refused)
+    before = steps.StepwiseSearch(None, (known,), None, None, (), terms)
     after = stepwise.next_step(before, SimpleNamespace(level=0.05, quick=False), torch.Generator())
-    assert [found.term.key for found in after.refused] == ([] if by_blocks else list(refused))
-    assert (after.unconfirmed and after.unconfirmed.term.key) == ("first" if by_blocks and refused else None)
+    assert [found.term.key for found in after.refused] == list(refused)
     taken = [found.term.key for found in after.found[1:]]
     assert taken == {0: ["first"], 1: ["second"], 2: []}[len(refused)]
     assert after.left == (() if len(refused) == 2 else terms)
@@ -166,12 +163,12 @@ def test_a_further_search_also_starts_from_the_open_loop(monkeypatch, terms, sta
 
 
 def test_two_findings_that_only_hold_each_other_up_end_the_search(monkeypatch):
-    monkeypatch.setattr(elimination, "needless_terms", lambda *_: (0, 1))
-    monkeypatch.setattr(elimination, "without", lambda *_: "nothing")
-    monkeypatch.setattr(elimination, "improves_open_loop", lambda *_: False)
+    monkeypatch.setattr(steps, "needless_terms", lambda *_: (0, 1))
+    monkeypatch.setattr(steps, "without", lambda *_: "nothing")
+    monkeypatch.setattr(steps, "improves_open_loop", lambda *_: False)
     found = (SimpleNamespace(fit="first"), SimpleNamespace(fit="both"))
-    search = stepwise.StepwiseSearch(None, found, None, None, ("without", "first", "both"), ("left",))
-    after = elimination.eliminated(search, SimpleNamespace(declared={}, settings=None))
+    search = steps.StepwiseSearch(None, found, None, None, ("without", "first", "both"), ("left",))
+    after = steps.eliminated(search, SimpleNamespace(declared={}, settings=None))
     assert (after.found, after.evidence, after.pairs, after.left) == ((), ("without",), (), ())
 
 

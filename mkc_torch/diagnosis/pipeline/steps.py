@@ -1,21 +1,54 @@
-"""Backward elimination of findings that the other findings make needless."""
+"""The state of a stepwise search, and backward elimination of findings that the other findings make needless."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
-from mkc_torch.diagnosis.evidence.held_out import held_out
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.pipeline.prepare import SearchOptions
 from mkc_torch.diagnosis.search.own_noise import needless_terms, without
 from mkc_torch.diagnosis.search.ranking import improves_open_loop
 from mkc_torch.diagnosis.search.run import SearchResult
 
-if TYPE_CHECKING:
-    from mkc_torch.diagnosis.pipeline.stepwise import StepwiseSearch
+
+@dataclass(frozen=True)
+class StepwiseSearch:
+    """The stepwise search so far.
+
+    Attributes:
+        first: result of the first search.
+        found: the findings.
+        unconfirmed: the last candidate that held-out blocks did not confirm.
+        blocks: the held-out blocks.
+        evidence: of the simulation without findings, and after each finding.
+        left: candidates that remain to be searched; empty once the search is over.
+        pairs: evidence without and with each finding under the same process noise, by which it was confirmed.
+        refused: candidates that passed the surrogates, but enlarge the open-loop residual.
+        given_up: why the next search failed; empty if it did not.
+        cut: whether there was a further finding beyond the limit.
+    """
+
+    first: SearchResult | None
+    found: tuple[SearchResult, ...]
+    unconfirmed: SearchResult | None
+    blocks: HeldOutBlocks
+    evidence: tuple[Evidence, ...]
+    left: tuple[Term, ...]
+    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
+    refused: tuple[SearchResult, ...] = ()
+    given_up: str = ""
+    cut: bool = False
+
+    @property
+    def parts(self) -> tuple[object, ...]:
+        """Everything that the next search needs."""
+        fits = [located.fit for located in self.found]
+        pairs = [evidence for pair in self.pairs for evidence in pair]
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
 
 
 def eliminated(search: StepwiseSearch, options: SearchOptions) -> StepwiseSearch:
