@@ -84,11 +84,13 @@ def prepare(
     check_numbers(options.level, options.surrogates, options.max_findings, options.seed)
     check_limits(options.quick, time_limit)
     refuse_no_settings(options.settings)
+    _refuse_no_progress(progress)
     settings = quick_settings(options.settings) if options.quick else options.settings
     _refuse_few(len(recording), "samples", recording, settings)
     progress("reading the recording")
     prepared = simulation.prepare(recording)
     _refuse_few(len(prepared.time), "usable samples", recording, settings)
+    _refuse_constant(prepared)
     prepared = with_own_offsets(prepared, several)
     options = replace(
         options,
@@ -163,6 +165,26 @@ def _refuse_no_effect(effect: object) -> None:
     else:
         return
     raise TypeError(f"Expected argument `effects` to hold Effects but got {format_value(effect)}; {remedy}.")
+
+
+def _refuse_constant(prepared: PreparedSimulation) -> None:
+    """Raise for an output of differential equations that never changes: no noise can be estimated from it."""
+    if prepared.dynamics is None:
+        return
+    for name, values in zip(prepared.channels, prepared.dynamics.measured.unbind(-1), strict=True):
+        if bool((values == values[0]).all()):
+            raise ValueError(
+                f"{subject_of(prepared.recording)}the output `{name}` is {float(values[0]):g} in all samples. A "
+                "diagnosis needs an output that changes: check the column, or remove the output from the simulation."
+            )
+
+
+def _refuse_no_progress(progress: object) -> None:
+    if not callable(progress):
+        raise TypeError(
+            f"Expected argument `progress` to be a function of one text but got {format_value(progress)}; pass print, "
+            "for example."
+        )
 
 
 def refuse_no_settings(settings: object) -> None:

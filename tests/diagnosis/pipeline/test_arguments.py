@@ -1,4 +1,4 @@
-"""Checks of the declared sensor noise and input holds."""
+"""Checks of the arguments of a diagnosis."""
 
 import math
 
@@ -8,6 +8,7 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.pipeline.prepare import checked_input_hold, checked_noise
 from mkc_torch.simulation import Static
+from tests.diagnosis.swing import STEP, Pendulum
 
 
 @pytest.mark.parametrize(
@@ -60,3 +61,18 @@ def test_diagnose_checks_the_declarations():
     # a static simulation has no input holds
     with pytest.raises(ValueError, match=r"inputs in the equations of this simulation.*got `temperature`; it has no"):
         diagnose(line, recording, input_hold={"temperature": "held"})
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_an_output_that_never_changes_is_rejected(value):
+    time = torch.arange(200, dtype=torch.float64) * STEP
+    stuck = Recording({"time": time, "angle": torch.full_like(time, value), "torque": time.sin()})
+    with pytest.raises(ValueError, match=rf"`angle` is {value:g} in all samples"):
+        diagnose(Pendulum(), stuck)
+
+
+def test_progress_that_is_no_function_is_rejected():
+    time = torch.arange(200, dtype=torch.float64) * STEP
+    swinging = Recording({"time": time, "angle": time.cos(), "torque": time.sin()})
+    with pytest.raises(TypeError, match=r"`progress`.*got 3"):
+        diagnose(Pendulum(), swinging, progress=3)
