@@ -249,7 +249,7 @@ class Diagnosis:
 
     @property
     def plot(self) -> DiagnosisPlot:
-        """The figures of the report as axes of matplotlib, such as ``diagnosis.plot.drawings()``."""
+        """The figures of the report as axes of matplotlib, such as ``diagnosis.plot.residual()``."""
         return DiagnosisPlot(self.traces, self.findings, self.candidates, self.separability, self.environment)
 
     @property
