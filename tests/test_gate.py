@@ -106,6 +106,8 @@ def test_a_claim_in_the_wrong_place_is_wrong():
     )
     assert there["right"]
     assert elsewhere["wrong"] == ["overflow is claimed at rate of level2"]
+    both = [finding("overflow", at=[at]) for at in ("rate of level2", "rate of level1")]
+    assert judged(row(*both, after={"level2": 0.28}), CASES["cases tanks fit Tanks"])["right"]
 
 
 def test_another_effect_claimed_first_is_wrong():

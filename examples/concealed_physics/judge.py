@@ -57,8 +57,9 @@ def _wrong_names(stated: StatedDiagnosis, expected: Expected) -> list[str]:
     if first and not {first.named.effect, *(other.effect for other in first.others)} & accepted:
         wrong.append(f"{first.named.effect} is claimed first")
     wrong += [f"{name} is claimed" for name in expected.refused if name in claimed]
-    if first and expected.places and not wrong and not _is_at(first.named, expected.places):
-        wrong.append(f"{first.named.effect} is claimed at {', '.join(sorted(first.named.at))}")
+    named = [finding.named for finding in stated.claims if finding.named.effect in accepted]
+    if named and expected.places and not wrong and not any(_is_at(place, expected.places) for place in named):
+        wrong += [f"{place.effect} is claimed at {', '.join(sorted(place.at))}" for place in named]
     return wrong
 
 

@@ -33,7 +33,7 @@ class Expected:
     Attributes:
         names: groups of accepted effects; each group needs a claimed effect, or an alternative that cannot be ruled
             out. None: no effect may be claimed.
-        places: substrings, one of which has to be in a channel of the claimed effect; empty for any place.
+        places: substrings, one of which has to be in a channel of a claimed effect of these names; empty for any place.
         refused: effects that may not be claimed.
         verdicts: accepted verdicts; empty for any.
         sizes: right values of parameters.
@@ -148,6 +148,7 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
     yield _known(folder, "two_mass", "resonant_600.csv", "Drive", Expected(mode))
     arm = Expected((("input_square", "dead_zone", "power_law", CURVE), LATE), residual={"angle": 0.045})
     yield _known(folder, "propeller_arm", "run.csv", "Arm", arm, between={"voltage": "held"})
+    # the lower tank can overflow too (Schoukens & Noël, IFAC World Congress 2017), so a claim there is not refused
     overflow = Expected((("overflow", CURVE),), places=("level1",), residual={"level2": 1.2 * 0.41})
     yield _known(folder, "tanks", "fit.csv", "Tanks", overflow)
     air = Expected(

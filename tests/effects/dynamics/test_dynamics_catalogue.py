@@ -429,8 +429,8 @@ class TestNeeds:
 
     def test_needs_are_known_parts(self):
         known = {
-            "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
-            "height", "sideways", "flowing", "surroundings",
+            "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other level",
+            "other", "rate", "height", "sideways", "flowing", "surroundings",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known
