@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -45,7 +45,8 @@ def with_parameters(
         settings: of the noise that standard errors are of.
 
     Returns:
-        The alternatives in their order. Fits that lose the recording leave an alternative without parameters.
+        The alternatives in their order. Fits that lose the recording leave an alternative without parameters. A more
+        general form of the finding that adds nothing to it is left out.
     """
     terms = {_place(located.scene.terms[rival.number]): located.scene.terms[rival.number] for rival in located.ranking}
     near = [rival for rival in alternatives if not rival.separable and _named(rival) in terms][:MOST_FITTED]
@@ -56,7 +57,39 @@ def with_parameters(
     known: Mapping[_Place, tuple[EffectParameter, ...]] = {
         _named(rival): parameters for rival, parameters in zip(near, found, strict=True)
     }
-    return tuple(replace(rival, parameters=known.get(_named(rival), ())) for rival in alternatives)
+    own = {parameter.name for parameter in all_parameters(final, number)}
+    general = {place for place, term in terms.items() if _special_case(term) == located.term.effect.id}
+    return tuple(
+        replace(rival, parameters=known.get(_named(rival), ()))
+        for rival in alternatives
+        if not (_named(rival) in general and adds_nothing(own, known.get(_named(rival), ())))
+    )
+
+
+def adds_nothing(own: Collection[str], parameters: Sequence[EffectParameter]) -> bool:
+    """Whether all sizes of a general form, other than those of its special case, are within a standard error of 0.
+
+    Args:
+        own: names of the special case's parameters.
+        parameters: of the general form.
+
+    Example:
+        >>> share = EffectParameter("share_of_load", 0.0001, 0.0002, "")
+        >>> adds_nothing({"friction"}, [EffectParameter("friction", 0.4, 0.01, "m/s2"), share])
+        True
+    """
+    more = [parameter for parameter in parameters if parameter.name not in own and not parameter.of_shape]
+    return bool(more) and all(
+        isinstance(parameter.value, float)
+        and isinstance(parameter.standard_error, float)
+        and abs(parameter.value) <= parameter.standard_error
+        for parameter in more
+    )
+
+
+def _special_case(term: Term) -> str | None:
+    special = term.effect.reduces_to
+    return None if special is None else special.id
 
 
 def _place(term: Term) -> _Place:

@@ -8,7 +8,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.findings.alternatives import adds_nothing
 from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.parts import EffectParameter
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.report.diagnosis.findings import fitted_sizes, rivals
 from mkc_torch.simulation import Dynamics, Parameter
@@ -73,3 +75,21 @@ def test_the_sizes_are_in_the_file_and_in_the_text(diagnosis):
     assert fitted_sizes(other).startswith("drag ")
     assert rivals(finding, sizes=True).endswith(f"with {fitted_sizes(other)}")
     assert fitted_sizes(other) not in rivals(finding)
+
+
+@pytest.mark.parametrize(
+    ("share", "error", "of_shape", "nothing"),
+    [
+        (1e-4, 2e-4, False, True),
+        (-1e-4, 2e-4, False, True),
+        (3e-4, 2e-4, False, False),
+        (1e-4, None, False, False),
+        (1e-4, 2e-4, True, False),
+    ],
+)
+def test_a_general_form_adds_nothing_if_its_other_sizes_are_zero_within_their_errors(share, error, of_shape, nothing):
+    friction = EffectParameter("friction", 0.4, 0.01, "rad/s2")
+    more = EffectParameter("share_of_load", share, error, "", of_shape=of_shape)
+    assert adds_nothing({"friction"}, [friction, more]) is nothing
+    assert not adds_nothing({"friction"}, [friction])
+    assert not adds_nothing({"friction"}, ())
