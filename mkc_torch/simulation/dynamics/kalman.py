@@ -32,6 +32,9 @@ _SCALINGS = 100
 _SETTLED = 1e-9
 """Relative change of the scale at which its iteration has converged."""
 
+_LEAST_SCALE = 1e-150
+"""Smallest scale, whose square is a positive number: innovations can all be 0."""
+
 _LINEAR = 0.95
 """Ratio of successive steps of the scale up to which the next are extrapolated."""
 
@@ -371,7 +374,7 @@ def robust_likelihood(
     tail = math.log(math.sqrt(0.5 * math.pi) * _OUTLIERS / (1.0 - _OUTLIERS)) - np.log(reach)
     # log ratio of the outliers' density to the normal density at its mode
     odds = np.broadcast_to(tail, counts.shape)[used] + spread
-    scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, 1e-300) if free else np.ones(B)
+    scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, _LEAST_SCALE) if free else np.ones(B)
     left = np.arange(B if free else 0)  # models whose scale has not converged
     moved = np.zeros(B)  # logarithm of a scale's last step; 0 after an extrapolation
     for _ in range(_SCALINGS):
@@ -389,7 +392,7 @@ def robust_likelihood(
         # Aitken's extrapolation of linear convergence
         ratio = np.divide(step, moved[left], out=np.zeros(len(left)), where=moved[left] != 0.0)
         ratio = np.where((ratio > 0.0) & (ratio < _LINEAR), ratio, 0.0)
-        scale[left] = before * np.exp(step / (1.0 - ratio))
+        scale[left] = np.maximum(before * np.exp(step / (1.0 - ratio)), _LEAST_SCALE)
         moved[left] = np.where(ratio > 0.0, 0.0, step)
         left = left[~(np.abs(step) < _SETTLED)]
     scale = np.maximum(scale, least) if free else scale

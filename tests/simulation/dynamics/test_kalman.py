@@ -265,6 +265,14 @@ class TestRobustLikelihood:
         assert value == pytest.approx(at(scale), rel=1e-12)
         assert at(scale) >= max(at(scale * factor) for factor in (0.9, 0.99, 0.999, 1.001, 1.01, 1.1))
 
+    @pytest.mark.parametrize("zeros", [0.4, 0.6, 1.0])
+    def test_innovations_of_zero_have_a_finite_likelihood(self, zeros):
+        z = np.random.default_rng(3).standard_normal(200)
+        z[: int(200 * zeros)] = 0.0
+        value, scale = self.of(z)
+        assert np.isfinite(value).all()
+        assert (scale > 0.0).all()
+
     def test_the_scale_of_normal_innovations_is_1_and_robust_to_outliers(self):
         z = np.random.default_rng(1).standard_normal(4000)
         assert self.of(z)[1][0] == pytest.approx(1.0, abs=0.04)
