@@ -39,7 +39,7 @@ def goodness_of_fit_json(environment: NoiseEnvironment) -> dict[str, Any]:
     """Return the goodness of fit of each output, by its name.
 
     Example:
-        >>> from mkc_torch.diagnosis.parts import GoodnessOfFit
+        >>> from mkc_torch.diagnosis.environment import GoodnessOfFit
         >>> fit = GoodnessOfFit("angle", "rad", 0.0049, 0.35, 0.9997, 0.005, "declared", 0.35, 0.02)
         >>> goodness_of_fit_json(NoiseEnvironment(goodness_of_fit=(fit,)))["angle"]["explained"]
         0.9997
@@ -90,7 +90,7 @@ def recordings_json(environment: NoiseEnvironment) -> dict[str, Any]:
     """Return the keys "runs" and "offsets" of several recordings; a key without entries is absent.
 
     Example:
-        >>> from mkc_torch.diagnosis.parts import Offset
+        >>> from mkc_torch.diagnosis.environment import Offset
         >>> recordings_json(NoiseEnvironment(offsets=(Offset("speed", "m/s", 2, "b.csv", -0.2, 0.001),)))
         {'offsets': [{'output': 'speed', 'unit': 'm/s', 'recording': 2, 'name': 'b.csv', 'value': -0.2, ...}]}
     """

@@ -190,7 +190,7 @@ def offset_sentences(environment: NoiseEnvironment) -> list[str]:
     """Format the offsets of each output in several recordings.
 
     Example:
-        >>> from mkc_torch.diagnosis.parts import Offset
+        >>> from mkc_torch.diagnosis.environment import Offset
         >>> offset_sentences(NoiseEnvironment(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
         ['Offset of speed in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
     """

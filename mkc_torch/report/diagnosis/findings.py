@@ -256,7 +256,7 @@ def shape(finding: Finding) -> str:
 
     Example:
         >>> from dataclasses import replace
-        >>> from mkc_torch.diagnosis.parts import ShapeCheck
+        >>> from mkc_torch.diagnosis.environment import ShapeCheck
         >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=ShapeCheck(1.2, 0.4))
         >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
