@@ -111,7 +111,7 @@ def without_exchange(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Floa
     """Remove exchanged axes and signs from a response.
 
     Returns:
-        A sentence about the exchange, empty if there is none, and the response without it.
+        A sentence about the exchange, empty without an exchange, and the response without it.
 
     Args:
         response: response from the field in the axes of a gyroscope or attitude to the magnetometer's axes.

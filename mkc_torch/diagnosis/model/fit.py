@@ -1,4 +1,4 @@
-"""A fit of a simulation with given findings, and the error message where there is none."""
+"""A fit of a simulation with given findings, and the error message if no fit succeeds."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ TIME_REACH = 2.0
 """Limits of separability within which an effect of time takes the place of an effect of a doubted column.
 
 That of a special case (:mod:`mkc_torch.diagnosis.pipeline.simpler_form`): the lag of a slow column gives it a choice of
-courses that its penalty of one number does not cover.
+courses that its penalty of one number does not cover. It was chosen by judgement, on one recording of a drift.
 """
 
 

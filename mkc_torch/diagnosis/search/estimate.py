@@ -172,7 +172,7 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
 
     The M-estimate weighs samples as if they were independent. For coloured noise this step is more precise, and its
     covariance includes the autocorrelation. A step of more than ``last_step`` standard errors is not taken, because
-    the noise model does not describe the fit; neither is a step that loses more than a nat per parameter.
+    the noise model does not describe the fit; neither is a step that loses more than a nat per parameter, by judgement.
     """
     model, parameters = fit.model, fit.parameters
     tangents = tangents_of(model, parameters, settings)

@@ -99,7 +99,7 @@ PHYSICS = 8
 """Number of effects that are fitted in open loop."""
 
 FURTHER = 3
-"""The same once there are findings: there the linear gains are more reliable."""
+"""The same once there are findings: there the linear gains are more reliable. Chosen by judgement."""
 
 SHAPES = 2
 """Number of initial shapes for each effect."""

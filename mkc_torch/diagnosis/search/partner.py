@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 
 _LEADING = 3
-"""Number of other effects that are tried as partners, the leading ones of the search."""
+"""Number of leading other effects of the search that are tried as partners; chosen by judgement."""
 
 
 def is_undetermined(fit: FittedModel, settings: NoiseSettings) -> bool:

@@ -239,8 +239,8 @@ def _best_start(
 
     Process noise of the first fit has absorbed part of the effect, and keeps some of it. A quick look starts from open
     loop only if the first fit is no more likely than the simulation alone. ``free`` is None where the open loop is
-    not tried: there is none, or the candidate is much less likely than others in it. ``running`` is its open-loop fit,
-    if known.
+    not tried: no such fit exists, or the candidate is much less likely than others in it. ``running`` is the
+    candidate's open-loop fit, if known.
     """
     under = with_own_noise(fit, declared, settings)
     if free is None or not has_process_noise(under):
