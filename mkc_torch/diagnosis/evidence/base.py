@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
 from mkc_torch.diagnosis.goodness_of_fit import units_of
-from mkc_torch.diagnosis.model.fit import FittedModel, without_term
+from mkc_torch.diagnosis.model.fit import FittedModel, within_domain, without_term
 from mkc_torch.diagnosis.model.term import Driver, Term
 from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, SmoothCorrection
 from mkc_torch.diagnosis.search.estimate import FinalEstimate
@@ -110,7 +110,7 @@ class EvidenceContext:
     def without_and_with(self) -> tuple[FittedModel, FittedModel]:
         """The models without and with the finding; the first may only be a start for a fit."""
         if self.overlaid:
-            return without_term(self.fit, self.number), self.fit
+            return within_domain(without_term(self.fit, self.number)), self.fit
         return self.fits[self.number], self.located.fit
 
     @property

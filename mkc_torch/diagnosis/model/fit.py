@@ -28,6 +28,9 @@ _CLIP = 2.0
 _WIDE = 1.2
 """Ratio of a scale to the residual's robust standard deviation above which the scale may belong to another optimum."""
 
+_DOMAIN_SCALES = 2.5
+"""Least half-width of a domain in robust scales, so that 2 are left in each fold: the least that a fit accepts."""
+
 _NARROWER = 2
 """Restarts of a fit with such a scale from its own end."""
 
@@ -182,6 +185,18 @@ def without_term(fit: FittedModel, number: int) -> FittedModel:
     left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]), model.near)
     parameters = torch.cat([fit.parameters[:place], fit.parameters[place + model.sizes[number] :]])
     return replace(fit, model=left, parameters=parameters)
+
+
+def within_domain(fit: FittedModel) -> FittedModel:
+    """Return a start that its domain can hold: a start that is too far for the domain is refitted on a wide domain.
+
+    The domain grows only if it is also too narrow for the refit.
+    """
+    if not bool((fit.bound < 2.0 * robust_scale(fit.model.residual(fit.parameters).detach())).any()):
+        return fit
+    wide = fitted(fit.model, fit.parameters)
+    bound = torch.maximum(fit.bound, _DOMAIN_SCALES * robust_scale(wide.residual))
+    return replace(fit, model=wide.model, parameters=wide.parameters, bound=bound)
 
 
 def _finite_start(

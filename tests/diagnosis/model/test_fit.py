@@ -1,11 +1,15 @@
 """Fits of a joint model."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.fit import _finite_start, fitted
+from mkc_torch.diagnosis.model.fit import _finite_start, fitted, within_domain
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics, Parameter
 
 NOISE = 0.002
@@ -56,3 +60,24 @@ def test_a_fit_starts_without_a_nearby_trajectory_that_diverges(monkeypatch):
     # a nearby trajectory with a finite result is kept
     monkeypatch.setattr(JointModel, "residual", whole)
     assert _finite_start(JointModel(prepared, (), near), start, fresh=True)[0].near is near
+
+
+def test_a_start_beyond_its_domain_is_refitted_on_a_wide_domain():
+    random, time = np.random.default_rng(1), np.arange(300) * 0.02
+    level = np.exp(-0.7 * time) + NOISE * random.standard_normal(300)
+    prepared = Decay().prepare(Recording({"time": torch.from_numpy(time), "level": torch.from_numpy(level)}))
+    model = JointModel(prepared)
+    near = fitted(model, torch.tensor([0.7, 1.0], dtype=torch.float64), torch.tensor([20.0 * NOISE]).double())
+    assert within_domain(near) is near
+    far = replace(near, parameters=torch.tensor([3.0, 1.0], dtype=torch.float64))
+    with pytest.raises(NoFitError):
+        fitted(model, far.parameters, far.bound, graduate=False)
+    start = within_domain(far)
+    assert torch.equal(start.bound, near.bound)
+    torch.testing.assert_close(fitted(model, start.parameters, start.bound, graduate=False).parameters, near.parameters)
+    # no fit of this model is within so narrow a domain
+    narrow = within_domain(replace(far, bound=torch.tensor([0.5 * NOISE], dtype=torch.float64)))
+    assert float(narrow.bound) > 2.0 * NOISE
+    torch.testing.assert_close(
+        fitted(model, narrow.parameters, narrow.bound, graduate=False).parameters, near.parameters, rtol=0.01, atol=0.0
+    )
