@@ -91,10 +91,13 @@ def sizes_of(
 
 
 def without_finding(case: EvidenceContext) -> Evidence | None:
-    """Score the final model without the finding, if later findings may have masked its gain."""
+    """Score the final model without the finding, if later findings may have masked its gain and if it can be fitted."""
     if not case.overlaid or _confirmed(case):
         return None
-    return held_out(case.without_and_with[0], case.blocks)
+    try:
+        return held_out(case.without_and_with[0], case.blocks)
+    except NoFitError:
+        return None
 
 
 def _confirmed(case: EvidenceContext) -> bool:
@@ -174,8 +177,8 @@ def extrapolated(
         settings: definition of low values.
 
     Returns:
-        None without a recorded driver, if its low values hardly vary (a switch), or if the high values are in too few
-        blocks.
+        None without a recorded driver, if its low values hardly vary (a switch), if the high values are in too few
+        blocks, or if a model cannot be fitted to the low values.
     """
     reach = _reach(term)
     if reach is None:
@@ -187,7 +190,10 @@ def extrapolated(
     spread = float(reach[low].max() - reach[low].min())
     if spread < settings.low_spread * float(reach.max() - reach.min()) or len(seen) < _FEWEST:
         return None
-    before, after = (_score(model, low)[high] for model in (without, fit))
+    try:
+        before, after = (_score(model, low)[high] for model in (without, fit))
+    except NoFitError:
+        return None
     gain, interval = gain_interval(after - before, block, torch.Generator().manual_seed(seed))
     return Extrapolation(gain, interval)
 

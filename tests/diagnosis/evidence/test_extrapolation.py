@@ -1,4 +1,6 @@
-"""Fitted where a driver is low, judged where it is high."""
+"""Extrapolation: fitted at low values of a driver, scored at high values."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,14 +56,14 @@ def warning(found):
     return () if found is None else extrapolation_warnings(found, Term(effect, load, {}), EvidenceSettings())
 
 
-def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():
+def test_a_linear_effect_extrapolates_to_high_values_of_its_driver():
     found = held_beyond(both(LOAD, load=LOAD))
     assert found.confidence_interval[0] > 0.2
     assert found.confidence_interval[0] < found.log_likelihood_gain < found.confidence_interval[1]
     assert warning(found) == ()
 
 
-def test_what_turns_round_where_the_driver_is_high_does_not():
+def test_an_effect_that_reverses_at_high_values_does_not_extrapolate():
     """In proportion to the low values alone; on all samples the effect is still a gain."""
     trace = np.where(LOAD < EDGE, LOAD, 2.0 * EDGE - LOAD)
     without, fit = both(trace, load=LOAD)
@@ -73,13 +75,13 @@ def test_what_turns_round_where_the_driver_is_high_does_not():
     assert "70 % of samples where load is lowest" in sentence
 
 
-def test_what_is_not_there_is_neither():
+def test_without_an_effect_there_is_no_gain_and_no_warning():
     found = held_beyond(both(np.zeros(N), load=LOAD))
     assert abs(found.log_likelihood_gain) < 0.02
     assert warning(found) == ()
 
 
-def test_of_several_columns_what_is_far_from_the_middle_is_high():
+def test_values_of_several_columns_are_high_far_from_their_mean():
     columns = {f"position_{axis}": np.sin(TIME * (0.7 + 0.4 * k)) for k, axis in enumerate("xyz")}
     stronger = 0.8 * columns["position_x"] - 0.5 * columns["position_z"]
     direction = turns(TIME).inv().apply(FIELD / np.linalg.norm(FIELD)) @ RESPONSE.T
@@ -98,7 +100,7 @@ def test_high_values_in_a_single_stretch_have_no_extrapolation_test():
     assert held_beyond(both(high, load=high)) is None
 
 
-def test_an_effect_without_a_recorded_driver_has_none():
+def test_an_effect_without_a_recorded_driver_has_no_extrapolation_test():
     without, _ = both(LOAD, load=LOAD)
     effect = next(e for e in CATALOGUE if e.id == "hard_iron_step")
     model = without.model.with_term(Term(effect, None, {"onset": 10.0}))
@@ -106,15 +108,21 @@ def test_an_effect_without_a_recorded_driver_has_none():
     assert held_beyond((without, fit)) is None
 
 
-def test_it_is_drawn_by_its_seed():
+def test_extrapolation_depends_on_the_seed_alone():
     fits = both(LOAD, load=LOAD)
     assert held_beyond(fits, 4) == held_beyond(fits, 4)
 
 
-def test_only_a_clear_failure_is_warned_of():
+def test_only_a_gain_surely_below_zero_is_a_warning():
     assert warning(None) == ()
     assert warning(Extrapolation(-0.1, (-0.3, 0.1))) == ()
     assert len(warning(Extrapolation(-0.2, (-0.3, -0.1)))) == 1
+
+
+def test_models_that_cannot_be_fitted_to_low_values_have_no_extrapolation_test():
+    without, fit = both(LOAD, load=LOAD)
+    narrow = replace(without, bound=0.1 * without.d)
+    assert held_beyond((narrow, fit)) is None
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +132,7 @@ def diagnosis():
 
 
 @pytest.mark.e2e
-def test_a_finding_of_a_diagnosis_has_it(diagnosis):
+def test_a_finding_of_a_diagnosis_has_an_extrapolation_test(diagnosis):
     (finding,) = diagnosis.findings
     assert finding.effect == "current_field"
     assert finding.extrapolation.confidence_interval[0] > 0.0
