@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from mkc_torch._support.torch_internals import is_wrapped
+from mkc_torch._support.dual_constants import dual_constants
 
 Residual = Callable[..., Tensor]
 
@@ -23,17 +23,6 @@ def load_forward_mode() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.func.jvp(torch.sin, (point,), (point,))
-
-
-def make_dual(constant: Tensor, moving: Tensor) -> Tensor:
-    """A constant as a dual tensor with zero tangent if the scalar ``moving`` has a tangent; otherwise unchanged.
-
-    In forward mode, tensors without a tangent are added and multiplied by reference functions in Python, which take
-    0.5 ms each and 1 s at their first use.
-    """
-    if not is_wrapped(moving):
-        return constant
-    return torch.where(torch.ones((), dtype=torch.bool, device=constant.device), constant, moving)
 
 
 _CELLS = 250_000
@@ -56,7 +45,7 @@ def forward_tangents(function: Residual, values: int = 1) -> Residual:
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
         def along(direction: Tensor) -> Tensor:
-            return torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
+            return torch.func.jvp(dual_constants(lambda t: function(t, *data)), (theta,), (direction,))[1]
 
         basis = torch.eye(theta.shape[0], dtype=theta.dtype, device=theta.device)
         batch = directions_at_once(values)
@@ -74,10 +63,10 @@ def forward_jacobian(function: Residual, theta: Tensor, values: int) -> Tensor:
 def twice_reverse_tangents(function: Residual) -> Residual:
     """The transposed Jacobian as a function, by differentiating the vector-Jacobian product by its vector.
 
-    This runs in C++, forward mode in Python unless constants have tangents too (:func:`make_dual`). Forward mode is
-    used where reverse mode is not finite, as next to an infinite slope that ``torch.where`` excludes, and where there
-    is no second derivative. Torch takes a missing second derivative for 0, so the first result of each function is
-    compared with forward mode along one direction.
+    This is faster than forward mode, in which each direction is a transform of the function. Forward mode is used where
+    reverse mode is not finite, as next to an infinite slope that ``torch.where`` excludes, and where there is no second
+    derivative. Torch takes a missing second derivative for 0, so the first result of each function is compared with
+    forward mode along one direction.
     """
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
@@ -102,7 +91,7 @@ def _agree(rows: Tensor, function: Residual, theta: Tensor, *data: Any) -> bool:
     sizes = rows.flatten(1).abs().amax(1)
     # scaled so that all parameters change the values alike
     direction = torch.where((sizes > 0) & sizes.isfinite(), 1.0 / sizes, 1.0)
-    along = torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
+    along = torch.func.jvp(dual_constants(lambda t: function(t, *data)), (theta,), (direction,))[1]
     off = (torch.tensordot(direction, rows, 1) - along).abs().amax()
     return bool(off <= 1e3 * torch.finfo(theta.dtype).eps ** 0.5 * along.abs().amax())
 
@@ -119,6 +108,19 @@ def _twice_reversed(function: Residual, theta: Tensor, *data: Any) -> Tensor | N
             return torch.autograd.grad(weighed, weights, basis, is_grads_batched=True)[0].detach()
         except RuntimeError:
             return None
+
+
+def vector_jacobian_product(function: Residual, point: Tensor, vector: Tensor) -> Tensor:
+    """The product of a vector, of the shape of the function's value, and the Jacobian, of the shape of the point.
+
+    As ``torch.func.vjp``, whose first use imports ``torch._dynamo`` in 1 s.
+    """
+    with torch.enable_grad():
+        at = point.detach().requires_grad_()
+        value = function(at)
+        if not value.requires_grad:
+            return torch.zeros_like(point)
+        return torch.autograd.grad(value, at, vector, allow_unused=True, materialize_grads=True)[0]
 
 
 def reverse_tangents(function: Residual) -> Residual:

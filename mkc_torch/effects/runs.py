@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,7 +44,8 @@ def linear_recurrence(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -
 def _composed(factor: Float[Tensor, "*#b N"], level: Float[Tensor, "*#b N"]) -> Float[Tensor, "*b N"]:
     """The recurrence along the last dimension."""
     shift, length = 1, level.shape[-1]
-    level = level.expand(torch.broadcast_shapes(factor.shape, level.shape))
+    # torch.broadcast_shapes would import sympy
+    level = level.expand(np.broadcast_shapes(factor.shape, level.shape))
     while shift < length:
         tail = factor[..., shift:] * level[..., :-shift] + level[..., shift:]
         level = torch.cat([level[..., :shift], tail], -1)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch._support.arguments import refuse_other_type, refuse_text
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.recording.join_recordings import Clock, refuse_no_recording
 from mkc_torch.recording.recording import Recording
@@ -228,7 +229,7 @@ class PreparedStatic(ClosedForm):
         self.independent = (True,) * len(self.channels)
         self._refuse_not_finite()
         load_forward_mode()
-        tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
+        tangents = torch.func.jacfwd(dual_constants(lambda theta: self.residual(theta, {})))(self.start())
         self.warnings = undetermined(tangents.flatten(0, 1), self.start(), self.parameter_names)
         fixed = tuple(name for k, name in enumerate(self.channels) if not _can_shift(tangents, k))
         self.state: Mapping[str, object] = {"class": system.name, "fixed": list(fixed)}
@@ -266,7 +267,7 @@ class PreparedStatic(ClosedForm):
             recording: number of each sample's recording.
             names: names of the recordings.
         """
-        tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
+        tangents = torch.func.jacfwd(dual_constants(lambda theta: self.residual(theta, {})))(self.start())
         found = determined_offsets(tangents, self.channels, recording, names)
         return PreparedStatic(self.system, self.recording, found, recording) if found else self
 

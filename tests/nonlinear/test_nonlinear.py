@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 from scipy.optimize import minimize as scipy_minimize
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.linear import MKCRegression
 from mkc_torch.nonlinear import GaussianPrior, fit, minimise
 from tests.draws import normal as sample
@@ -707,14 +706,3 @@ def test_a_narrow_bound_is_refused():
         fit(residual_to(noisy(0)), START, bound=0.01)
     with pytest.raises(ValueError, match="'sandwich' or 'hac'"):
         fit(residual_to(noisy(0)), START, covariance="classical")
-
-
-def test_a_constant_next_to_a_parameter_keeps_its_value_and_has_no_derivative():
-    constant = torch.tensor([1.0, torch.inf, -2.0], dtype=torch.float64)
-    theta = torch.tensor([3.0, 4.0], dtype=torch.float64)
-    assert make_dual(constant, theta[0]) is constant
-    value, slope = torch.func.jvp(lambda t: make_dual(constant, t[0]), (theta,), (torch.ones_like(theta),))
-    assert torch.equal(value, constant)
-    assert torch.equal(slope, torch.zeros_like(constant))
-    both = torch.func.jacfwd(lambda t: make_dual(constant, t[0])[[0, 2]] * t)(theta)
-    assert torch.equal(both, torch.diag(constant[[0, 2]]))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.nonlinear import GaussianPrior
 
@@ -141,7 +140,7 @@ class Model:
         if turned is not None:
             direction = direction + torch.linalg.cross(turned, direction)
         body = (turns.to_frame.mT @ direction.unsqueeze(-1)).squeeze(-1)
-        return make_dual(measured, theta[0]) - theta[:3] - body @ response.mT
+        return measured - theta[:3] - body @ response.mT
 
     def first_weight(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns
@@ -156,7 +155,7 @@ class Model:
 
     def _along(self, theta: Tensor, measured: Tensor, turns: Turns) -> tuple[Tensor, Tensor | None]:
         """The unit field in the axes of its window, and the rotation in rad by errors of the rates."""
-        field = torch.linalg.solve(self.response(theta), (make_dual(measured, theta[0]) - theta[:3]).mT).mT
+        field = torch.linalg.solve(self.response(theta), (measured - theta[:3]).mT).mT
         along = (turns.to_frame @ field.unsqueeze(-1)).squeeze(-1)
         if turns.summed is None:
             return along, None
@@ -169,5 +168,5 @@ def steady(along: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"
     """The weighted mean of each window, (W, 3)."""
     share = weight.unsqueeze(-1)
     total = share.new_zeros(turns.count, 1).index_add(0, turns.window, share)
-    part = make_dual(share / total[turns.window], along[0, 0])
-    return make_dual(along.new_zeros(turns.count, 3), along[0, 0]).index_add(0, turns.window, part * along)
+    part = share / total[turns.window]
+    return along.new_zeros(turns.count, 3).index_add(0, turns.window, part * along)

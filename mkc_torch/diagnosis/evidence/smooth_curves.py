@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import forward_jacobian
+from mkc_torch._support.forward_mode import forward_jacobian, vector_jacobian_product
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
 from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Driver
@@ -125,8 +125,7 @@ class _Around:
         def residual(change: Tensor) -> Tensor:
             return self.model.residual_with_change(self.parameters, port, entrance.at(change))
 
-        pulled: Tensor = torch.func.vjp(residual, zero)[1](left)[0]
-        return pulled
+        return vector_jacobian_product(residual, zero, left)
 
 
 def smooth_tangents(
@@ -161,7 +160,7 @@ def smooth_tangents(
         else:
             courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
             entering = ports[port].at(courses.flatten(2))
-            tangents.append(through_port(model, parameters, port, entering, known))
+            tangents.append(through_port(around.model, parameters, port, entering, known))
         for name in names:
             degree = torch.arange(curves[name].shape[-1], dtype=joined.dtype)
             groups.append(torch.arange(start, start + c * len(degree)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.unit_text import ratio, sized, tidy
 from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
@@ -318,9 +318,9 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
     shape = {name: value for name, value in term.shape.items() if name != "lag"}
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, shape, replace(synthetic, signal=make_dual(synthetic.signal, gamma[0])))
+        return term.effect.change(gamma, shape, synthetic)
 
-    slope = torch.func.jacfwd(change)(gamma)
+    slope = torch.func.jacfwd(dual_constants(change))(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
     channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
     value = change(gamma).detach()

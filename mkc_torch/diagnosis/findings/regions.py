@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import vector_jacobian_product
 from mkc_torch.diagnosis.evidence.held_out import scored
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -96,7 +97,7 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
         def likelihood(change: Tensor, parameters: Tensor = parameters, model: JointModel = model) -> Tensor:
             return scored(model.residual_with_change(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
 
-        slope = torch.func.grad(likelihood)(there.new_zeros(len(there), width))
+        slope = vector_jacobian_product(likelihood, there.new_zeros(len(there), width), there.new_ones(()))
         added = term.effect.change(gamma, term.shape, term.context(prepared, there))[:, :width]
         nats = nats + float(weight) * (slope * added).sum(-1)
     if not bool(nats.isfinite().all()):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.diagnosis.environment import Curve, ShapeCheck
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -228,7 +229,7 @@ def curve_of(fit: FittedModel, number: int) -> Curve:
     def change(values: Tensor) -> Tensor:
         return term.effect.change(values, term.shape, term.context(prepared, signal))[order]
 
-    value, slope = change(gamma), torch.func.jacfwd(change)(gamma)
+    value, slope = change(gamma), torch.func.jacfwd(dual_constants(change))(gamma)
     start = model.base + sum(model.sizes[:number])
     covariance = _covariance(fit)[start : start + len(gamma), start : start + len(gamma)]
     band = _NORMAL_95 * torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0).sqrt()
@@ -238,7 +239,7 @@ def curve_of(fit: FittedModel, number: int) -> Curve:
 
 def _covariance(fit: FittedModel) -> Float[Tensor, "p p"]:
     """Return the covariance of the parameters for white noise."""
-    tangents = torch.func.jacfwd(fit.model.around(fit.parameters).residual)(fit.parameters)
+    tangents = torch.func.jacfwd(dual_constants(fit.model.around(fit.parameters).residual))(fit.parameters)
     weighted = (fit.weights / fit.d.square()).unsqueeze(-1) * tangents
     gram = torch.einsum("nmp,nmq->pq", weighted, tangents)
     size = gram.diagonal().clamp(min=1e-300).rsqrt()

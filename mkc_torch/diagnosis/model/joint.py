@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch._support.forward_mode import forward_jacobian, make_dual
+from mkc_torch._support.dual_constants import dual_constants
+from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.waveforms import apply_basis, outer_product
@@ -207,13 +208,13 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
     zero = parameters.new_zeros(N, len(known.channels))
 
     def residual(change: Tensor) -> Tensor:
-        return model.residual_with_change(make_dual(parameters, change[0, 0]), port, change)
+        return model.residual_with_change(parameters, port, change)
 
     columns = []
     for k in range(len(known.channels)):
         direction = torch.zeros_like(zero)
         direction[:, k] = 1.0
-        columns.append(torch.func.jvp(residual, (zero,), (direction,))[1])
+        columns.append(torch.func.jvp(dual_constants(residual), (zero,), (direction,))[1])
     return torch.stack(columns, -1)
 
 
@@ -272,7 +273,7 @@ def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
         return term.effect.waveform(term.shape, context)[:, None, None] * eye
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, term.shape, replace(context, signal=make_dual(context.signal, gamma[0])))
+        return term.effect.change(gamma, term.shape, context)
 
     return forward_jacobian(change, context.signal.new_zeros(term.size(context)), context.signal.numel())
 
@@ -289,10 +290,11 @@ def through_port(
         return torch.einsum("nmc,ncq->nmq", pointwise, courses)
     zero = torch.zeros_like(courses[..., 0])
 
+    def residual(change: Tensor) -> Tensor:
+        return model.residual_with_change(parameters, port, change)
+
     def tangent(direction: Tensor) -> Tensor:
-        return torch.func.jvp(
-            lambda change: model.residual_with_change(parameters, port, change), (zero,), (direction,)
-        )[1]
+        return torch.func.jvp(dual_constants(residual), (zero,), (direction,))[1]
 
     # out_dims=-1 fails in torch if nothing depends on the change
     return torch.vmap(tangent, in_dims=-1, chunk_size=_CHUNK)(courses).movedim(0, -1)

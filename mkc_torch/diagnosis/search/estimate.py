@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -255,9 +255,11 @@ def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) ->
         return plain
 
     def residual(numbers: Tensor) -> Tensor:
-        return shaped.residual(torch.cat([make_dual(parameters, numbers[0]), numbers]))
+        return shaped.residual(torch.cat([parameters, numbers]))
 
-    columns, within = _with_secants(torch.func.jacfwd(residual)(start[shaped.joint :]), shaped, start, inside)
+    columns, within = _with_secants(
+        torch.func.jacfwd(dual_constants(residual))(start[shaped.joint :]), shaped, start, inside
+    )
     if not bool(columns.isfinite().all()):
         return plain
     wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
@@ -92,7 +91,7 @@ class MagneticPole(Effect):
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers
         place = torch.stack([torch.as_tensor(shape[f"place_{a}"], dtype=p.dtype, device=p.device) for a in "xyz"])
-        away, softening = make_dual(p, place[0]) - place, make_dual(p.new_tensor(shape["radius"] ** 2), place[0])
+        away, softening = p - place, p.new_tensor(shape["radius"] ** 2)
         field = away * (away.square().sum(-1, keepdim=True) + softening) ** -1.5
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 

@@ -93,7 +93,7 @@ def flow_along(
     new = prepared.measured - prepared.outputs_by_states(theta, changes, at) + prepared.output_disturbance(at)
     after = at if jump is None else jump.applied(states)[prepared.rows].detach()
     # corrections and disturbances of an observer moved the trajectory itself
-    shift = torch.einsum("kij,kj->ki", carry, (after - at)[:-1, :n])
+    shift = (carry @ (after - at)[:-1, :n].unsqueeze(-1)).squeeze(-1)
     for number, disturbance in enumerate(prepared.lasting):
         if disturbance.at_rate:
             value = after[:-1, states.shape[1] - len(prepared.lasting) + number]

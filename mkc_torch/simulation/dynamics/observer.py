@@ -75,7 +75,7 @@ class Observer:
 
     def whitened(self, new: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
         """Whiten innovations to independent residuals of equal size, in the outputs' units."""
-        return torch.einsum("nij,nj->ni", self.white, new)
+        return (self.white @ new.unsqueeze(-1)).squeeze(-1)
 
 
 def clipped(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
@@ -110,7 +110,7 @@ class ObserverJump:
     def applied(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
         at = states[self.rows]
         moved = clipped(self.measured - self.predict(at), self.observer.spread)
-        return states.index_put((self.rows,), at + self._spread_out(torch.einsum("nkm,nm->nk", self._gain, moved), at))
+        return states.index_put((self.rows,), at + self._spread_out((self._gain @ moved.unsqueeze(-1)).squeeze(-1), at))
 
     def slope(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n n"]:
         at = states[self.rows]

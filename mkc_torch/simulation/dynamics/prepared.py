@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
@@ -166,7 +167,7 @@ class PreparedDynamics(ObservedDynamics):
         load_forward_mode()
         theta = self.start()
         near = self.trajectory(theta, {})
-        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta)
+        tangents = torch.func.jacfwd(dual_constants(lambda values: self.residual(values, {}, near)))(theta)
         system = equations_with_offsets(self.system, self.channels, self.run, tangents, recording, names)
         return self if system is None else PreparedDynamics(system, self.recording, self.channels)
 
@@ -205,7 +206,8 @@ class PreparedDynamics(ObservedDynamics):
         load_forward_mode()
         theta = self.start()
         near = self.trajectory(theta, {})
-        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta).flatten(0, 1)
+        residual = dual_constants(lambda values: self.residual(values, {}, near))
+        tangents = torch.func.jacfwd(residual)(theta).flatten(0, 1)
         # a value near 0 does not define the parameter's size
         meant = theta.new_tensor([parameter.value for parameter in self.known.values()])
         typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))

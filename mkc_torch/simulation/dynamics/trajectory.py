@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch._support.torch_internals import is_wrapped, temporarily_clear_interpreter_stack
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.dynamics.recurrence import Recurrence
@@ -392,7 +393,7 @@ def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
     at = at.detach()
 
     def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(rate, (at,), (direction.expand_as(at),))[1]
+        return torch.func.jvp(dual_constants(rate), (at,), (direction.expand_as(at),))[1]
 
     eye = torch.eye(at.shape[1], dtype=at.dtype, device=at.device)
     return torch.stack([along(direction).detach() for direction in eye], -1)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.aided.rotation import from_quaternion, rotated
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
@@ -93,7 +92,7 @@ class AttitudeView(View):
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The ambient field in the world frame, (3,)."""
-        direction = make_dual(self._ahead, theta[0]) + theta[12:14] @ self._across
+        direction = self._ahead + theta[12:14] @ self._across
         return self._strength(theta) * direction / torch.linalg.vector_norm(direction)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.linear import LeastTrimmedSquares
@@ -94,7 +93,7 @@ class View(ClosedForm):
 
     def _away(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         """The measurement without the offset and the changes at the port "sensor"."""
-        away = make_dual(self.measured, theta[0])
+        away = self.measured
         if "sensor" in changes:
             change = changes["sensor"]
             away = away - change(
@@ -108,7 +107,7 @@ class View(ClosedForm):
 
     def _strength(self, theta: Float[Tensor, " p"]) -> Float[Tensor, ""]:
         """The field strength."""
-        return make_dual(self.measured.new_tensor(self.strength), theta[0])
+        return self.measured.new_tensor(self.strength)
 
     def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
         chosen = thinned(self.thin if rows is None else self.thin & rows)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, traced
@@ -44,7 +45,7 @@ def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
         return system.rate(theta, {})(states), system.outputs_by_states(theta, {}, states[:N])
 
     try:
-        expected, slopes = torch.func.jvp(functions, (theta, at), (along, moved))[:2]
+        expected, slopes = torch.func.jvp(dual_constants(functions), (theta, at), (along, moved))[:2]
     except RuntimeError:
         return False
     ends, moves, rates, slope = (_ends(array) for array in (at, moved, expected[0], slopes[0]))

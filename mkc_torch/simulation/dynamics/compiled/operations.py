@@ -17,7 +17,7 @@ def _pointwise(build: Callable[..., int], values: Sequence[Any], dtype: torch.dt
     """Apply an operation to each element, with torch's broadcasting."""
     trace = next(value.tracing for value in values if isinstance(value, Symbol))
     parts = [as_nodes(value, trace) for value in values]
-    shape = torch.broadcast_shapes(*(part.shape for part in parts))
+    shape = torch.Size(np.broadcast_shapes(*(part.shape for part in parts)))  # torch's own would import sympy
     time_axes = {len(shape) - len(part.shape) + part.time_axis for part in parts if part.time_axis is not None}
     if len(time_axes) > 1:
         raise UntraceableError("two different time axes")

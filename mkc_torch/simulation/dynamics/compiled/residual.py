@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.dual_constants import dual_constants
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
@@ -127,7 +128,7 @@ class CompiledDynamics:
         along = torch.eye(self._size, dtype=parameters.dtype), torch.from_numpy(np.ascontiguousarray(moved.T))
 
         def tangent(direction: Tensor, states: Tensor) -> Tensor:
-            return torch.func.jvp(self._outputs_by_torch, point, (direction, states))[1]
+            return torch.func.jvp(dual_constants(self._outputs_by_torch), point, (direction, states))[1]
 
         found = torch.func.vmap(tangent, in_dims=(0, 1))(*along)
         return np.ascontiguousarray(found.numpy().transpose(2, 0, 1))
