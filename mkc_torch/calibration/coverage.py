@@ -76,7 +76,7 @@ def fibonacci_sphere(count: int) -> Float[Tensor, "count 3"]:
 
 
 def tangents(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
-    """Derivatives of the norm by centre and shape: the functions u_i and u_i u_j on the sphere."""
+    """Derivatives of the norm with respect to centre and shape: the functions u_i and u_i u_j on the sphere."""
     x, y, z = directions.unbind(-1)
     root2 = math.sqrt(2.0)
     return torch.stack([x, y, z, x * x, y * y, z * z, root2 * x * y, root2 * x * z, root2 * y * z], -1)
@@ -114,7 +114,7 @@ def least_of_each(moments: Float[Tensor, "B 9 9"]) -> tuple[Float[Tensor, " B"],
 
 
 class CoverageOfEach(Sequence[Coverage]):
-    """Coverage by the directions in use of each of many problems, computed when it is asked for."""
+    """Coverage by the directions in use of each of many problems, computed on access."""
 
     def __init__(self, vectors: Float[Tensor, "B N 3"], used: Bool[Tensor, "B N"]) -> None:
         self._vectors = vectors

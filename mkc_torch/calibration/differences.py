@@ -23,7 +23,7 @@ _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 class Difference(NamedTuple):
-    """A number of both calibrations.
+    """A number that both calibrations have.
 
     Attributes:
         name: its name, such as "offset x".

@@ -42,7 +42,8 @@ def magnetic_field_messages(
     The error of an undisturbed sample is the sensor's noise and the offset's uncertainty. For a sample of robust weight
     w, the noise's variance is divided by w; it is at least the square of the length's error,
     ``| |field| - field_strength |``, and at most ``largest_error²``. So a filter keeps every sample and gives a
-    disturbed sample little weight. A disturbance that turns the field without a change of its length is not seen.
+    disturbed sample little weight. A disturbance that turns the field without changing its length is not
+    detected.
 
     Args:
         calibration: of a magnetometer, with a field in a unit of the magnetic field.

@@ -2,9 +2,9 @@
 
 Regressors of noisy points contain the square of the noise. It biases the parameters, and gives points that do not
 determine an ellipsoid, for example on two circles, a spurious curvature. To second order both effects are half the
-variance of the noise times the Laplacian of the moments by the points; subtracting that gives the moments of the points
-without noise (Kukush, Markovsky & Van Huffel, "Consistent estimation in an implicit quadratic measurement error
-model", Computational Statistics & Data Analysis 47 (2004)). The noise is assumed to be isotropic.
+variance of the noise times the Laplacian of the moments with respect to the points; subtracting this product gives the
+moments of the points without noise (Kukush, Markovsky & Van Huffel, "Consistent estimation in an implicit quadratic
+measurement error model", Computational Statistics & Data Analysis 47 (2004)). The noise is assumed to be isotropic.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def bias_by_noise(moments: NoisyMoments) -> Bias:
     """Bias of parameters at which the mean product of the rows with the residual, their last element, is 0.
 
     Args:
-        moments: moments of rows that hold the residual's derivatives by the parameters and the residual.
+        moments: moments of rows that hold the residual's derivatives with respect to the parameters and the residual.
     """
     p = moments.found.shape[-1] - 1
     without = (moments.found - moments.lent)[:, :p, :p]

@@ -1,4 +1,4 @@
-"""Whether a calibration can be used unseen: doubts about the result, and the disturbances of its recording."""
+"""Doubts about a calibration that must be looked at before use, and the disturbances of its recording."""
 
 from __future__ import annotations
 

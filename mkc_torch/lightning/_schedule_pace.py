@@ -9,7 +9,7 @@ from mkc_torch.losses.bandwidth_schedule import WARMUP_STEPS, BandwidthSchedule
 from mkc_torch.losses.residual_scale import ResidualScale
 
 WARMUP_EPOCHS = 3
-"""Epochs in which the initial loss is used alone, if they have fewer batches than ``WARMUP_STEPS``. Annealing takes
+"""Epochs in which only the initial loss is used, if they have fewer batches than ``WARMUP_STEPS``. Annealing takes
 twice as many. This leaves most of thirty epochs to the likelihood."""
 
 

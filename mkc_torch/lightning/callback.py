@@ -37,9 +37,9 @@ class MKCExpectationMaximization(Callback):
     training the residuals of all processes are used, and all processes get the same values.
 
     The weights change during an epoch, and the network is in training mode (dropout), while residuals are collected.
-    With ``residuals`` they come from a separate pass.
+    With ``residuals`` the residuals come from a separate pass.
 
-    Recommended is a loss ``MKCLoss(m, learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters,
+    The recommended loss is ``MKCLoss(m, learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters,
     reaches σ = ∞ exactly, and its values, for example on a validation set, are comparable between epochs. Without a
     given ``d`` and ``bound``, both follow the residuals until the first E-step and are then frozen; a physical bound is
     better. If the loss learns σ and d, their gradients are switched off during the fit: no optimiser may have these

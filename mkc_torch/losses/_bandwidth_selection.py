@@ -35,7 +35,7 @@ TINY = 1e-30
 """Lower limit of denominators."""
 
 _FAR = 1e4
-"""Square of a residual over its bandwidth from which the kernel is 0."""
+"""Square of a residual divided by its bandwidth from which the kernel is 0."""
 
 
 class BandwidthSelection(NamedTuple):
@@ -58,7 +58,7 @@ def select_bandwidth(
 
     Args:
         xp: ``numpy`` or ``torch``, the library of the other arrays.
-        z: residuals (prediction - target) over their scale.
+        z: residuals (prediction - target) divided by their scale.
         prediction: the prediction of each residual.
         weight: the weight of each residual.
 

@@ -155,7 +155,7 @@ class ChannelDensity(nn.Module):
 
     @property
     def d_min(self) -> Float[Tensor, " m"]:
-        """Floor under d, in the unit of the target."""
+        """Floor of d, in the unit of the target."""
         return self._state().floor
 
     @property

@@ -74,12 +74,12 @@ class ChannelCurves(Curves):
         return energy(z, kappa)
 
     def influence(self, error: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """Derivative of :meth:`rho` by the error, in 1 over the unit of the target."""
+        """Derivative of :meth:`rho` with respect to the error, in 1 / unit of the target."""
         z, kappa, d = self._standardised(error)
         return energy_dz(z, kappa) / d
 
     def weight(self, error: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """Influence over that of least squares with the same d, ``exp(-e² / (2 d² σ²))`` in [0, 1]: (15) of the paper.
+        """Influence relative to least squares with the same d, ``exp(-e² / (2 d² σ²))`` in [0, 1]: (15) of the paper.
 
         Example:
             >>> from mkc_torch import MKCLoss
@@ -158,7 +158,7 @@ class SampleCurves(Curves):
     def influence(
         self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Derivative of :meth:`rho` by the error, in 1 over the unit of the target; same arguments."""
+        """Derivative of :meth:`rho` with respect to the error, in 1 / unit of the target; same arguments."""
         error, sigma, d = _sampled(error, sigma, d)
         return error / d * mkc_weight(error, sigma, d) / d
 

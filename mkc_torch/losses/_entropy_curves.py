@@ -49,13 +49,13 @@ class EntropyCurves(Curves):
         return entropy / math.log(count)
 
     def influence(self, error: Float[Tensor, "*shape"], batch: Float[Tensor, "*others"]) -> Float[Tensor, "*shape"]:
-        """Derivative of :meth:`rho` by the error; beyond the typical error it has the opposite sign of the error."""
+        """Derivative of :meth:`rho` with respect to the error; opposite in sign to errors beyond the typical error."""
         square, total, moment, count = _sums(error, batch)
         pull = moment * error.sign() * square.sqrt() - total * _times_log(error, square)
         return 2.0 * pull / ((total + square).square() * math.log(count)) / _unit(batch)
 
     def weight(self, error: Float[Tensor, "*shape"], batch: Float[Tensor, "*others"]) -> Float[Tensor, "*shape"]:
-        """Influence over the error: infinite at 0, negative where descent increases the error."""
+        """Influence divided by the error: infinite at 0, negative where descent increases the error."""
         square, total, moment, count = _sums(error, batch)
         return 2.0 * (moment - total * square.log()) / ((total + square).square() * math.log(count)) / _unit(batch) ** 2
 

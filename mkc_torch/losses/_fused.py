@@ -1,8 +1,8 @@
 """The reduced loss, with gradients computed in the forward pass by NumPy or torch.
 
 Autograd on the formulas of :mod:`mkc_torch.losses._terms` keeps a dozen arrays of the size of the batch. This forward
-pass keeps a single array, the gradient by the input, and returns it in the first backward pass. A second backward pass
-of the same graph computes it again. Second derivatives use the formulas.
+pass keeps a single array, the gradient with respect to the input, and returns it in the first backward pass. A second
+backward pass of the same graph computes the gradient again. Second derivatives use the formulas.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ChannelSums(NamedTuple):
 
 
 def fused_loss(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> Tensor:
-    """The reduced sum of the terms, (), for plain tensors: no function transforms, no gradient by the weight."""
+    """The reduced sum of the terms, (), for plain tensors, without function transforms and gradients of the weight."""
     value: Tensor = _Fused.apply(batch.input, batch.target, raw_kappa, raw_d, batch, settings)  # type: ignore[no-untyped-call]
     return value
 
@@ -234,7 +234,7 @@ def _whole_batch(
 def _element_values(
     xp: Any, error: Any, weight: Any, table: ChannelTable, divisor: Any, *, can_read: bool
 ) -> tuple[ChannelSums, Any]:
-    """Summands of each element, and the gradient by the input; the table must broadcast with ``error``."""
+    """Summands of each element, and the gradient with respect to the input; the table must broadcast with ``error``."""
     z = error / table.d
     learns_kappa, learns_d = table.kappa_by_raw is not None, table.d_by_raw is not None
     has_gaussian = not can_read or bool((table.kappa == 0).any())
@@ -253,7 +253,7 @@ def _element_values(
 
 
 def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, can_read: bool) -> tuple[Any, Any]:
-    """The network term of each element, and its derivative by the error over the divisor."""
+    """The network term of each element, and its derivative with respect to the error, divided by the divisor."""
     share = table.share
     parts = []
     if not can_read or bool((share > 0).any()):
@@ -311,7 +311,7 @@ def _in_pieces(
 def _value_and_gradients(
     xp: Any, batch: Elements, sums: ChannelSums, table: ChannelTable, divisor: Any
 ) -> tuple[Any, Any, Any]:
-    """Value and gradients by the raw parameters, from the sums of each channel."""
+    """Value and gradients with respect to the raw parameters, from the sums of each channel."""
     total = sums.energy if sums.network is None else sums.energy + sums.network
     by_kappa = sums.by_kappa
     if by_kappa is None and table.kappa_by_raw is not None:  # (sum of z² exp(-x) / 2 - energy) / kappa

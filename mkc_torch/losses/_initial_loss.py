@@ -13,7 +13,7 @@ def initial_loss(xp: Any, z: Any) -> Any:
 
     Args:
         xp: ``numpy`` or ``torch``, the library of ``z``.
-        z: residuals over their scale.
+        z: residuals divided by their scale.
     """
     ratio = z / SHARPNESS
     return 2.0 * SHARPNESS**2 * (xp.sqrt(xp.sqrt(1.0 + ratio * ratio)) - 1.0)

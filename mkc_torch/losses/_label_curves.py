@@ -42,7 +42,7 @@ class LabelCurves(Curves):
         return torch.where(kappa > 0, -torch.expm1(-own * deviance) / own, deviance)
 
     def influence(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """Derivative of :meth:`rho` by the probability, ``-p^(1/σ² - 1)``: -∞ at p = 0 where σ > 1."""
+        """Derivative of :meth:`rho` with respect to the probability, ``-p^(1/σ² - 1)``: -∞ at p = 0 if σ > 1."""
         p, kappa = self._given(probability)
         return -p.pow(kappa - 1.0)
 

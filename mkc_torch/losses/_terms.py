@@ -1,7 +1,8 @@
 """The terms of the loss in differentiable torch operations: the reference for every faster implementation.
 
-In training a robust loss is the sum of two terms. ``network`` trains the network and has no gradient by σ and d.
-``density`` is the negative log-likelihood at detached residuals and trains σ and d. The likelihood is a single term.
+In training a robust loss is the sum of two terms. ``network`` trains the network and has no gradient with respect to σ
+and d. ``density`` is the negative log-likelihood at detached residuals and trains σ and d. The likelihood is a single
+term.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class LossSettings:
     """Fixed numbers, state and options of a loss.
 
     Attributes:
-        fixed_kappa, fixed_d: 1/σ² and d where they are not learned, (m,); None where they are.
+        fixed_kappa, fixed_d: 1/σ² and d if they are not learned, (m,); None if they are.
         state: scale, bound and schedule of each channel.
         follows: whether d follows the scale of the residuals.
         normalize: whether the density term has its log-normaliser.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 WARMUP_STEPS = 100
-"""Batches in which the initial loss is used alone."""
+"""Batches in which only the initial loss is used."""
 
 ANNEAL_STEP = 0.005
 """Change of the annealed loss's share per batch after the warm-up."""
@@ -39,13 +39,13 @@ UNLIMITED = 32.0
 class BandwidthSchedule(nn.Module):
     """Annealing of each channel from the initial loss to Welsch's loss at the selected bandwidth; all state in buffers.
 
-    In the first ``warmup_steps`` batches the initial loss is used alone. At every fourth batch the bandwidth is
+    In the first ``warmup_steps`` batches only the initial loss is used. At every fourth batch the bandwidth is
     selected by the estimated risk of the predictions. The share of the annealed loss grows while its risk is smaller
     than that of the initial loss, and falls while it is larger.
 
     Args:
         num_channels: m.
-        warmup_steps: batches in which the initial loss is used alone.
+        warmup_steps: batches in which only the initial loss is used.
         anneal_step: change of the share per later batch.
 
     Attributes:
@@ -83,7 +83,7 @@ class BandwidthSchedule(nn.Module):
         return self.log_bandwidth.exp()
 
     def energy(self, z: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
-        """The training loss of each residual over its scale, (*, m)."""
+        """The training loss of each residual divided by its scale, (*, m)."""
         share = self.share.to(z.dtype)
         kappa = torch.exp(-2.0 * self.log_bandwidth).to(z.dtype)
         return share * energy(z, kappa) + (1.0 - share) * initial_loss(torch, z)

@@ -63,14 +63,14 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
 
     The normaliser of each element is a quadrature of 32 nodes, computed in chunks of bounded memory. It costs a
     microsecond or more per element on one core, thirty times the rest of the loss. In float32, on the CPU and in GPU
-    kernels, a table replaces it where the domain extends beyond the head of the density; the loss is then ten times as
+    kernels, a table replaces it if the domain extends beyond the head of the density; the loss is then ten times as
     fast. If σ and d have size 1 along a dimension of the input, for example one value per sample for many channels,
     torch computes the normaliser once and broadcasts it.
 
     Args:
         bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,).
         channel_dim: the dimension of the input that holds the channels.
-        reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
+        reduction: "none", "mean" (over elements, weighted if weights are given) or "sum".
         impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
             select an implementation. All compute the same.
 
@@ -324,7 +324,7 @@ class MKCHead(_WideBuffers):
 
 
 class MKCConvHead(MKCHead):
-    """An :class:`MKCHead` at each place of an image or a series, channels second: a convolution of kernel size 1.
+    """An :class:`MKCHead` at each position of an image or a series, channels second: a convolution of kernel size 1.
 
     Args:
         in_features: number of feature maps; the other arguments are those of :class:`MKCHead`.
@@ -338,10 +338,10 @@ class MKCConvHead(MKCHead):
     """
 
     def forward(self, features: Float[Tensor, "N n *places"]) -> MKCHeadOutput:
-        """Predictions, σ and d at each place, each (N, m, *places).
+        """Predictions, σ and d at each position, each (N, m, *positions).
 
         Args:
-            features: feature maps, (N, n, *places).
+            features: feature maps, (N, n, *positions).
 
         Raises:
             TypeError: integer or complex features, or an argument that is not a tensor.

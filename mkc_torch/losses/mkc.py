@@ -36,19 +36,19 @@ if TYPE_CHECKING:
 class MKCLoss(ChannelCurves, ChannelDensity):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
-    The likelihood is (17) of Li et al. (2023). Where σ or d is learned, the loss is ``energy + log_normalizer``. With
+    The likelihood is (17) of Li et al. (2023). If σ or d is learned, the loss is ``energy + log_normalizer``. With
     both fixed it is the paper's loss, ``energy = σ² (1 - exp(-e² / (2 d² σ²)))`` with e = input - target. Learning
     without the normaliser is refused: the energy alone is smallest at σ → 0 or d → ∞, whatever the data.
 
     ``objective`` selects the loss that trains the network:
 
     - ``"likelihood"``: the negative log-likelihood, for the network as for σ and d.
-    - ``"robust"``: in training the value is the sum of two stop-gradient terms. ``network`` has a gradient by the
-      predictions alone: a :class:`BandwidthSchedule` of residuals over their running :class:`ResidualScale`. It starts
-      sharper than the absolute value, and is annealed to Welsch's loss of the widest bandwidth whose estimated risk is
-      within a tenth of the smallest. ``density`` is the negative log-likelihood of detached residuals and has a
-      gradient by σ and d alone. In evaluation the value is the negative log-likelihood. Up to half of the targets may
-      be wrong.
+    - ``"robust"``: in training the value is the sum of two terms. ``network`` has a gradient only with respect to the
+      predictions: it is the loss of a :class:`BandwidthSchedule`, of residuals divided by their running
+      :class:`ResidualScale`. This loss starts sharper than the absolute value, and is annealed to Welsch's loss of the
+      widest bandwidth whose estimated risk is within a tenth of the smallest. ``density`` is the negative
+      log-likelihood of detached residuals, and has a gradient only with respect to σ and d. In evaluation the value is
+      the negative log-likelihood. Up to half of the targets may be wrong.
 
     Without a ``d``, the scale of each channel follows the residuals robustly during training, so that targets of any
     unit need no tuning.
@@ -59,27 +59,27 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             learned must start finite, because its gradient is 0 at ``inf``.
         d: initial or fixed scales > 0 in the unit of the target, a number or (m,); "auto" takes them from the
             residuals of each training batch, and ``learn_d`` then learns a factor on them.
-        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). "auto" means half
-            the range of the residuals and no less than ten scales where ``d`` is "auto"; with a given d, as None, 100
-            times that d, and it stays there while d is learned. The likelihood of σ depends on it: a physical bound
-            is better, and likelihoods compare only at equal bounds. Errors beyond it keep a finite loss and gradient.
-        objective: "robust" or "likelihood"; None is robust where d is "auto".
+        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). "auto" and None
+            mean half the range of the residuals, and at least ten scales, if ``d`` is "auto"; else 100 times the
+            initial d. The likelihood of σ depends on the bound: a physical bound is better, and likelihoods are
+            comparable only at equal bounds. Errors beyond the bound have a finite loss and gradient.
+        objective: "robust" or "likelihood"; None is robust if d is "auto".
         learn_sigma: whether σ is a parameter.
         learn_d: whether d is a parameter; it stays in [d_min, bound].
         normalize: whether to add the log-normaliser; None does so if anything is learned.
         channel_dim: the dimension of the input that holds the channels, 1 for (N, C, H, W); None for the last. An input
             of four dimensions or more whose second and last dimension both have size m needs an explicit value.
-        reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
-        d_min: floor under d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
+        reduction: "none", "mean" (over elements, weighted if weights are given) or "sum".
+        d_min: floor of d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
             residuals. The likelihood of a network that interpolates its targets grows without limit as d → 0.
         impl: "auto" runs Triton kernels on a GPU that has them and torch elsewhere; "eager", "compile" or "triton"
-            select an implementation. All compute the same.
+            select an implementation. All give the same results.
 
     Attributes:
         sigma, d: current values (m,), differentiable; assign to set them.
         bound, d_min: current values (m,).
-        residual_scale: the :class:`ResidualScale`, or None where d is given and the objective is the likelihood.
-        schedule: the :class:`BandwidthSchedule`, or None where the objective is the likelihood.
+        residual_scale: the :class:`ResidualScale`, or None if d is given and the objective is the likelihood.
+        schedule: the :class:`BandwidthSchedule`, or None if the objective is the likelihood.
 
     Raises:
         TypeError: an argument that is not a number.
@@ -172,7 +172,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
             input: predictions, any shape whose ``channel_dim`` has size m.
             target: targets of the same shape; nothing is broadcast.
             weight: non-negative weights, or a boolean mask (True: used); of the shape of the input, with size 1 along
-                dimensions where it is constant, or without the channel dimension. Elements of weight 0 or False, NaN
+                dimensions in which it is constant, or without the channel dimension. Elements of weight 0 or False, NaN
                 included, affect neither the value nor a gradient.
 
         Returns:
@@ -213,9 +213,9 @@ class MKCLoss(ChannelCurves, ChannelDensity):
     ) -> LossTerms:
         """The two terms of the robust objective at the current state, which is not changed.
 
-        ``network`` has a gradient by input and target alone, ``density`` by σ and d alone. Let a scheduler or early
-        stopping watch ``network`` after the annealing, or the value in evaluation. With ``objective="likelihood"``,
-        ``network`` is 0 and ``density`` the negative log-likelihood with all gradients.
+        ``network`` has a gradient only with respect to input and target, ``density`` only with respect to σ and d. A
+        scheduler or early stopping should monitor ``network`` after the annealing, or the value in evaluation. With
+        ``objective="likelihood"``, ``network`` is 0 and ``density`` the negative log-likelihood with all gradients.
 
         Args:
             input, target, weight: as in :meth:`forward`.
@@ -240,13 +240,13 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         *,
         optimizer: torch.optim.Optimizer | None = None,
     ) -> tuple[str, ...]:
-        """Warnings about a training, a sentence each; empty if there are none. Reads values, and so waits for a device.
+        """Warnings about a training, a sentence each; empty if there are none. Waits for the device.
 
         The checks: a d close to its floor; more than 1 % of the errors beyond a given bound; σ or d missing from the
         optimizer.
 
         Args:
-            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss keeps them.
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.
             optimizer: the optimizer of the training; None skips its check.
 
         Example:
@@ -267,7 +267,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         A finite σ is not evidence of heavy tails: it is finite for about half of all Gaussian samples.
 
         Args:
-            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss keeps them.
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, if the loss keeps them.
 
         Returns:
             A :class:`mkc_torch.density.Tails` at the loss's bound; ``print`` shows a line for each channel.
@@ -359,7 +359,7 @@ def _compiled() -> Callable[..., Tensor]:
 
 
 def checked_loss(loss: nn.Module) -> MKCLoss:
-    """The MKCLoss, unwrapped where it was compiled.
+    """The MKCLoss, unwrapped if it was compiled.
 
     Raises:
         TypeError: ``loss`` is not an MKCLoss.

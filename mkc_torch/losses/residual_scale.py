@@ -29,7 +29,7 @@ FEWEST_RECENT = 64
 """Most recent residuals kept per channel, at least, however many channels there are."""
 
 RECENT_IN_ALL = 1 << 16
-"""Limit of the residuals kept in all channels together, where it allows ``FEWEST_RECENT`` per channel."""
+"""Limit of the residuals kept in all channels together, if it allows ``FEWEST_RECENT`` per channel."""
 
 RANGE_ROWS = 1 << 12
 """Evenly spaced residuals per batch and channel from which the half range is taken, at most."""
@@ -57,7 +57,8 @@ class ResidualScale(nn.Module):
     """Running robust scale, half range and most recent residuals of each channel, all in buffers.
 
     ``update`` is the only method that changes the state; it is called in training. The scale is the 0.4 quantile of
-    the recent absolute residuals over that of a standard normal variable; its logarithm is averaged over the batches.
+    the recent absolute residuals divided by that of a standard normal variable; its logarithm is averaged over the
+    batches.
     Residuals of weight 0 and residuals that are not finite are ignored.
 
     In distributed training, all processes have the same state: the mean of their scales and the widest half range.

@@ -152,7 +152,7 @@ def beyond_bound(
 def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: float = 0.9) -> PredictiveInterval:
     """Equal-tailed predictive interval of each target under the loss's density.
 
-    The interval covers the noise alone, not the uncertainty of the prediction. σ and d must have been fitted: learned,
+    The interval covers only the noise, not the uncertainty of the prediction. σ and d must have been fitted: learned,
     by MKC-EM, or by :func:`mkc_torch.fit_density` on residuals of data that the network has not seen. With
     ``normalize=False`` they are the values passed to the loss.
 

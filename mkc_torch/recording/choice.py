@@ -118,7 +118,7 @@ _COUNTERS = {"experiment", "run", "sample", "row", "index", "id"}
 
 
 def _example(topics: Sequence[Topic]) -> dict[str, str]:
-    """Three columns of the first table that are no time, no counter and no other sensor, by axis; else empty."""
+    """Three columns of the first table by axis, none of which is a time, a counter or another sensor; else empty."""
     for topic in topics:
         names = [n for n in topic.table.names if n and meaning(n) is None and n.casefold() not in _COUNTERS]
         if len(names) >= len(_MAG):

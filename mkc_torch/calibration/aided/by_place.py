@@ -41,7 +41,7 @@ def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: PlaceF
     """Fit the three responses with the length of the place's field, and select the response with the most evidence.
 
     The turns are assumed to be about the vertical: the measurements form a circle, whose radius is the horizontal field
-    and which lies above or below the offset by the vertical field. Tilts of the vehicle show which of the two holds.
+    and which lies above or below the offset by the vertical field. Tilts of the vehicle show on which side.
 
     Args:
         measured: measurements in the order of time.

@@ -43,7 +43,7 @@ def mounting(
 ) -> Mounting | None:
     """Find exchanged axes or signs of a magnetometer; None if its own axes fit, or if no exchange fits.
 
-    Turned back by the body's rotation, the field must be constant. Of the 48 exchanges of axes and signs, the exchange
+    The field must be constant after rotation by the body's turns. Of the 48 exchanges of axes and signs, the exchange
     with the smallest residual is selected.
 
     Args:

@@ -11,7 +11,7 @@ from mkc_torch.losses.kernels.formulas import energy, energy_by_kappa, initial
 @triton.jit
 def finish(sum_network, sum_energy, sum_kappa, sum_d, weight, table, channel, mask, m, divisor,
            LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr, by_kappa, by_d):  # fmt: skip
-    """Contribution of each channel to the value; stores the gradients by the raw parameters."""
+    """Contribution of each channel to the value; stores the gradients with respect to the raw parameters."""
     total = sum_network + sum_energy
     if NORMALIZE:
         total += weight * tl.load(table + 4 * m + channel, mask=mask, other=0.0)
@@ -40,9 +40,10 @@ def walk(
 ):  # fmt: skip
     """The pass of a program. ANNEALED, INITIAL: whether that loss is used in this phase; the likelihood has neither.
 
-    Returns, for each place of the tile, the sums of the network term, of the energy, of its derivative by kappa, of -d
-    times its derivative by d, and of the upstream gradients. With CURVE the derivative by kappa is summed over
-    elements; without, it is computed from the other sums, which is accurate unless a kappa is small.
+    Returns, for each place of the tile, the sums of the network term, of the energy, of the energy's derivative with
+    respect to kappa, of -d times its derivative with respect to d, and of the upstream gradients. With CURVE the
+    derivative with respect to kappa is summed over elements; without CURVE it is computed from the other sums, which is
+    accurate unless a kappa is small.
     """
     like = tl.float64 if WIDE else tl.float32
     m: tl.constexpr = CHANNELS
@@ -186,7 +187,7 @@ def walk_by_kappa(
     LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """:func:`walk`, with the derivative by kappa per element, a third of the work, only if a kappa is small."""
+    """:func:`walk`; sums the derivative with respect to kappa, a third of the work, only if a kappa is small."""
     if LEARN_KAPPA and SUMS and not WIDE:
         if least_kappa >= 0.1:
             sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
@@ -220,11 +221,11 @@ def elements_kernel(
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, FINISH: tl.constexpr,
     WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of elements (WRITE_VALUES), gradients by the input (WRITE_SLOPES) and sums of each channel (SUMS).
+    """Values of elements (WRITE_VALUES), gradients of the input (WRITE_SLOPES) and sums of each channel (SUMS).
 
     UPSTREAM: 0 if the upstream gradient is 1, 1 if it is a number, 2 if each element has its own. LAYOUT of a tile's
     columns: 0, places within the single channel of a program; 1, channels; 2, channels of successive rows in contiguous
-    memory. With FINISH a single program also computes the value and the gradients by the raw parameters.
+    memory. With FINISH a single program also computes the value and the gradients with respect to the raw parameters.
     """
     like = tl.float64 if WIDE else tl.float32
     m: tl.constexpr = CHANNELS

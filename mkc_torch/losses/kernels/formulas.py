@@ -45,7 +45,7 @@ def curve_series(minus_x, WIDE: tl.constexpr):
 
 @triton.jit
 def energy(z, kappa, inverse_kappa, WIDE: tl.constexpr):
-    """Energy of a standardised error z, its derivative by z, -x = -kappa z² / 2, exp(-x) and z² / 2.
+    """Energy of a standardised error z, its derivative with respect to z, -x = -kappa z² / 2, exp(-x) and z² / 2.
 
     ``inverse_kappa`` may be any finite number where kappa is 0.
     """
@@ -59,7 +59,7 @@ def energy(z, kappa, inverse_kappa, WIDE: tl.constexpr):
 
 @triton.jit
 def energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE: tl.constexpr):
-    """Derivative of the energy by kappa, from the results of :func:`energy`."""
+    """Derivative of the energy with respect to kappa, from the results of :func:`energy`."""
     near = -half * half * curve_series(tl.maximum(minus_x, -0.5), WIDE)
     far = (inlier * (1.0 - tl.maximum(minus_x, -1e4)) - 1.0) * (inverse_kappa * inverse_kappa)
     return tl.where(minus_x > -0.5, near, far)
@@ -85,7 +85,7 @@ def initial(z, WIDE: tl.constexpr):
 
 @triton.jit
 def log_partition(kappa, length, rule, NODES: tl.constexpr):
-    """``log Z`` of a channel and its derivatives by kappa and by length, all in float64.
+    """``log Z`` of a channel and its derivatives with respect to kappa and length, all in float64.
 
     ``rule`` has NODES nodes on [0, 1], then their weights: those of mkc_torch.density.normalizer.
     """

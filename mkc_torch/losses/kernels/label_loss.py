@@ -90,9 +90,9 @@ def pass_over_labels(
     Args:
         batch: the batch.
         mean: whether sums and gradients are those of the mean.
-        upstream: gradient by the value, a number or one per row; None means 1.
+        upstream: gradient with respect to the value, a number or one per row; None means 1.
         values: output, the value of each row.
-        slopes: output, the gradient by the logits.
+        slopes: output, the gradient with respect to the logits.
         sums: whether to compute the value.
     """
     rows, classes = batch.input.shape
@@ -126,7 +126,7 @@ def pass_over_labels(
 
 
 def reduce_labels(batch: Labels, mean: bool, wants_input: bool) -> tuple[Tensor, Tensor | None]:
-    """Value () of a reduced loss, and its gradient by the logits."""
+    """Value () of a reduced loss, and its gradient with respect to the logits."""
     slopes = torch.empty_like(batch.input) if wants_input else None
     value = pass_over_labels(batch, mean=mean, slopes=slopes, sums=True)
     assert value is not None
@@ -141,7 +141,7 @@ def label_values(batch: Labels) -> Tensor:
 
 
 def label_slopes(batch: Labels, mean: bool, upstream: Tensor) -> Tensor:
-    """The gradient by the logits, multiplied by the upstream gradient before rounding."""
+    """The gradient with respect to the logits, multiplied by the upstream gradient before rounding."""
     slopes = torch.empty_like(batch.input)
     pass_over_labels(batch, mean=mean, upstream=upstream, slopes=slopes)
     return slopes
@@ -202,7 +202,7 @@ def _slopes(ctx: Any, grad: Tensor) -> Tensor:
 
 
 def _by_formulas(ctx: Any, grad: Tensor) -> Tensor:
-    """Differentiable gradient by the logits, for second derivatives."""
+    """Differentiable gradient with respect to the logits, for second derivatives."""
     input, target, _ = ctx.saved_tensors
     value = ctx.work.loss._computed(input, target)
     (found,) = torch.autograd.grad(value, input, grad.to(value.dtype), create_graph=True)

@@ -16,7 +16,7 @@ from mkc_torch.losses.kernels.label_loss import arranged_labels, label_slopes, l
 def reduced_label_loss(
     input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor | None, ignore_index: int, mean: bool, wanted: bool
 ) -> tuple[Tensor, Tensor]:
-    """Value, and the gradient by the logits; empty if not needed, or in float16."""
+    """Value, and the gradient with respect to the logits; empty if not needed, or in float16."""
     batch = arranged_labels(input, target, kappa, weight, ignore_index)
     value, slopes = reduce_labels(batch, mean, wanted and input.dtype != torch.float16)
     return value, input.new_empty(0) if slopes is None else slopes
@@ -38,7 +38,7 @@ def _without_gaps(input: Tensor) -> Tensor:
 def slopes_of_labels(
     input: Tensor, target: Tensor, kappa: Tensor, weight: Tensor | None, ignore_index: int, mean: bool, grad: Tensor
 ) -> Tensor:
-    """The gradient by the logits, multiplied by the upstream gradient."""
+    """The gradient with respect to the logits, multiplied by the upstream gradient."""
     return label_slopes(arranged_labels(input, target, kappa, weight, ignore_index), mean, grad)
 
 

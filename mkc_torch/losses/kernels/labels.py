@@ -45,7 +45,7 @@ def labels_kernel(
     HAS_WEIGHT: tl.constexpr, MEAN: tl.constexpr, UPSTREAM: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of rows (WRITE_VALUES), gradients by the logits (WRITE_SLOPES), a summand of the value per program (SUMS).
+    """Values of rows (WRITE_VALUES), gradients of the logits (WRITE_SLOPES), a summand of the value per program (SUMS).
 
     The logits are (rows, CLASSES), contiguous. A tile holds BLOCK_ROW whole rows, or BLOCK_ROW is 1 and a row has
     several tiles. The weight of a mean is the sum of ``parts`` numbers of ``counted``, at most PARTS; with PARTS = 0

@@ -252,10 +252,10 @@ def pass_over(
         table: result of :func:`make_table`.
         options: options of the loss.
         weights, total_weight: sums of the weights of each channel, (m,), and of all; None without weights.
-        upstream: gradient by the value, a number or one per element, of any strides; None means 1.
+        upstream: gradient with respect to the value, a number or one per element, of any strides; None means 1.
         values: output, the value of each element; in the layout of the input, like ``slopes``.
-        slopes: output, the gradient by the input.
-        by_kappa, by_d: outputs, the gradients by the raw parameters, (m,); with ``sums``.
+        slopes: output, the gradient with respect to the input.
+        by_kappa, by_d: outputs, the gradients with respect to the raw parameters, (m,); with ``sums``.
         sums: whether to compute the sums of each channel.
     """
     outer, m, inner = batch.size
@@ -323,7 +323,7 @@ def rescale(slopes: Tensor | None, by_kappa: Tensor | None, by_d: Tensor | None,
 def reduce_batch(
     batch: Arranged, table: Tensor, options: Options, *, wants_input: bool
 ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """Value () of a reduced loss, and its gradients by the input and by the raw parameters."""
+    """Value () of a reduced loss, and its gradients with respect to the input and the raw parameters."""
     weights, total = weight_sums(batch, table.dtype)
     m = batch.channels
     slopes = torch.empty_like(batch.input) if wants_input else None

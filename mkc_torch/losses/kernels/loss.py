@@ -156,8 +156,8 @@ def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, 
 class ReducedFunction(torch.autograd.Function):
     """A sum or mean.
 
-    The forward pass computes the gradient by the input. In float16 the backward pass does: 1 over the number of
-    elements would underflow before a gradient scaler multiplies it.
+    The forward pass computes the gradient with respect to the input. In float16 the backward pass does: 1 over the
+    number of elements would underflow before a gradient scaler multiplies it.
     """
 
     @staticmethod
@@ -222,7 +222,7 @@ def _again(ctx: Any) -> Arranged:
 def gradients_of_each(
     batch: Arranged, table: Tensor, options: Options, grad: Tensor
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Gradients by the input and the raw parameters, with an upstream gradient per element."""
+    """Gradients with respect to the input and the raw parameters, with an upstream gradient per element."""
     slopes = torch.empty_like(batch.input)
     by_kappa = table.new_empty(batch.channels) if options.learn_kappa else None
     by_d = table.new_empty(batch.channels) if options.learn_d else None
@@ -234,7 +234,7 @@ def gradients_of_each(
 
 
 def _handed_out(ctx: Any, slopes: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-    """The gradients by input and target, in their dtypes."""
+    """The gradients with respect to input and target, in their dtypes."""
     target = ctx.saved_tensors[1]
     wants = ctx.needs_input_grad
     by_target = -slopes.to(target.dtype) if wants[1] and slopes is not None else None

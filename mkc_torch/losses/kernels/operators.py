@@ -67,7 +67,7 @@ def reduced_loss(
     table: Tensor,
     options: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, and gradients by the input, raw_kappa and raw_d; empty where not computed."""
+    """Value, and gradients with respect to the input, raw_kappa and raw_d; empty where not computed."""
     batch, stores = arranged(input, target, weight, axis), input.dtype != torch.float16
     value, *slopes = reduce_batch(batch, table, Options(*options), wants_input=stores)
     by_input, by_kappa, by_d = (table.new_empty(0) if slope is None else slope for slope in slopes)
@@ -125,7 +125,7 @@ def slopes(
     grad: Tensor,
     options: Sequence[bool],
 ) -> Tensor:
-    """The gradient of a reduced loss by the input, multiplied by the upstream gradient before rounding."""
+    """The gradient of a reduced loss with respect to the input, multiplied by the upstream gradient before rounding."""
     batch = arranged(input, target, weight, axis)
     found = torch.empty_like(batch.input)
     weights, total = weight_sums(batch, table.dtype)
@@ -176,7 +176,7 @@ def each_gradients(
     grad: Tensor,
     options: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients by the input, raw_kappa and raw_d, with an upstream gradient per element."""
+    """Gradients with respect to the input, raw_kappa and raw_d, with an upstream gradient per element."""
     found = gradients_of_each(arranged(input, target, weight, axis), table, Options(*options), grad)
     by_input, by_kappa, by_d = (table.new_empty(0) if value is None else value for value in found)
     return by_input, by_kappa, by_d

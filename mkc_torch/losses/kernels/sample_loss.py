@@ -105,9 +105,9 @@ def pass_over_samples(
         batch: the batch.
         mean: whether sums and gradients are those of the mean.
         total_weight: sum of the weights, for a weighted mean.
-        upstream: gradient by the value, a number or one per element; None means 1.
+        upstream: gradient with respect to the value, a number or one per element; None means 1.
         values: output, the value of each element.
-        slopes: outputs, the gradients by input, sigma and d.
+        slopes: outputs, the gradients with respect to input, sigma and d.
         sums: whether to compute the value.
     """
     dtype, device, count = batch.dtype, batch.input.device, batch.input.numel()
@@ -138,7 +138,7 @@ def pass_over_samples(
 
 
 def empty_slopes(batch: Samples, wanted: Sequence[bool]) -> list[Tensor | None]:
-    """Empty tensors for the gradients by input, sigma and d, in the layout of the input."""
+    """Empty tensors for the gradients with respect to input, sigma and d, in the layout of the input."""
     given = (batch.input, batch.sigma, batch.d)
     return [
         torch.empty_like(batch.input, dtype=value.dtype) if wants else None
@@ -147,7 +147,7 @@ def empty_slopes(batch: Samples, wanted: Sequence[bool]) -> list[Tensor | None]:
 
 
 def reduce_samples(batch: Samples, mean: bool, wanted: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
-    """Value () of a reduced loss, and its gradients by input, sigma and d."""
+    """Value () of a reduced loss, and its gradients with respect to input, sigma and d."""
     slopes = empty_slopes(batch, wanted)
     value = pass_over_samples(batch, mean=mean, total_weight=batch.total_weight, slopes=slopes, sums=True)
     assert value is not None
@@ -162,7 +162,7 @@ def samples_values(batch: Samples) -> Tensor:
 
 
 def samples_slopes(batch: Samples, mean: bool, wanted: Sequence[bool], upstream: Tensor) -> list[Tensor | None]:
-    """Gradients by input, sigma and d, multiplied by the upstream gradient before rounding."""
+    """Gradients with respect to input, sigma and d, multiplied by the upstream gradient before rounding."""
     slopes = empty_slopes(batch, wanted)
     pass_over_samples(batch, mean=mean, total_weight=batch.total_weight, upstream=upstream, slopes=slopes)
     return slopes

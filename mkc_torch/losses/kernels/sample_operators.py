@@ -33,7 +33,7 @@ def reduced_sample_loss(
     mean: bool,
     wanted: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, and gradients by input, sigma and d; empty where not needed, or in float16."""
+    """Value, and gradients with respect to input, sigma and d; empty where not needed, or in float16."""
     batch = arranged_samples(input, target, sigma, d, weight, bound, axis)
     made = [wants and not has_float16(input, sigma, d) for wants in wanted]
     value, slopes = reduce_samples(batch, mean, made)
@@ -82,7 +82,7 @@ def sample_slopes(
     wanted: Sequence[bool],
     grad: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients by input, sigma and d, multiplied by the upstream gradient; empty where not needed."""
+    """Gradients with respect to input, sigma and d, multiplied by the upstream gradient; empty where not needed."""
     batch = arranged_samples(input, target, sigma, d, weight, bound, axis)
     return _without_none(batch, samples_slopes(batch, mean, wanted, grad))
 

@@ -13,7 +13,7 @@ from mkc_torch.losses.kernels.formulas import energy, energy_by_kappa
 def head_by_table(
     kappa, table, DEGREE: tl.constexpr = DEGREE, INTERVALS: tl.constexpr = INTERVALS, RATE: tl.constexpr = RATE
 ):  # fmt: skip
-    """Integral over the head and its derivative by kappa, in float32, by the table of mkc_torch.density.head_table."""
+    """Integral over the head and its derivative in kappa, in float32, from mkc_torch.density.head_table."""
     place = tl.rsqrt(1.0 + RATE * kappa)
     position = place * INTERVALS
     index = tl.minimum(tl.maximum(position, 0.0), INTERVALS - 1.0).to(tl.int32)
@@ -53,7 +53,7 @@ def samples_kernel(
     UPSTREAM: tl.constexpr, WRITE_VALUES: tl.constexpr, WRITE_INPUT: tl.constexpr, WRITE_SIGMA: tl.constexpr,
     WRITE_D: tl.constexpr, SUMS: tl.constexpr, NODES: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of elements (WRITE_VALUES), gradients by input, sigma and d, a summand of the value per program (SUMS).
+    """Values of elements (WRITE_VALUES), gradients of input, sigma and d, a summand of the value per program (SUMS).
 
     All tensors of elements are contiguous in the same layout. UPSTREAM: 0 if the upstream gradient is 1, 1 if it is a
     number, 2 if each element has its own. ``rule`` has NODES nodes of the quadrature, then their weights.

@@ -107,7 +107,7 @@ def optional(module: str, files: str, extra: str) -> Any:
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is a number; nan and other words for a missing value are not."""
+    """Whether a text is a number, and not nan or another word for a missing value."""
     try:
         float(text)
     except ValueError:
