@@ -27,7 +27,7 @@ def gram_of_basis(problem: LinearProblem) -> Tensor:
         ((1, 30, 2), (5, 30), True, (5, 30, 1)),
     ],
 )
-def test_both_forms_are_read(x_shape, y_shape, single, canonical):
+def test_data_with_and_without_a_channel_dimension_are_accepted(x_shape, y_shape, single, canonical):
     values = canonical_shapes(sample(0, *x_shape), sample(1, *y_shape))
     assert values.single_channel is single
     assert values.Y.shape == canonical
@@ -50,7 +50,7 @@ def test_ambiguous_shapes_are_read_by_the_documented_rule(A, B, n, single):
     assert canonical_shapes(sample(0, A, B, n), sample(1, A, B)).single_channel is single
 
 
-def test_channel_dimension_settles_an_ambiguous_shape():
+def test_a_channel_dimension_resolves_an_ambiguous_shape():
     values = canonical_shapes(sample(0, 100, 3, 2).unsqueeze(-2), sample(1, 100, 3).unsqueeze(-1))
     assert values.batch == (100,)
     assert values.Y.shape == (100, 3, 1)
@@ -87,14 +87,14 @@ def test_coefficients_and_in_basis_are_inverse():
     torch.testing.assert_close(problem.coefficients(problem.in_basis(coef)), coef)
 
 
-def test_shared_design_is_kept_once():
+def test_a_shared_design_is_stored_once():
     problem = linear_problem(sample(0, 40, 2), sample(1, 5, 40))
     assert problem.basis.shape == (1, 40, 1, 2)
     assert problem.Y.shape == (5, 40, 1)
     assert problem.residual(sample(2, 5, 2)).shape == (5, 40, 1)
 
 
-def test_stack_of_candidates_equals_one_at_a_time():
+def test_a_stack_of_candidates_equals_a_loop():
     problem = linear_problem(sample(0, 3, 20, 2, 4), sample(1, 3, 20, 2), sample(2, 3, 20).exp())
     weights, betas = sample(3, 3, 6, 20, 2).exp(), sample(4, 3, 6, 4)
     fits, residuals = problem.weighted_fit(weights), problem.residual(betas)
@@ -221,7 +221,7 @@ def test_fewer_values_than_coefficients_raise():
         linear_problem(sample(0, 3, 4), sample(1, 3))
 
 
-def test_channels_count_as_values():
+def test_values_of_all_channels_determine_the_coefficients():
     assert linear_problem(sample(0, 2, 2, 4), sample(1, 2, 2)).num_coefficients == 4
 
 
@@ -247,7 +247,7 @@ def test_integer_dtype_raises(name):
         linear_problem(**values)
 
 
-def test_other_types_raise():
+def test_data_of_another_type_raise():
     with pytest.raises(TypeError, match=r"`Y` .*tensor.* got list"):
         linear_problem(sample(0, 2, 1), [1.0, 2.0])
 
@@ -272,7 +272,7 @@ def test_half_precision_raises(dtype):
         ((20, 2, 3), (20, 4), r"\(20, 2, 3\) and \(20, 4\)"),
     ],
 )
-def test_shapes_that_do_not_fit_are_shown(x_shape, y_shape, shown):
+def test_mismatched_shapes_raise_naming_both_shapes(x_shape, y_shape, shown):
     with pytest.raises(ValueError, match=rf"`X` of shape \(\*, N, m, n\) .* but got {shown}"):
         linear_problem(sample(0, *x_shape), sample(1, *y_shape))
 
