@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mkc_torch import MKCLoss
 
 FIXED: dict[str, Any] = {"d": 1.0, "sigma": 2.0, "learn_sigma": False, "learn_d": False}
-MODES: dict[str, dict[str, Any]] = {"fixed": FIXED, "learned": {"d": 1.0}, "as it comes": {}}
+MODES: dict[str, dict[str, Any]] = {"fixed": FIXED, "learned": {"d": 1.0}, "default": {}}
 
 
 class LearnedGaussianNLL(nn.Module):

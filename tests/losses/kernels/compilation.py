@@ -59,7 +59,7 @@ def compiled(kernel: Any, tensors: Any, numbers: Any, constants: Any, warps: int
 
 
 def fuses_lanes(ptx: str) -> bool:
-    """Whether a lane's product is fused with a value of another lane: a sum then differs between lanes."""
+    """Whether a fused multiply-add uses a value of another lane, so that sums differ between lanes."""
     shuffled: set[str] = set()
     for line in ptx.splitlines():
         if found := re.search(r"shfl\.sync\.\w+\.b32\s+(%r\d+)", line):
