@@ -269,7 +269,7 @@ def test_a_problem_does_not_depend_on_the_others(N, p):
             torch.testing.assert_close(getattr(together, name)[at], getattr(alone, name), rtol=1e-10, atol=1e-12)
 
 
-def test_the_order_of_samples_does_not_matter():
+def test_the_estimate_does_not_depend_on_the_order_of_samples():
     X = SETS["hbk_y"]()
     order = torch.randperm(75, generator=torch.Generator().manual_seed(0))
     fit, shuffled = MCD().fit(X), MCD().fit(X[order])

@@ -213,7 +213,7 @@ def test_arrays_are_accepted():
 # the result of fit_density
 
 
-def test_a_density_fit_has_its_tails():
+def test_the_tails_of_a_density_fit_equal_their_assessment():
     error = torch.stack([with_outliers(0, 0.05, 300), normal(3, 300)], -1)
     weight = uniform(7, 300, 1)
     fit = fit_density(error, weight=weight, bound=25.0, d_min=0.01)

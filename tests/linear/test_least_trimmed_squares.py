@@ -103,7 +103,7 @@ def test_no_exchange_of_two_samples_lowers_the_sum():
     assert float(sums.min()) >= float(fit.objective_) * (1 - 1e-9)
 
 
-def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
+def test_the_gradient_equals_that_of_least_squares_on_the_values_kept():
     X, y = contaminated_line(0)
     keep = LeastTrimmedSquares().fit(X, y).weights_[:, 0]
     for leaf in (X, y):

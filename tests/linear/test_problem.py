@@ -165,28 +165,28 @@ def test_solve_gram_equals_solve_and_falls_back_to_the_least_norm():
     assert abs(float(solution[1, 3])) < 1e-12
 
 
-def test_dependent_columns_are_named():
+def test_dependent_columns_raise_naming_them():
     X = sample(0, 20, 4)
     X[:, 3] = 2 * X[:, 1]
     with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] are linearly dependent .* remove a column"):
         linear_problem(X, sample(1, 20))
 
 
-def test_dependent_columns_are_named_whatever_their_size():
+def test_dependent_columns_of_any_size_raise_naming_them():
     X = sample(0, 20, 4)
     X[:, 3] = 1e10 * X[:, 1]
     with pytest.raises(RankDeficientError, match=r"columns \[1, 3\]"):
         linear_problem(X, sample(1, 20))
 
 
-def test_dependent_columns_of_one_problem_of_a_batch_are_named():
+def test_dependent_columns_of_a_problem_in_a_batch_raise_naming_it():
     X = sample(0, 3, 20, 1, 3)
     X[1, ..., 2] = X[1, ..., 0] + X[1, ..., 1]
     with pytest.raises(RankDeficientError, match=r"columns \[0, 1, 2\]"):
         linear_problem(X, sample(1, 3, 20, 1))
 
 
-def test_columns_dependent_on_the_samples_in_use_are_named():
+def test_columns_dependent_on_the_samples_in_use_raise_naming_them():
     X, weight = torch.ones(20, 2).double(), torch.ones(20).double()
     X[:5, 1] = 3.0
     linear_problem(X, sample(1, 20), weight)
@@ -195,14 +195,14 @@ def test_columns_dependent_on_the_samples_in_use_are_named():
         linear_problem(X, sample(1, 20), weight)
 
 
-def test_zero_column_is_named():
+def test_a_zero_column_raises_naming_it():
     X = sample(0, 20, 3)
     X[:, 1] = 0.0
     with pytest.raises(RankDeficientError, match=r"Column 1 of `X` .*zero.*; remove"):
         linear_problem(X, sample(1, 20))
 
 
-def test_column_that_is_zero_on_the_samples_in_use_is_named():
+def test_a_column_that_is_zero_on_the_samples_in_use_raises_naming_it():
     X = sample(0, 20, 3)
     X[5:, 2] = 0.0
     weight = (torch.arange(20) >= 5).double()
@@ -226,7 +226,7 @@ def test_values_of_all_channels_determine_the_coefficients():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
-def test_values_that_are_not_finite_are_named_with_their_index(value):
+def test_values_that_are_not_finite_raise_naming_their_index(value):
     X, Y, weight = sample(0, 20, 3), sample(1, 20), torch.ones(20).double()
     bad_X, bad_Y, bad_weight = X.clone(), Y.clone(), weight.clone()
     bad_X[4, 0, ...] = bad_Y[7] = bad_weight[9] = value

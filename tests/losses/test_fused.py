@@ -76,7 +76,7 @@ def assert_equals_formulas(*args, **options):
 
 @pytest.fixture(params=["NumPy", "torch", "torch table", "pieces"])
 def implementation(request, monkeypatch):
-    """Every way to compute a batch, whatever its size."""
+    """Every implementation, for batches of any size."""
     if request.param == "torch":
         monkeypatch.setattr(module, "SMALL_BATCH", 0)
     elif request.param != "NumPy":

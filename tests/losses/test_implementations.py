@@ -89,7 +89,7 @@ def loss_and_compiled_copy(options, backend):
 @pytest.mark.e2e
 @compiler
 def test_a_traced_loss_equals_eager_over_300_batches():
-    """The graph that the compiler takes, computed as it is."""
+    """The graph that the compiler receives, executed without compilation."""
     assert_same_steps(*loss_and_compiled_copy({}, "aot_eager"), 300, rtol=1e-10)
 
 

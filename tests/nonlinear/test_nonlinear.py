@@ -614,7 +614,7 @@ def test_residuals_that_are_not_finite_at_the_start_are_refused_with_their_count
         minimise(residual_to(y), START)
 
 
-def test_derivatives_that_are_not_finite_are_named():
+def test_derivatives_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match="finite derivatives at `start`"):
         minimise(lambda t: (T + t[0] + t[1].sqrt()).unsqueeze(-1), torch.tensor([1.0, 0.0]).double())
 
