@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.covariance import MinimumCovarianceDeterminant, OutlierMap, SampleKind, outlier_map
-from mkc_torch.covariance._picture_labels import Box, free_place, ranges, together
+from mkc_torch.covariance._picture_labels import Box, free_place, linked_groups, ranges
 from mkc_torch.linear import (
     LeastSquares,
     LeastTrimmedSquares,
@@ -213,7 +213,7 @@ def test_long_ranges_of_labels_are_abbreviated():
 
 def test_points_connected_by_short_distances_share_a_label():
     page = np.array([[0.0, 0.0], [100.0, 0.0], [10.0, 0.0], [20.0, 5.0], [101.0, 30.0]])
-    assert [sorted(group) for group in together(page, [1, 0, 2, 3, 4])] == [[1], [0, 2, 3], [4]]
+    assert [sorted(group) for group in linked_groups(page, [1, 0, 2, 3, 4])] == [[1], [0, 2, 3], [4]]
 
 
 def test_a_label_overlaps_nothing_or_is_left_out():
@@ -222,5 +222,5 @@ def test_a_label_overlaps_nothing_or_is_left_out():
     assert above.middle[1] > 50.0
     below = free_place(point, "7", 8.0, [above])
     assert below.middle[1] < 50.0
-    assert not below.meets(above)
+    assert not below.overlaps(above)
     assert free_place(point, "7", 8.0, [Box(0.0, 0.0, 100.0, 100.0)]) is None

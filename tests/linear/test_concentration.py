@@ -191,11 +191,11 @@ def test_the_alternation_by_the_kernel_equals_that_of_torch(kind, given):
     begin = _robust_start.robust_start(problem)
     sigma, d = {"known width": (2.0, None), "known scale": (None, 1.2)}.get(given, (None, None))
     known = _maximum.FixedParameters(sigma, d, None, "lts")
-    d_min, bound = _maximum.least_d(problem, begin), 60.0 * torch.ones_like(begin.scale)
+    d_min, bound = _maximum.lower_limit_of_d(problem, begin), 60.0 * torch.ones_like(begin.scale)
     start = known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
     for steps, ends in ((1, False), (100, True)):
         plain = torch_alternation(problem, begin.beta, start, max_iter=steps, tol=1e-10)
-        found = _alternation.alternated(problem, begin.beta, start, max_iter=steps, tol=1e-10, patience=2)
+        found = _alternation.alternate_by_kernel(problem, begin.beta, start, max_iter=steps, tol=1e-10, patience=2)
         assert bool(found.ended.all()) == ends
         # rounding of second derivatives is a part of the steps, and of the last gain
         assert abs(len(found.history) - len(plain.history)) <= 2
