@@ -1,4 +1,4 @@
-"""Inputs that do not fit, what is said of each, and the page that `python -m tests.bad_inputs` makes of it."""
+"""Bad inputs and the message that each gets; `python -m tests.bad_inputs` writes them to docs/bad_inputs.md."""
 
 from __future__ import annotations
 
@@ -24,7 +24,16 @@ from mkc_torch.nonlinear import NoFitError, fit
 from mkc_torch.simulation import Parameter
 from tests.docs.pages import ROOT
 from tests.recording.test_bad_input import BAD
-from tests.recording.test_strange_files import EXPECTED_WARNINGS, FIELD, LINES, OTHER, PLAIN, SAME, TIME, table
+from tests.recording.test_strange_files import (
+    EXPECTED_WARNINGS,
+    FIELD,
+    LINES,
+    OTHER,
+    PLAIN,
+    READABLE_FILES,
+    TIME,
+    table,
+)
 
 PAGE = ROOT / "docs" / "bad_inputs.md"
 
@@ -38,97 +47,99 @@ LOGS = (".parquet", ".ulg", ".bin", ".log", ".mcap", ".bag", ".mat", ".h5", ".mf
 
 
 @dataclass(frozen=True)
-class Bad:
-    """An input: under which heading, what was given, and what is said of it in a folder of its own."""
+class BadInput:
+    """An input: its heading on the page, its description, and a function that returns its message, given a folder."""
 
     group: str
     given: str
-    said: Callable[[Path], str]
+    message: Callable[[Path], str]
 
 
-class WrongAnswerError(Exception):
-    """What was said is a traceback or no refusal, or a file was lost."""
+class UnexpectedOutcomeError(Exception):
+    """The outcome is a traceback or a success, or a file was changed."""
 
 
-def mkc(folder: Path, *arguments: str, exit_codes: tuple[int, ...] = (1, 2)) -> str:
-    """The message of a command for its arguments; those that begin with @ are files of the folder."""
+def run_mkc(folder: Path, *arguments: str, exit_codes: tuple[int, ...] = (1, 2)) -> str:
+    """The error message of a command; arguments that begin with @ are files of the folder."""
     there = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     given = [str(folder / item[1:]) if item.startswith("@") else item for item in arguments]
     done = CliRunner().invoke(app, given)
     if done.exit_code not in exit_codes or not isinstance(done.exception, (SystemExit, type(None))):
-        raise WrongAnswerError(f"{arguments}: exit code {done.exit_code}, {done.exception!r}\n{done.output}")
+        raise UnexpectedOutcomeError(f"{arguments}: exit code {done.exit_code}, {done.exception!r}\n{done.output}")
     lost = [path for path, data in there.items() if not path.is_file() or path.read_bytes() != data]
     if lost:
-        raise WrongAnswerError(f"{arguments}: {lost} is not what it was")
-    return plain(folder, done.stderr)
+        raise UnexpectedOutcomeError(f"{arguments}: {lost} was changed")
+    return one_line(folder, done.stderr)
 
 
-def plain(folder: Path, text: str) -> str:
-    """A message on one line, without the place of its files, nor how to ask for help."""
+def one_line(folder: Path, text: str) -> str:
+    """A message on a single line, without the folder of its files and without usage hints."""
     text = " ".join(text.replace(str(folder) + "/", "").replace(str(folder), ".").split())
     return re.sub(r"^Usage: .*? Error: (Invalid value( for '[^']*')?: )?", "", text).removeprefix("mkc: ")
 
 
-def raised(call: Callable[[], Any]) -> str:
-    """What a call that does not fit raises."""
+def error_message(call: Callable[[], Any]) -> str:
+    """The message of the error that a call raises."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             answer = call()
     except (ValueError, TypeError, NotFittedError, NoFitError) as error:
         return " ".join(str(error).split())
-    raise WrongAnswerError(f"it is taken, and gives {answer!r}")
+    raise UnexpectedOutcomeError(f"accepted, with the result {answer!r}")
 
 
 def of_text(kind: str) -> Callable[[Path], str]:
-    def said(folder: Path) -> str:
+    def message(folder: Path) -> str:
         content, _ = BAD[kind]
         (folder / "bad.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
-        return mkc(folder, "calibrate", "@bad.csv", "--output", "@out", *(["--sensor", "c"] * (kind == "two sensors")))
+        return run_mkc(
+            folder, "calibrate", "@bad.csv", "--output", "@out", *(["--sensor", "c"] * (kind == "two sensors"))
+        )
 
-    return said
+    return message
 
 
 def of_file(name: str, content: bytes | str, *options: str) -> Callable[[Path], str]:
-    def said(folder: Path) -> str:
+    def message(folder: Path) -> str:
         (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-        return mkc(folder, "calibrate", f"@{name}", "--output", "@out", *options)
+        return run_mkc(folder, "calibrate", f"@{name}", "--output", "@out", *options)
 
-    return said
+    return message
 
 
-def repaired(kind: str) -> Callable[[Path], str]:
-    """The warning for text that is read all the same."""
+def of_repaired_text(kind: str) -> Callable[[Path], str]:
+    """The warning for text that is read after a repair."""
 
-    def said(folder: Path) -> str:
-        content = SAME[kind]
+    def message(folder: Path) -> str:
+        content = READABLE_FILES[kind]
         (folder / "rec.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
         recording = Recording.read(folder / "rec.csv")
         if not recording.magnetometer().isfinite().all():
-            raise WrongAnswerError(f"{kind}: {recording}")
+            raise UnexpectedOutcomeError(f"{kind}: {recording}")
         return next(
             sentence for sentence in (*recording.warnings, *recording.notes) if EXPECTED_WARNINGS[kind] in sentence
         )
 
-    return said
+    return message
 
 
 def of_command(*arguments: str) -> Callable[[Path], str]:
-    """A command in a folder with a good recording, its calibration and things that are none."""
+    """A command in a folder with a good recording, its calibration and files that are neither."""
 
-    def said(folder: Path) -> str:
+    def message(folder: Path) -> str:
         for name, content in prepared().items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
         (folder / "folder").mkdir()
-        return mkc(folder, *arguments)
+        return run_mkc(folder, *arguments)
 
-    return said
+    return message
 
 
 @cache
 def prepared() -> dict[str, bytes]:
-    """The files of that folder."""
+    """The files of that folder by their paths."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "rec.csv").write_text(PLAIN)
@@ -139,21 +150,21 @@ def prepared() -> dict[str, bytes]:
         (folder / "none.json").write_text('{"a": 1}')
         (folder / "cut.json").write_text('{"schema": "mkc-calib')
         (folder / "file").write_text("")
-        mkc(folder, "calibrate", "@rec.csv", "@counts.csv", "--output", "@done", exit_codes=(0,))
+        run_mkc(folder, "calibrate", "@rec.csv", "@counts.csv", "--output", "@done", exit_codes=(0,))
         return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def of_fmu(content: bytes | None) -> Callable[[Path], str]:
-    def said(folder: Path) -> str:
+    def message(folder: Path) -> str:
         (folder / "rec.csv").write_text(PLAIN)
         if content is None:
             with zipfile.ZipFile(folder / "model.fmu", "w") as archive:
                 archive.writestr("readme.txt", "nothing")
         else:
             (folder / "model.fmu").write_bytes(content)
-        return mkc(folder, "diagnose", "@rec.csv", "--simulation", "@model.fmu", "--output", "@out")
+        return run_mkc(folder, "diagnose", "@rec.csv", "--simulation", "@model.fmu", "--output", "@out")
 
-    return said
+    return message
 
 
 DONE = "@done/rec/calibration.json"
@@ -225,60 +236,66 @@ PYTHON: dict[str, Callable[[], Any]] = {
 }
 
 
-def bad_inputs() -> Iterator[Bad]:
-    """All of them."""
+def bad_inputs() -> Iterator[BadInput]:
+    """All bad inputs, in the order of the page."""
     for kind in BAD:
-        yield Bad("Text", kind, of_text(kind))
-    yield Bad("Text", "a table without a header", of_file("rec.csv", "\n".join(LINES[1:])))
-    yield Bad("Text", "an accelerometer alone", of_file("rec.csv", table("time,acc_x,acc_y,acc_z", TIME, *FIELD.T)))
-    yield Bad("Text", "columns with numbers for axes", of_file("rec.csv", table("time,m_0,m_1,m_2", TIME, *FIELD.T)))
-    yield Bad("Text", "eight samples", of_file("rec.csv", "\n".join(LINES[:9])))
-    yield Bad("Text", "a sensor that does not turn", of_file("rec.csv", table("mx,my,mz", *([[9.0] * 99] * 3))))
-    yield Bad("Text", "an axis that is stuck", of_file("rec.csv", table("mx,my,mz", *FIELD.T[:2], [7.0] * len(TIME))))
+        yield BadInput("Text", kind, of_text(kind))
+    yield BadInput("Text", "a table without a header", of_file("rec.csv", "\n".join(LINES[1:])))
+    yield BadInput(
+        "Text", "an accelerometer alone", of_file("rec.csv", table("time,acc_x,acc_y,acc_z", TIME, *FIELD.T))
+    )
+    yield BadInput(
+        "Text", "columns with numbers for axes", of_file("rec.csv", table("time,m_0,m_1,m_2", TIME, *FIELD.T))
+    )
+    yield BadInput("Text", "eight samples", of_file("rec.csv", "\n".join(LINES[:9])))
+    yield BadInput("Text", "a sensor that does not turn", of_file("rec.csv", table("mx,my,mz", *([[9.0] * 99] * 3))))
+    yield BadInput(
+        "Text", "an axis that is stuck", of_file("rec.csv", table("mx,my,mz", *FIELD.T[:2], [7.0] * len(TIME)))
+    )
     for kind in EXPECTED_WARNINGS:
-        yield Bad("Text that is read, and the warning", kind, repaired(kind))
+        yield BadInput("Text that is read, and the warning", kind, of_repaired_text(kind))
     for ending in LOGS:
-        yield Bad("Logs", f"text called `{ending}`", of_file(f"log{ending}", PLAIN))
-    yield Bad("Logs", "an empty log", of_file("log.ulg", b""))
-    yield Bad("Logs", "bytes of nothing", of_file("log.ulg", bytes(range(200, 256)) * 9))
-    yield Bad("Logs", "a ULog of its beginning alone", of_file("log.ulg", b"ULog\x01\x12\x35\x01" + bytes(8)))
-    yield Bad("Logs", "a ULog called `.csv`", of_file("log.csv", b"ULog\x01\x12\x35\x01" + bytes(64)))
-    yield Bad("Logs", "an archive called `.csv`", of_file("log.csv", b"\x1f\x8b\x08\x00" + bytes(64)))
-    yield Bad("Logs", "an archive", of_file("log.csv.gz", b"\x1f\x8b\x08\x00" + bytes(64)))
-    yield Bad("Logs", "a spreadsheet", of_file("log.xlsx", b"PK\x03\x04" + bytes(64)))
-    yield Bad("Logs", "a file without an ending", of_file("log", PLAIN))
+        yield BadInput("Logs", f"text called `{ending}`", of_file(f"log{ending}", PLAIN))
+    yield BadInput("Logs", "an empty log", of_file("log.ulg", b""))
+    yield BadInput("Logs", "bytes of nothing", of_file("log.ulg", bytes(range(200, 256)) * 9))
+    yield BadInput("Logs", "a ULog of its beginning alone", of_file("log.ulg", b"ULog\x01\x12\x35\x01" + bytes(8)))
+    yield BadInput("Logs", "a ULog called `.csv`", of_file("log.csv", b"ULog\x01\x12\x35\x01" + bytes(64)))
+    yield BadInput("Logs", "an archive called `.csv`", of_file("log.csv", b"\x1f\x8b\x08\x00" + bytes(64)))
+    yield BadInput("Logs", "an archive", of_file("log.csv.gz", b"\x1f\x8b\x08\x00" + bytes(64)))
+    yield BadInput("Logs", "a spreadsheet", of_file("log.xlsx", b"PK\x03\x04" + bytes(64)))
+    yield BadInput("Logs", "a file without an ending", of_file("log", PLAIN))
     for given, arguments in COMMANDS.items():
-        yield Bad("Commands", given, of_command(*arguments))
-    yield Bad("FMUs", "text called `.fmu`", of_fmu(b"no archive"))
-    yield Bad("FMUs", "an archive without a model", of_fmu(None))
-    yield Bad("FMUs", "an archive that is cut", of_fmu(b"PK\x03\x04 cut off"))
+        yield BadInput("Commands", given, of_command(*arguments))
+    yield BadInput("FMUs", "text called `.fmu`", of_fmu(b"no archive"))
+    yield BadInput("FMUs", "an archive without a model", of_fmu(None))
+    yield BadInput("FMUs", "an archive that is cut", of_fmu(b"PK\x03\x04 cut off"))
     for given, call in PYTHON.items():
-        yield Bad("Python", given, lambda _, call=call: raised(call))
+        yield BadInput("Python", given, lambda _, call=call: error_message(call))
 
 
-def row(bad: Bad, said: str) -> str:
-    return f"| {cell(bad.given)} | {cell(said)} |"
+def row(bad: BadInput, message: str) -> str:
+    return f"| {cell(bad.given)} | {cell(message)} |"
 
 
 def cell(text: str) -> str:
-    """Text in a table: a bar ends no cell, and `<` begins no tag."""
+    """Text in a table, with bars and `<` escaped."""
     return text.replace("|", r"\|").replace("<", "&lt;")
 
 
-def rows() -> Iterator[tuple[Bad, str]]:
-    """Each input and what is said of it."""
+def rows() -> Iterator[tuple[BadInput, str]]:
+    """Each input and its message."""
     for bad in bad_inputs():
         with tempfile.TemporaryDirectory() as folder:
-            yield bad, bad.said(Path(folder))
+            yield bad, bad.message(Path(folder))
 
 
 def page() -> str:
     text, group = HEAD, ""
-    for bad, said in rows():
+    for bad, message in rows():
         if bad.group != group:
             text += f"{'' if not group else chr(10)}## {bad.group}\n\n| input | message |\n|---|---|\n"
             group = bad.group
-        text += row(bad, said) + "\n"
+        text += row(bad, message) + "\n"
     return text
 
 

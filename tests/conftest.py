@@ -31,7 +31,7 @@ DEVICES = ("cpu", SIDE_BY_SIDE, *(f"cuda:{i}" for i in range(min(1, torch.cuda.d
 
 @pytest.fixture(params=DEVICES)
 def device(request):
-    """Every device there is, and the CPU where problems are computed side by side, as on a GPU."""
+    """Every available device, and the CPU with problems computed in parallel, as on a GPU."""
     if request.param == SIDE_BY_SIDE:
         with forced():
             yield torch.device("cpu")

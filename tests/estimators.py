@@ -1,4 +1,4 @@
-"""Robust linear estimators by name, as the tests of all of them make them."""
+"""Robust linear estimators by name, for tests of all estimators."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ from mkc_torch.linear._estimator import LinearEstimator
 
 
 def estimators(d: float) -> dict[str, Callable[[], LinearEstimator]]:
-    """Return functions that make the estimators; ``d`` is the scale of the one with a fixed scale."""
+    """Return functions that make the estimators; ``d`` is the scale of `FixedPointLinear`."""
     return {
         "LeastSquares": LeastSquares,
         "FixedPointLinear": lambda: FixedPointLinear(sigma=2.0, d=d),

@@ -1,10 +1,10 @@
-"""Do the tests see a change of the code? `python -m tests.mutation density tests/density -n 40`
+"""Mutation testing: `python -m tests.mutation density tests/density -n 40`
 
-Each mutant is one change in one file of a room: an operator or a comparison exchanged, a number moved, a condition
-turned round. The named tests run once under coverage; then those that reach the changed statement run on a copy of the
-package with the mutant in it, the quickest first, until one fails. A mutant that none fails on is listed; one that no
-test reaches is tried with all of them. Mutants are drawn by a seed; without `-n` all are tried. A library such as
-mutmut puts a switch into each function, which torch.compile(fullgraph=True) cannot trace.
+Each mutant is a single change in a file of a package: an operator or a comparison exchanged, a number changed, a
+condition negated. The named tests run once under coverage; then those that reach the changed statement run on a copy of
+the package with the mutant in it, the quickest first, until one fails. A mutant that no test detects is listed; a
+mutant that no test reaches is tried with all tests. Mutants are drawn by a seed; without `-n` all are tried. A library
+such as mutmut puts a switch into each function, which torch.compile(fullgraph=True) cannot trace.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PYTEST = ("-q", "-m", "not slow", "--doctest-modules", "-p", "no:cacheprovider",
 LOADED = ("torch", "torch._dynamo", "numpy", "scipy.stats", "scipy.optimize", "hypothesis", "sklearn.linear_model")
 SLACK = 30  # seconds that a test may take beyond five times what it takes under coverage
 OUTPUT = Path("output.txt")  # in the copy: what the last tests wrote
-MEMORY = 16 << 30  # bytes of addresses that a mutant may ask for, lest it takes the machine's memory
+MEMORY = 16 << 30  # limit of the address space of a mutant, bytes
 OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
@@ -61,7 +61,7 @@ COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
 
 
 class Mutant(NamedTuple):
-    """A file of the copy, the text it becomes, the change in words, and the lines of the statement that is changed."""
+    """A file of the copy, its mutated text, a description of the change, and the lines of the changed statement."""
 
     path: Path
     text: str
@@ -70,7 +70,7 @@ class Mutant(NamedTuple):
 
 
 def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that can be changed, in functions alone and outside of what they raise, whose words few tests read."""
+    """Nodes that can be changed: in functions, outside of raised errors, whose wording few tests check."""
     for function in ast.walk(tree):
         if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
             stack: list[ast.AST] = list(function.body)
@@ -83,14 +83,14 @@ def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
                 stack += [child for child in ast.iter_child_nodes(node) if not (annotated and child is node.annotation)]
 
 
-def places(path: Path) -> list[tuple[Path, int]]:
-    """A file, once for each of its mutants, and the number of the node that is changed."""
+def mutation_sites(path: Path) -> list[tuple[Path, int]]:
+    """The file and the number of the changed node of each of its mutants."""
     nodes = list(_nodes(ast.parse(path.read_text(encoding="utf-8"))))
     return [(path, number) for number, node in enumerate(nodes) if _changed(node)]
 
 
 def mutant_of(path: Path, number: int) -> Mutant:
-    """The mutant of a file with this node changed."""
+    """The mutant of a file with the node of this number changed."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     node = list(_nodes(tree))[number]
     before, lines = ast.unparse(node), _lines_of_statement(tree, node)
@@ -100,7 +100,7 @@ def mutant_of(path: Path, number: int) -> Mutant:
 
 
 def _lines_of_statement(tree: ast.AST, node: ast.AST) -> range:
-    """Lines of the innermost statement around a node, without the statements within it."""
+    """Lines of the innermost statement around a node, without nested statements."""
     statements = [entry for entry in ast.walk(tree) if isinstance(entry, ast.stmt)]
     inner = [entry for entry in statements if any(each is node for each in ast.walk(entry))]
     statement = inner[-1]  # ast.walk goes from the outside inwards
@@ -109,7 +109,7 @@ def _lines_of_statement(tree: ast.AST, node: ast.AST) -> range:
 
 
 def _changed(node: ast.AST) -> bool:
-    """Change a node, if it is of a kind that is."""
+    """Change a node in place. Returns whether its kind can be changed."""
     if isinstance(node, (ast.BinOp, ast.AugAssign)) and type(node.op) in OPERATORS:
         node.op = OPERATORS[type(node.op)]()
     elif isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARISONS:
@@ -130,7 +130,7 @@ def _changed(node: ast.AST) -> bool:
 
 
 class Reach(NamedTuple):
-    """What the tests reach: (file, line) to tests or files of tests, and the seconds that each test took."""
+    """Tests or test files by the (file, line) that they run, and the seconds of each test."""
 
     by_line: dict[tuple[str, int], set[str]]
     seconds: dict[str, float]
@@ -163,8 +163,8 @@ class _Recorder:
         self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
 
 
-class _Clock:
-    """A plugin of pytest that ends the process when a test takes far longer than it should."""
+class _TimeLimit:
+    """A pytest plugin that ends the process when a test exceeds five times its seconds by ``SLACK``."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
         self.seconds = seconds
@@ -175,9 +175,9 @@ class _Clock:
         return (yield)
 
 
-def reach(tests: list[str]) -> Reach:
-    """Run the tests on the copy as it is, and note what each reaches."""
-    noted = Path("reach.pickle")
+def reach_of(tests: list[str]) -> Reach:
+    """Run the tests on the unchanged copy, and record the lines that each runs."""
+    pickled = Path("reach.pickle")
 
     def record() -> int:
         from coverage import Coverage
@@ -192,32 +192,32 @@ def reach(tests: list[str]) -> Reach:
             path = str(Path(file).relative_to(Path.cwd()))
             for line, contexts in data.contexts_by_lineno(file).items():
                 by_line[path, line] |= set(contexts) - {""}
-        noted.write_bytes(pickle.dumps((dict(by_line), recorder.seconds)))
+        pickled.write_bytes(pickle.dumps((dict(by_line), recorder.seconds)))
         return int(done)
 
-    if status := _in_a_fork(record):
-        said = OUTPUT.read_text(encoding="utf-8", errors="replace")[-3000:]
-        raise SystemExit(f"{said}\nthe tests fail on the code as it is, or under coverage (status {status})")
-    return Reach(*pickle.loads(noted.read_bytes()))
+    if status := _in_a_child_process(record):
+        output = OUTPUT.read_text(encoding="utf-8", errors="replace")[-3000:]
+        raise SystemExit(f"{output}\nthe tests fail on the code as it is, or under coverage (status {status})")
+    return Reach(*pickle.loads(pickled.read_bytes()))
 
 
-def survives(mutant: Mutant, tests: list[str], seconds: dict[str, float]) -> bool:
-    """Whether no test fails on the copy with the mutant in it; one that takes too long is seen too."""
+def is_missed(mutant: Mutant, tests: list[str], seconds: dict[str, float]) -> bool:
+    """Whether no test fails on the copy with the mutant; a test that exceeds its time limit counts as a failure."""
     own = mutant.path.read_text(encoding="utf-8")
 
     def run() -> int:
         signal.alarm(SLACK)
-        return int(pytest.main(["-x", *PYTEST, *tests], plugins=[_Clock(seconds)]))
+        return int(pytest.main(["-x", *PYTEST, *tests], plugins=[_TimeLimit(seconds)]))
 
     mutant.path.write_text(mutant.text, encoding="utf-8")
     try:
-        return _in_a_fork(run) == 0
+        return _in_a_child_process(run) == 0
     finally:
         mutant.path.write_text(own, encoding="utf-8")
 
 
-def _in_a_fork(task: Callable[[], int]) -> int:
-    """What a task returns in a process of its own, which finds torch loaded and the package of this folder not yet."""
+def _in_a_child_process(task: Callable[[], int]) -> int:
+    """The status of a task in a child process, which has torch loaded but imports the package from this folder."""
     child = os.fork()
     if child:
         _, status = os.waitpid(child, 0)
@@ -238,7 +238,7 @@ def _in_a_fork(task: Callable[[], int]) -> int:
         os._exit(status)
 
 
-def go_to_a_copy(package: Path) -> None:
+def copy_and_enter(package: Path) -> None:
     """Copy what the tests need, compiled by content: a file changed twice in a second is compiled again."""
     for name in ("mkc_torch", "tests", "pyproject.toml"):
         (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, package / name)
@@ -253,32 +253,32 @@ def go_to_a_copy(package: Path) -> None:
 
 
 def main() -> None:
-    """Print each survivor, and the share that was seen."""
+    """Print each undetected mutant, and the share of detected mutants."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("room", help="folder or file of mkc_torch")
-    parser.add_argument("tests", nargs="+", help="paths of the tests that should see a change")
-    parser.add_argument("-n", type=int, default=0, help="how many are drawn; 0 tries all")
+    parser.add_argument("tests", nargs="+", help="paths of the tests that should detect a change")
+    parser.add_argument("-n", type=int, default=0, help="number of mutants drawn; 0 tries all")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     left = 0
     with tempfile.TemporaryDirectory() as folder:
-        go_to_a_copy(Path(folder).resolve())
+        copy_and_enter(Path(folder).resolve())
         room = Path("mkc_torch", options.room)
         files = sorted(room.rglob("*.py")) if room.is_dir() else [room]
-        found = [place for file in files for place in places(file)]
+        found = [place for file in files for place in mutation_sites(file)]
         if options.n:
             found = random.Random(options.seed).sample(found, min(options.n, len(found)))
-        reached = reach(options.tests)
+        reached = reach_of(options.tests)
         for number, (path, node) in enumerate(found, start=1):
             mutant = mutant_of(path, node)
             tests = reached.tests_of(mutant)
-            if survives(mutant, tests or options.tests, reached.seconds):
+            if is_missed(mutant, tests or options.tests, reached.seconds):
                 left += 1
                 print(f"survives {len(tests)} tests: {mutant.change}", flush=True)
             if number % 10 == 0:
                 print(f"{number} of {len(found)} tried, {left} survive", flush=True)
         os.chdir(ROOT)
-    print(f"{len(found) - left} of {len(found)} were seen, {100 * (1 - left / max(len(found), 1)):.0f} %")
+    print(f"{len(found) - left} of {len(found)} were detected, {100 * (1 - left / max(len(found), 1)):.0f} %")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ MODULES = (
 
 
 def public_api() -> str:
-    """Every public name with its signature, one a line, the members of a class below it."""
+    """Every public name with its signature, a name a line, the members of a class below it."""
     package = griffe.load("mkc_torch", search_paths=[ROOT], resolve_aliases=True, resolve_external=False)
     lines: list[str] = []
     for module in MODULES:

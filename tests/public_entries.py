@@ -1,4 +1,4 @@
-"""Every public entry with arguments that fit, and ways to contaminate each of them."""
+"""Every public entry with valid arguments, and ways to contaminate each argument."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ INF, NAN = math.inf, math.nan
 
 @dataclass(frozen=True)
 class Entry:
-    """A public name, a call of it, and arguments with which it works.
+    """A public name, a call of it, and valid arguments.
 
     Attributes:
-        names: what is public of it, by module.
-        call: what is asked of it.
-        arguments: that fit; those of ``fixed`` stay as they are.
-        passes: arguments of which NaN goes through, by the docstring, or that the user's own function is given.
+        names: public names that the call covers, with their module.
+        call: takes the arguments and returns results.
+        arguments: valid arguments by name; those of ``fixed`` are not contaminated.
+        passes: arguments whose NaN is passed on to the result, by the docstring or by the user's own function.
     """
 
     names: tuple[str, ...]
@@ -282,7 +282,7 @@ def entries() -> Iterator[Entry]:
 
 
 def contaminated(value: Any) -> Iterator[tuple[str, Any]]:
-    """Ways in which a value does not fit: its name, and the value."""
+    """Invalid replacements of a value: a name, and the value."""
     yield "text", "contaminated"
     yield "object", object()
     if isinstance(value, Tensor):

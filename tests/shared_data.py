@@ -1,4 +1,4 @@
-"""Real recordings, published tables and kept cases, in a folder next to the project, and not part of it."""
+"""Real recordings, published tables and stored cases, in a folder next to the project."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ def shared_data(path: str) -> Path:
 
 
 def shared_case(path: str) -> Path:
-    """The same of the cases, each a recording with a simulation of it, whose right answer is known."""
+    """Like `shared_data`, for cases: recordings with a simulation whose missing physics is known."""
     return _there(CASES / path)
 
 
 def shared_real(path: str) -> Path:
-    """The same of the real recordings whose missing physics is known."""
+    """Like `shared_data`, for real recordings whose missing physics is known."""
     return _there(REAL / path)
 
 

@@ -1,4 +1,4 @@
-"""Processes that tests start and interrupt: however the suite itself was started, and none outlives its test."""
+"""Processes that tests start and interrupt; they receive interrupts in every environment and end with their test."""
 
 import os
 import signal
@@ -13,8 +13,8 @@ from typing import Any
 def started(*arguments: object, **options: Any) -> Iterator["subprocess.Popen[str]"]:
     """Run this Python with the arguments, in a process group of its own that ends with the block.
 
-    A process ignores the signals that its parent ignores, and a shell's background ignores interrupts; a handler of
-    Python is not inherited, so that the process hears them.
+    A process ignores the signals that its parent ignores, and a background shell ignores interrupts; a handler of
+    Python is not inherited, so that the process receives them.
     """
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -1,4 +1,4 @@
-"""Every bad input gets a message of whole sentences: no traceback, no NaN, and no file lost."""
+"""Every bad input gets a message of whole sentences, without a traceback, a NaN or a changed file."""
 
 import re
 
@@ -12,7 +12,7 @@ from tests.bad_inputs import HEAD, PAGE, bad_inputs, cell, rows
 
 
 @pytest.fixture(scope="module")
-def found():
+def inputs_and_messages():
     for reader in ("fmpy", "pyulog", "pymavlink", "mcap", "rosbags", "scipy", "h5py", "asammdf"):
         pytest.importorskip(reader)
     return list(rows())
@@ -29,14 +29,14 @@ def test_the_page_lists_every_input_under_its_heading():
     assert listed == [(bad.group, cell(bad.given)) for bad in bad_inputs()]
 
 
-def test_they_are_many_and_differ():
+def test_bad_inputs_are_many_and_differ():
     given = [(bad.group, bad.given) for bad in bad_inputs()]
     assert len(set(given)) == len(given) >= 80
 
 
 @pytest.mark.manual
-def test_each_message_is_a_sentence(found):
-    for bad, message in found:
+def test_each_message_is_a_sentence(inputs_and_messages):
+    for bad, message in inputs_and_messages:
         assert re.search(r"[.:][)\"`]*$|\.$", message), (bad.given, message)
         assert len(message) > 20, (bad.given, message)
         assert "Traceback" not in message
@@ -45,5 +45,5 @@ def test_each_message_is_a_sentence(found):
 
 
 @pytest.mark.manual
-def test_most_messages_differ(found):
-    assert len({message for _, message in found}) > 0.8 * len(found)
+def test_most_messages_differ(inputs_and_messages):
+    assert len({message for _, message in inputs_and_messages}) > 0.8 * len(inputs_and_messages)

@@ -1,4 +1,4 @@
-"""What the benchmarks measure with: their recordings, and curves that end in time."""
+"""The recordings of the benchmarks, and curves that end before their time limit."""
 
 import itertools
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The checks for devices run on the CPU, at tiny sizes, so that they still run where there is a GPU."""
+"""The device checks run on the CPU at tiny sizes, so that they also work on a GPU."""
 
 import sys
 

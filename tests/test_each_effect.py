@@ -1,4 +1,4 @@
-"""Recordings with one effect hidden that can be seen well, and what is counted as its name."""
+"""Recordings with a single hidden effect that is clearly detectable, and how its name is scored."""
 
 import json
 
@@ -37,7 +37,7 @@ def test_an_effect_that_no_system_hides_has_no_recordings():
     assert list(strong_cases("added_mass", 11, 3)) == []
 
 
-def test_its_name_is_right_and_another_is_not(case, tmp_path):
+def test_the_hidden_effect_is_right_and_another_is_wrong(case, tmp_path):
     for effect, right in (("gravity_sag", True), ("backlash", False)):
         check_score(tmp_path, case.key, effect)
         assert score_case(case.key, tmp_path) == (right, f"explained: {effect} at angle")
@@ -45,7 +45,7 @@ def test_its_name_is_right_and_another_is_not(case, tmp_path):
     assert score_case(case.key, tmp_path) == (False, "explained: no name")
 
 
-def test_the_table_counts_names_and_an_earlier_diagnosis_is_kept(case, tmp_path, monkeypatch, capsys):
+def test_the_table_counts_right_names_and_stored_diagnoses_are_not_repeated(case, tmp_path, monkeypatch, capsys):
     asked = []
 
     def diagnosed(paths, folder):

@@ -142,7 +142,7 @@ def test_normalizer_of_many_channels_equals_a_loop():
 
 
 @pytest.mark.parametrize("length", [0.3, 1.0, 8.0])
-def test_normalizer_of_infinite_sigma_is_that_of_the_truncated_gaussian(length):
+def test_normalizer_of_infinite_sigma_equals_that_of_the_truncated_gaussian(length):
     expected = math.log(0.5 * math.sqrt(2 * math.pi) * special.erf(length / math.sqrt(2)))
     assert log_normalizer(*double(INF, 0.5, 0.5 * length)).item() == pytest.approx(expected, abs=1e-12)
 
@@ -151,7 +151,7 @@ def test_normalizer_of_infinite_sigma_is_that_of_the_truncated_gaussian(length):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_energy_of_infinite_sigma_is_exactly_half_the_square(dtype):
+def test_energy_of_infinite_sigma_equals_half_the_square(dtype):
     z = torch.cat([torch.linspace(-9, 9, 61, dtype=dtype), torch.tensor([1e-15, 1e-3, 1e6, 1e15], dtype=dtype)])
     e = (2 * z).requires_grad_()
     sigma, d = torch.tensor(INF, dtype=dtype), torch.tensor(2.0, dtype=dtype, requires_grad=True)
@@ -322,14 +322,14 @@ each_function = pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNC
 
 @each_function
 @pytest.mark.parametrize("fast", [True, False])
-def test_gradcheck(function, fast):
+def test_functions_pass_gradcheck(function, fast):
     leaves = double(*AT, requires_grad=True)
     assert gradcheck(function, leaves, fast_mode=fast, check_forward_ad=True, check_batched_grad=not fast)
     assert gradgradcheck(function, leaves, fast_mode=fast)
 
 
 @pytest.mark.parametrize("fast", [True, False])
-def test_gradcheck_of_the_energy_at_and_near_kappa_zero(fast):
+def test_the_energy_passes_gradcheck_at_and_near_kappa_zero(fast):
     def shifted(z, offset):  # differences need room on both sides of kappa = 0.1, and near zero
         return energy(z, offset)
 
@@ -341,14 +341,14 @@ def test_gradcheck_of_the_energy_at_and_near_kappa_zero(fast):
     assert gradgradcheck(lambda z: energy(z, zero), (z,), fast_mode=fast)
 
 
-def test_gradcheck_where_sigma_is_infinite():
+def test_functions_pass_gradcheck_where_sigma_is_infinite():
     e, d, bound = double(AT[0], AT[2], AT[3], requires_grad=True)
     assert gradcheck(lambda e, d, bound: mkc_nll(e, INF, d, bound), (e, d, bound), check_forward_ad=True)
     assert gradgradcheck(lambda e, d, bound: mkc_nll(e, INF, d, bound), (e, d, bound))
 
 
 @pytest.mark.parametrize(("a", "b"), [((3,), ()), ((), (3,)), ((2, 1), (3,)), ((2, 3), (1, 1))])
-def test_gradcheck_of_broadcast_arguments(a, b):
+def test_functions_pass_gradcheck_with_broadcast_arguments(a, b):
     z = torch.linspace(-2.5, 3.0, math.prod(a), dtype=torch.float64).reshape(a).requires_grad_()
     kappa = torch.linspace(0.2, 1.5, math.prod(b), dtype=torch.float64).reshape(b).requires_grad_()
     assert gradcheck(energy, (z, kappa), check_forward_ad=True, check_batched_grad=True)
@@ -530,7 +530,7 @@ POINTWISE = [mkc_energy, mkc_weight]
 LIKELIHOOD = [lambda _, **p: log_normalizer(**p), mkc_nll]
 
 
-def called(function, **changed):
+def call_with(function, **changed):
     parameters = {"sigma": 2.0, "d": 1.0} | ({} if function in POINTWISE else {"bound": 5.0}) | changed
     return function(torch.tensor([0.5, 1.0]), **parameters)
 
@@ -543,31 +543,31 @@ def test_parameters_out_of_range_are_refused_by_name(function, name, bad, kind):
     if name == "bound" and function in POINTWISE:
         return
     with pytest.raises(ValueError, match=rf"`{name}`.*(positive and finite|in \[.*inf\])"):
-        called(function, **{name: kind(bad)})
+        call_with(function, **{name: kind(bad)})
 
 
 @pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
 def test_an_infinite_scale_or_domain_is_refused_and_an_infinite_bandwidth_is_the_gaussian(function):
-    assert bool(called(function, sigma=INF).isfinite().all())
+    assert bool(call_with(function, sigma=INF).isfinite().all())
     for name in ("d", "bound"):
         if name == "d" or function not in POINTWISE:
             with pytest.raises(ValueError, match=rf"`{name}`.*positive and finite.*got inf"):
-                called(function, **{name: INF})
+                call_with(function, **{name: INF})
 
 
 def test_the_normaliser_accepts_the_rounded_smallest_sigma():
     for function in LIKELIHOOD:
-        called(function, sigma=torch.tensor(KAPPA_MAX).rsqrt() * (1 - 1e-6))
+        call_with(function, sigma=torch.tensor(KAPPA_MAX).rsqrt() * (1 - 1e-6))
         with pytest.raises(ValueError, match=r"`sigma`.*\[0\.05, inf\].*got 0\.04"):
-            called(function, sigma=0.04)
-    assert called(mkc_energy, sigma=0.001).tolist() == pytest.approx([1e-6, 1e-6])
+            call_with(function, sigma=0.04)
+    assert call_with(mkc_energy, sigma=0.001).tolist() == pytest.approx([1e-6, 1e-6])
 
 
 @pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
 def test_parameters_are_not_checked_under_vmap(function):
     sigma = torch.tensor([[2.0, -2.0], [1.0, 3.0]])
-    found = vmap(lambda s: called(function, sigma=s))(sigma)
-    torch.testing.assert_close(found, torch.stack([called(function, sigma=s.abs()) for s in sigma]))
+    found = vmap(lambda s: call_with(function, sigma=s))(sigma)
+    torch.testing.assert_close(found, torch.stack([call_with(function, sigma=s.abs()) for s in sigma]))
 
 
 @pytest.mark.e2e
@@ -586,7 +586,7 @@ def test_compiled_code_checks_parameters_that_are_numbers():
 def test_parameters_that_are_not_numbers_are_refused_by_name(function):
     for value in ("2", None, 2j):
         with pytest.raises(TypeError, match=r"`sigma`.*number"):
-            called(function, sigma=value)
+            call_with(function, sigma=value)
 
 
 def test_errors_and_arguments_of_the_primitives_must_be_tensors():

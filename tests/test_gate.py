@@ -1,4 +1,4 @@
-"""The gate for changes of the verdict: its judgements and comparisons, on diagnoses made up for it."""
+"""The gate for changes of the verdict: its judgements and comparisons, on invented diagnoses."""
 
 import json
 import sys
@@ -53,7 +53,7 @@ def drag(value=9.3e-5, error=1e-6, **more):
     return finding("quadratic_drag", drag=(value, error), **more)
 
 
-def test_a_right_answer_is_right_and_each_fault_of_a_wrong_one_is_named():
+def test_right_answers_are_right_and_each_fault_of_a_wrong_answer_is_reported():
     right = judged(row(drag(), after={"altitude": 2.3}), REAL[ROCKET])
     assert right == {"right": True, "wrong": []}
     wrong = judged(row(drag(5e-5), after={"altitude": 17.0}), REAL[ROCKET])["wrong"]
@@ -72,7 +72,7 @@ def test_a_residual_that_is_unknown_is_not_small_enough():
     ]
 
 
-def test_stribeck_friction_may_be_an_alternative_and_no_claim():
+def test_stribeck_friction_is_right_as_an_alternative_and_wrong_as_a_claim():
     after = {"angle": 0.0061}
     assert judged(row(finding("coulomb_friction", alternatives=["stribeck_friction"]), after=after), REAL[PENDULUM])[
         "right"
@@ -88,7 +88,7 @@ def test_drag_under_coloured_noise_counts_by_its_standard_error(name):
     assert not judged(row(drag(9.0e-5, None)), CASES[name])["right"]
 
 
-def test_other_effects_that_are_needed_too():
+def test_every_required_effect_must_be_claimed():
     found, after, servo = (
         [finding(name) for name in ("backlash", "delay", "offset")],
         {"pan": 0.0025},
@@ -115,7 +115,7 @@ def test_another_effect_claimed_first_is_wrong():
     assert result == ["constant_force is claimed first"]
 
 
-def test_air_drag_that_would_explain_is_right_and_silence_is_wrong():
+def test_air_drag_reported_as_possible_is_right_and_no_report_is_wrong():
     coast = CASES["cases coastdown runs Coast"]
     stated = "quadratic_drag would explain what is left best, but noise makes as much of it by chance."
     assert judged(row(verdict="adequate", sentences=[stated]), coast)["right"]
@@ -134,7 +134,7 @@ def test_air_drag_that_would_explain_is_right_and_silence_is_wrong():
         ("cases ball_beam run Ball", "unfit"),
     ],
 )
-def test_where_nothing_is_to_be_named_the_verdict_decides(name, verdict):
+def test_without_hidden_effects_the_verdict_decides(name, verdict):
     for stated in ("adequate", "unexplained", "unfit", "explained"):
         assert judged(row(verdict=stated), CASES[name])["right"] == (stated == verdict)
     assert not judged(row(finding("input_delay"), verdict=verdict), CASES[name])["right"]

@@ -1,4 +1,4 @@
-"""The vocabulary is the field's: words of a private dialect are rejected; `docs/glossary.md` has the terms in use."""
+"""Texts use the vocabulary of the field: private words are rejected; `docs/glossary.md` has the terms in use."""
 
 import re
 from functools import cache
@@ -15,7 +15,7 @@ OWN = {WORDS, Path(__file__).resolve()}
 
 
 def rules():
-    """The patterns, each with what its matches may be a part of."""
+    """The rejected patterns, each with the pattern of its exceptions."""
     found = []
     for line in WORDS.read_text(encoding="utf-8").splitlines():
         if line.startswith("  except "):
@@ -28,7 +28,7 @@ def rules():
 
 @cache
 def texts():
-    """Path to lines, of every text that a reader may see."""
+    """The lines of every text that a reader may see, by path."""
     paths = [ROOT / "README.md", *(ROOT / ".github").rglob("*"), ROOT / "CITATION.cff"]
     paths += [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
     kept = [path for path in paths if path.suffix in KINDS and path not in OWN and path.is_file()]
@@ -36,7 +36,7 @@ def texts():
 
 
 @pytest.mark.parametrize(("pattern", "allowed"), rules(), ids=lambda value: getattr(value, "pattern", "")[18:40])
-def test_no_word_of_the_dialect_is_used(pattern, allowed):
+def test_no_rejected_word_is_used(pattern, allowed):
     found = []
     for path, lines in texts().items():
         for number, line in enumerate(lines, start=1):

@@ -22,7 +22,7 @@ from mkc_torch.metrics import MKCNegativeLogLikelihood
 NAN = math.nan
 
 
-def made(**options):
+def make_loss(**options):
     settings = {"sigma": [0.7, 3.0], "d": [0.5, 1.0], "bound": [9.0, 40.0]}
     return MKCLoss(2, **{k: torch.tensor(v, dtype=torch.float64) for k, v in settings.items()}, **options)
 
@@ -38,7 +38,7 @@ def nll(loss, x, y):
 
 @pytest.mark.parametrize("options", [{}, {"learn_sigma": False, "learn_d": False, "reduction": "sum"}])
 def test_metric_is_the_mean_nll_over_elements_and_per_channel(options):
-    loss = made(**options)
+    loss = make_loss(**options)
     x, y = data(50, 2)
     whole, channels = MKCNegativeLogLikelihood(loss), MKCNegativeLogLikelihood(loss, per_channel=True)
     whole.update(x, y)
@@ -59,7 +59,7 @@ def test_metric_equals_the_learned_loss_in_float32():
 
 @pytest.mark.parametrize("cut", [1, 13, 25])
 def test_the_mean_does_not_depend_on_the_batches(cut):
-    loss, (x, y) = made(), data(50, 2)
+    loss, (x, y) = make_loss(), data(50, 2)
     weight = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     whole, parts = MKCNegativeLogLikelihood(loss, per_channel=True), MKCNegativeLogLikelihood(loss, per_channel=True)
     whole.update(x, y, weight)
@@ -71,7 +71,7 @@ def test_the_mean_does_not_depend_on_the_batches(cut):
 
 
 def test_summed_states_of_ranks_equal_the_whole():
-    loss, (x, y) = made(), data(50, 2)
+    loss, (x, y) = make_loss(), data(50, 2)
     whole, *ranks = (MKCNegativeLogLikelihood(loss) for _ in range(3))
     whole.update(x, y)
     ranks[0].update(x[:20], y[:20])
@@ -88,7 +88,7 @@ def test_summed_states_of_ranks_equal_the_whole():
 
 
 def test_forward_returns_the_batch_value_and_adds_it_and_reset_clears():
-    loss, (x, y) = made(), data(50, 2)
+    loss, (x, y) = make_loss(), data(50, 2)
     metric = MKCNegativeLogLikelihood(loss)
     first = metric(x[:10], y[:10])
     second = metric(x[10:], y[10:])
@@ -101,7 +101,7 @@ def test_forward_returns_the_batch_value_and_adds_it_and_reset_clears():
 
 
 def test_masked_elements_are_ignored_even_if_nan():
-    loss, (x, y) = made(channel_dim=1), data(6, 2, 4)
+    loss, (x, y) = make_loss(channel_dim=1), data(6, 2, 4)
     mask = torch.ones(6, 4, dtype=torch.bool)
     mask[2, 3] = mask[5, 0] = False
     metric = MKCNegativeLogLikelihood(loss)
@@ -114,14 +114,14 @@ def test_masked_elements_are_ignored_even_if_nan():
 
 
 def test_without_counted_elements_the_metric_is_nan():
-    metric = MKCNegativeLogLikelihood(made(), per_channel=True)
+    metric = MKCNegativeLogLikelihood(make_loss(), per_channel=True)
     weight = torch.tensor([[1.0, 0.0]] * 4)
     metric.update(*data(4, 2), weight)
     assert metric.compute().isnan().tolist() == [False, True]
 
 
 def test_sigma_and_d_are_read_at_each_update():
-    loss, (x, y) = made(), data(8, 2)
+    loss, (x, y) = make_loss(), data(8, 2)
     metric = MKCNegativeLogLikelihood(loss)
     metric.update(x, y)
     before = nll(loss, x, y).mean()
@@ -140,7 +140,7 @@ def test_millions_of_small_batches_lose_no_digits():
 
 
 def test_the_metric_has_no_parameters_and_its_clones_refer_to_the_loss():
-    loss, (x, y) = made(), data(8, 2)
+    loss, (x, y) = make_loss(), data(8, 2)
     metric = MKCNegativeLogLikelihood(loss)
     assert list(metric.parameters()) == []
     assert dict(metric.state_dict()) == {}
@@ -153,7 +153,7 @@ def test_the_metric_has_no_parameters_and_its_clones_refer_to_the_loss():
 
 def test_a_metric_copied_with_its_loss_refers_to_the_copy():
     module = nn.Module()
-    module.criterion = made()
+    module.criterion = make_loss()
     module.nll = MKCNegativeLogLikelihood(module.criterion)
     for twin in (copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
         assert twin.nll.loss is twin.criterion
@@ -164,7 +164,7 @@ def test_a_metric_copied_with_its_loss_refers_to_the_copy():
 def test_another_loss_and_bad_batches_are_refused():
     with pytest.raises(TypeError, match=r"`loss`.*MKCLoss.*got MSELoss"):
         MKCNegativeLogLikelihood(nn.MSELoss())
-    metric = MKCNegativeLogLikelihood(made())
+    metric = MKCNegativeLogLikelihood(make_loss())
     with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 1))
     with pytest.raises(TypeError, match=r"`target`.*floating-point"):
@@ -180,7 +180,7 @@ def test_another_loss_and_bad_batches_are_refused():
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_a_compiled_loss_is_accepted():
-    loss = made()
+    loss = make_loss()
     assert MKCNegativeLogLikelihood(torch.compile(loss)).loss is loss
 
 

@@ -1,4 +1,4 @@
-"""Empty recordings of each kind of noise are what their names say, and their p-values are counted as they should be."""
+"""Empty recordings have the noise of their kind, and the table of their p-values equals SciPy's."""
 
 import json
 
@@ -13,13 +13,13 @@ from tests.gate import null_p_values, null_recordings
 from tests.gate.null_recordings import KINDS, NOISE, SAMPLES, STEP, Spring, recording
 
 
-def courses(kind, part, count=300):
-    """(T, count) of what the sensor adds (0), or the process noise (1)."""
+def ensemble(kind, part, count=300):
+    """(T, count) sensor errors (part 0) or process noise (part 1)."""
     return np.stack([KINDS[kind][part](np.random.default_rng([7, k])) for k in range(count)], -1)
 
 
-def alike(values, lag):
-    """Correlation of a stationary course with itself so many samples later, over an ensemble."""
+def autocorrelation(values, lag):
+    """Autocorrelation of stationary series at a lag in samples, over an ensemble."""
     return (values[lag:] * values[:-lag]).mean() / values.var()
 
 
@@ -30,51 +30,51 @@ def test_the_same_seed_gives_the_same_recording_and_each_kind_has_its_own():
     assert len({float(recording(kind, 3)["place"][5]) for kind in KINDS}) == len(KINDS)
 
 
-def test_what_the_sensor_adds_is_of_its_kind():
-    white, slow, ar = (courses(kind, 0) for kind in ("white", "slow sensor error", "autoregressive sensor"))
+def test_sensor_errors_have_the_correlation_of_their_kind():
+    white, slow, ar = (ensemble(kind, 0) for kind in ("white", "slow sensor error", "autoregressive sensor"))
     assert white.std() == pytest.approx(NOISE, rel=0.03)
-    assert abs(alike(white, 1)) < 0.03
-    assert alike(ar, 1) == pytest.approx(null_recordings.AR, abs=0.03)
-    assert alike(ar, 3) == pytest.approx(null_recordings.AR**3, abs=0.05)
+    assert abs(autocorrelation(white, 1)) < 0.03
+    assert autocorrelation(ar, 1) == pytest.approx(null_recordings.AR, abs=0.03)
+    assert autocorrelation(ar, 3) == pytest.approx(null_recordings.AR**3, abs=0.05)
     share = null_recordings.SLOW_SIZE**2 / (null_recordings.SLOW_SIZE**2 + NOISE**2)
     samples = null_recordings.SLOW_SHARE * SAMPLES
-    assert alike(slow, 5) == pytest.approx(share * np.exp(-5.0 / samples), abs=0.05)
+    assert autocorrelation(slow, 5) == pytest.approx(share * np.exp(-5.0 / samples), abs=0.05)
 
 
 def test_disturbances_are_white_or_correlated():
-    white, lasting = (courses(kind, 1) for kind in ("process noise, white", "process noise, lasting"))
-    assert abs(alike(white, 1)) < 0.03
+    white, lasting = (ensemble(kind, 1) for kind in ("process noise, white", "process noise, lasting"))
+    assert abs(autocorrelation(white, 1)) < 0.03
     samples = null_recordings.LASTING_SHARE * SAMPLES
-    assert alike(lasting, 40) == pytest.approx(np.exp(-40.0 / samples), abs=0.1)
-    assert not courses("white", 1, 2).any()
+    assert autocorrelation(lasting, 40) == pytest.approx(np.exp(-40.0 / samples), abs=0.1)
+    assert not ensemble("white", 1, 2).any()
 
 
-def moved(held, force, disturbance=None):
+def simulated_place(held, force, disturbance=None):
     disturbance = np.zeros(SAMPLES) if disturbance is None else disturbance
-    return null_recordings._moved(force, disturbance, held, np.array([0.2, -0.1]))
+    return null_recordings._simulated_place(force, disturbance, held, np.array([0.2, -0.1]))
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_the_true_course_is_that_of_scipy(held):
+def test_the_simulated_place_equals_scipy(held):
     from scipy.signal import StateSpace, lsim
 
     random = np.random.default_rng(1)
     force, time = random.standard_normal(SAMPLES), STEP * np.arange(SAMPLES)
     system = StateSpace([[0.0, 1.0], [-4.0, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
     _, expected, _ = lsim(system, force, time, X0=[0.2, -0.1], interp=not held)
-    np.testing.assert_allclose(moved(held, force), expected, atol=0.01 * NOISE)
+    np.testing.assert_allclose(simulated_place(held, force), expected, atol=0.01 * NOISE)
 
 
 def test_a_disturbance_exceeds_the_measurement_noise():
     force = np.zeros(SAMPLES)
     for kind in ("process noise, white", "process noise, lasting"):
         disturbance = KINDS[kind][1](np.random.default_rng(2))
-        assert (moved(False, force, disturbance) - moved(False, force)).std() > 2.0 * NOISE
+        assert (simulated_place(False, force, disturbance) - simulated_place(False, force)).std() > 2.0 * NOISE
 
 
-def test_numbers_are_those_of_scipy():
+def test_interval_and_distance_equal_scipy():
     values = np.random.default_rng(3).uniform(size=60).tolist()
-    found = null_p_values.numbers(values)
+    found = null_p_values.summary_row(values)
     below = sum(value <= 0.05 for value in values)
     interval = stats.binomtest(below, 60).proportion_ci(method="exact")
     assert (found["below"], found["recordings"]) == (below / 60, 60)
@@ -114,8 +114,8 @@ def test_the_command_writes_table_picture_and_p_values_and_goes_on(tmp_path, mon
 
 
 @pytest.mark.e2e
-def test_the_p_value_is_that_of_a_diagnosis_that_keeps_what_it_finds():
-    """The table is then valid for `mkc diagnose`."""
+def test_the_p_value_equals_that_of_a_diagnosis_that_keeps_its_findings():
+    """The table is therefore valid for `mkc diagnose`."""
     from mkc_torch import diagnose
 
     empty = recording("white", 5)

@@ -1,4 +1,4 @@
-"""Every public entry with each of its arguments contaminated in each way: a clear refusal, or an answer without NaN."""
+"""Every public entry, with each argument contaminated in each way, raises a clear error or returns no NaN."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def tensors(value: Any) -> Iterator[Tensor]:
             yield from tensors(item)
 
 
-def outcome(entry: Entry, argument: str, value: Any) -> str:
-    """What is wrong with a call that has one argument replaced: an error that is too short, or a NaN; else empty."""
+def fault_of(entry: Entry, argument: str, value: Any) -> str:
+    """The fault of a call with one argument replaced: an unclear error, or a NaN; empty if there is no fault."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # our own, of a tail beyond the bound and the like
@@ -68,38 +68,38 @@ def outcome(entry: Entry, argument: str, value: Any) -> str:
     except (ValueError, TypeError, NoFitError) as error:
         return "" if len(str(error)) >= 30 else f"{error!r} is too short"
     except Exception as error:
-        return f"{error!r} is none of ours"
+        return f"{error!r} is not an error of the package"
     return "NaN" if any(tensor.isnan().any() for tensor in tensors(answer)) else ""
 
 
-def wrong(name: str, argument: str) -> dict[str, str]:
+def faults_by_contamination(name: str, argument: str) -> dict[str, str]:
     entry = ENTRIES[name]
-    outcomes = {way: outcome(entry, argument, value) for way, value in contaminated(entry.arguments[argument])}
+    outcomes = {way: fault_of(entry, argument, value) for way, value in contaminated(entry.arguments[argument])}
     return {way: fault for way, fault in outcomes.items() if fault}
 
 
 @pytest.mark.parametrize(("name", "argument"), [case for case in CASES if not case[0].startswith(SLOW)])
 def test_a_contaminated_argument_is_refused_or_gives_numbers(name, argument):
-    assert wrong(name, argument) == {}
+    assert faults_by_contamination(name, argument) == {}
 
 
 @pytest.mark.e2e
 @settings(max_examples=25, deadline=None)
 @given(st.data())
-def test_so_of_those_that_take_long(data):
+def test_a_contaminated_argument_of_a_slow_entry_is_refused_or_gives_numbers(data):
     name, argument = data.draw(st.sampled_from([case for case in CASES if case[0].startswith(SLOW)]))
     entry = ENTRIES[name]
-    assert outcome(entry, argument, data.draw(st.sampled_from(list(contaminated(entry.arguments[argument]))))[1]) == ""
+    assert fault_of(entry, argument, data.draw(st.sampled_from(list(contaminated(entry.arguments[argument]))))[1]) == ""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "argument"), [case for case in CASES if case[0].startswith(SLOW)])
-def test_so_of_all_of_them(name, argument):
-    assert wrong(name, argument) == {}
+def test_every_contaminated_argument_of_a_slow_entry_is_refused_or_gives_numbers(name, argument):
+    assert faults_by_contamination(name, argument) == {}
 
 
 @pytest.mark.parametrize("name", [name for name in ENTRIES if name != "diagnosis.diagnose"])
-def test_arguments_that_fit_are_answered(name):
+def test_valid_arguments_give_results_without_nan(name):
     assert not any(tensor.isnan().any() for tensor in tensors(ENTRIES[name].call(**ENTRIES[name].arguments)))
 
 

@@ -1,4 +1,4 @@
-"""The house: rooms import only downwards, no file is too long to read, and the face shows public names alone."""
+"""Architecture: packages import from lower layers only, no file is too long, the top package exports public names."""
 
 import ast
 import re
@@ -12,7 +12,7 @@ import mkc_torch
 ROOT = Path(mkc_torch.__file__).parent
 MOST_LINES = 450
 
-FLOORS = (
+LAYERS = (
     {"_parallel", "_support"},
     {"density", "recording"},
     {"functional"},
@@ -25,7 +25,7 @@ FLOORS = (
     {"report"},
     {"cli"},
 )
-"""Rooms from the ground up; a room imports from floors below it alone."""
+"""Packages by layer, lowest first; a package imports from lower layers only."""
 
 
 def module_of(path):
@@ -38,7 +38,7 @@ PACKAGES = sorted(name for name, path in MODULES.items() if path.name == "__init
 
 
 def imported(path):
-    """The modules of the package that a file imports anywhere in it, in functions and for types too."""
+    """Modules that a file imports anywhere, also in functions and for type checking."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path} imports relatively"
@@ -54,8 +54,8 @@ def imports():
     return {name: {module for module in imported(path) if module in MODULES} - {name} for name, path in MODULES.items()}
 
 
-def circle(graph):
-    """Nodes that reach one another, empty if there are none."""
+def nodes_in_cycles(graph):
+    """Nodes that are part of a cycle."""
     reach = {node: set(ends) for node, ends in graph.items()}
     grown = True
     while grown:
@@ -67,8 +67,8 @@ def circle(graph):
     return sorted(node for node, ends in reach.items() if node in ends)
 
 
-def between_children(package):
-    """Which of the files and folders of a package import which others of them."""
+def imports_between_children(package):
+    """The import graph of the files and folders of a package."""
     graph = defaultdict(set)
     for name, ends in imports().items():
         if name.startswith(f"{package}."):
@@ -78,24 +78,26 @@ def between_children(package):
     return graph
 
 
-def test_no_file_imports_in_a_circle():
-    assert circle(imports()) == []
+def test_no_file_has_circular_imports():
+    assert nodes_in_cycles(imports()) == []
 
 
-def test_neither_files_nor_folders_of_a_room_import_in_a_circle():
-    assert {package: found for package in PACKAGES if (found := circle(between_children(package)))} == {}
+def test_files_and_folders_of_a_package_have_no_circular_imports():
+    assert {
+        package: found for package in PACKAGES if (found := nodes_in_cycles(imports_between_children(package)))
+    } == {}
 
 
-def test_every_room_has_its_floor():
+def test_every_package_has_a_layer():
     rooms = {
         path.stem for path in ROOT.iterdir() if (path.is_dir() and list(path.glob("*.py"))) or path.suffix == ".py"
     }
-    assert rooms - {"__init__"} == set().union(*FLOORS)
+    assert rooms - {"__init__"} == set().union(*LAYERS)
 
 
-def test_rooms_import_only_downwards():
-    graph, below = between_children("mkc_torch"), set()
-    for floor in FLOORS:
+def test_packages_import_only_from_lower_layers():
+    graph, below = imports_between_children("mkc_torch"), set()
+    for floor in LAYERS:
         for room in floor:
             assert graph[room] <= below, room
         below |= floor
@@ -111,7 +113,7 @@ def test_no_file_is_too_long():
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
-def test_the_face_shows_public_names_alone():
+def test_the_top_package_exports_public_names_alone():
     shown = dir(mkc_torch)
     assert not [name for name in shown if name.startswith("_")]
     rooms = {name.split(".")[1] for name in MODULES if name.count(".") == 1}
@@ -124,13 +126,13 @@ def test_every_package_has_a_docstring():
         assert ast.get_docstring(ast.parse(MODULES[name].read_text(encoding="utf-8"))), name
 
 
-def test_every_public_name_of_a_room_is_there():
+def test_every_exported_name_exists():
     for name in PACKAGES:
         module = __import__(name, fromlist=["__all__"])
         assert [item for item in getattr(module, "__all__", ()) if not hasattr(sys.modules[name], item)] == []
 
 
-def test_the_page_on_architecture_names_what_is_there():
+def test_the_architecture_page_names_existing_files_and_every_package():
     text = (ROOT.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:[a-z_]+/)*[a-z_]+(?:/|\.py))`", text))
     there = {
@@ -144,4 +146,4 @@ def test_the_page_on_architecture_names_what_is_there():
         ]
     }
     assert {name for name in named if not any(path.endswith(f"/{name}") for path in there)} == set()
-    assert {f"{floor}/" for floors in FLOORS for floor in floors if (ROOT / floor).is_dir()} <= named
+    assert {f"{floor}/" for floors in LAYERS for floor in floors if (ROOT / floor).is_dir()} <= named

@@ -18,5 +18,5 @@ def skip_without_interpreter() -> None:
 
 
 def _release(package: ModuleType) -> tuple[int, ...]:
-    """The first two numbers of a package's version."""
+    """Major and minor version of a package."""
     return tuple(int(number) for number in str(package.__version__).split(".")[:2])

@@ -51,7 +51,7 @@ def run(*command: object, **options: object) -> int:
 
 
 def use(place: Path, wheel: Path, wanted: str) -> int:
-    """Install the wheel in an empty environment, and run the script there; returns the status."""
+    """Install the wheel in an empty environment, run the script there, and return its status."""
     venv.create(place, with_pip=True)
     python = place / "bin" / "python"
     installed = run(python, "-m", "pip", "install", "-q", wanted, wheel)

@@ -13,13 +13,13 @@ try:
 except ImportError as error:
     raise ImportError('The outlier map is drawn with matplotlib; `pip install "mkc-torch[cli]"` has it.') from error
 
-from mkc_torch.covariance._picture_labels import Box, free_place, ranges, together
+from mkc_torch.covariance._picture_labels import Box, free_place, linked_groups, ranges
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 # Okabe and Ito's colours, distinguishable with any colour vision, and marker shapes; in the order of SampleKind
-_LOOK = (
+_STYLES = (
     ("regular", "#8A8A8A", "o"),
     ("vertical outlier", "#0072B2", "^"),
     ("good leverage point", "#009E73", "s"),
@@ -30,7 +30,7 @@ _LETTERS = 8.0
 """Size of a label, in points."""
 
 
-class Places(NamedTuple):
+class PlotCoordinates(NamedTuple):
     """Coordinates of the samples of a problem: x the distances, y the residuals."""
 
     x: Float[Tensor, N]
@@ -40,12 +40,12 @@ class Places(NamedTuple):
     y_cutoff: float
 
 
-def draw(places: Places, ax: Any, labels: int) -> Any:
+def draw(places: PlotCoordinates, ax: Any, labels: int) -> Any:
     """Draw the map of a problem into axes, or a new figure for None, and return the axes."""
     if ax is None:
         _, ax = pyplot.subplots(figsize=(7.0, 4.5), layout="constrained")
     x, y, kinds = places.x, places.y, places.kind
-    for kind, (name, colour, marker) in enumerate(_LOOK):
+    for kind, (name, colour, marker) in enumerate(_STYLES):
         mine = kinds == kind
         text = f"{int(mine.sum())} {name}{'s' if kind and int(mine.sum()) != 1 else ''}"
         ax.scatter(x[mine].numpy(), y[mine].numpy(), s=20, c=colour, marker=marker, linewidths=0, zorder=3, label=text)
@@ -66,7 +66,7 @@ def draw(places: Places, ax: Any, labels: int) -> Any:
     return ax
 
 
-def _limit(places: Places, ax: Any) -> None:
+def _limit(places: PlotCoordinates, ax: Any) -> None:
     """Set limits that leave room for labels, whatever the cutoffs are."""
     x, y = places.x, places.y
     ax.set_xlim(0.0, 1.1 * max(float(x.max()), 1.4 * places.x_cutoff))
@@ -75,7 +75,7 @@ def _limit(places: Places, ax: Any) -> None:
     ax.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low))
 
 
-def _tint(places: Places, ax: Any) -> None:
+def _tint(places: PlotCoordinates, ax: Any) -> None:
     """Fill each region with a shade of the colour of its points, and draw the cutoffs as lines."""
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     c, r = places.x_cutoff, places.y_cutoff
@@ -86,14 +86,14 @@ def _tint(places: Places, ax: Any) -> None:
         (3, (c, right), (r, high)),
         (3, (c, right), (low, -r)),
     ):
-        ax.fill_between(across, *up, color=_LOOK[kind][1], alpha=0.07, linewidth=0, zorder=0)
+        ax.fill_between(across, *up, color=_STYLES[kind][1], alpha=0.07, linewidth=0, zorder=0)
     style = {"color": _LINE, "linewidth": 0.8, "linestyle": (0, (5, 3)), "zorder": 1}
     ax.axvline(c, **style)
     ax.axhline(-r, **style)
     ax.axhline(r, **style)
 
 
-def _label(places: Places, ax: Any, labels: int) -> None:
+def _label(places: PlotCoordinates, ax: Any, labels: int) -> None:
     """Write the indices of the outermost samples where there is room; neighbouring samples share a label."""
     x, y = places.x, places.y
     far, large = x / places.x_cutoff, y.abs() / places.y_cutoff
@@ -104,7 +104,7 @@ def _label(places: Places, ax: Any, labels: int) -> None:
     page = ax.transData.transform(torch.stack([x, y], -1).numpy()) * 72.0 / ax.figure.dpi
     # relative to the largest in each direction, so that neither scale dominates
     rank = torch.maximum(far / far.max(), large / large.max())
-    groups = together(page, outer[rank[outer].argsort(descending=True)].tolist())
+    groups = linked_groups(page, outer[rank[outer].argsort(descending=True)].tolist())
     taken = [Box.around(place, 3.0) for place in page[outer.numpy()]]
     for group in groups[:labels]:
         text = ranges(group)

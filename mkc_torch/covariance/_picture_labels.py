@@ -32,11 +32,11 @@ class Box(NamedTuple):
     def middle(self) -> tuple[float, float]:
         return 0.5 * (self.left + self.right), 0.5 * (self.low + self.high)
 
-    def meets(self, other: Box) -> bool:
+    def overlaps(self, other: Box) -> bool:
         return self.left < other.right and other.left < self.right and self.low < other.high and other.low < self.high
 
 
-def together(page: np.ndarray, order: Sequence[int]) -> list[list[int]]:
+def linked_groups(page: np.ndarray, order: Sequence[int]) -> list[list[int]]:
     """Groups of points connected by short distances (single linkage), in the order of their first point.
 
     Args:
@@ -86,6 +86,6 @@ def free_place(group: np.ndarray, text: str, size: float, taken: Sequence[Box]) 
         (left - gap - half_width, middle_y),
     ):
         box = Box.around(middle, half_width, half_height)
-        if not any(box.meets(other) for other in taken):
+        if not any(box.overlaps(other) for other in taken):
             return box
     return None

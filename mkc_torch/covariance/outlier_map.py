@@ -75,7 +75,7 @@ class OutlierMap:
             ValueError: the map is of a batch of problems.
         """
         # matplotlib is an optional dependency
-        from mkc_torch.covariance._outlier_picture import Places, draw
+        from mkc_torch.covariance._outlier_picture import PlotCoordinates, draw
 
         if self.residuals.dim() != 1:
             raise ValueError(
@@ -83,7 +83,7 @@ class OutlierMap:
                 "make a map from each problem's fit and data."
             )
         x, y = (values.detach().cpu().double() for values in (self.distances, self.residuals))
-        return draw(Places(x, y, self.kind.cpu(), self.distance_cutoff, self.residual_cutoff), ax, labels)
+        return draw(PlotCoordinates(x, y, self.kind.cpu(), self.distance_cutoff, self.residual_cutoff), ax, labels)
 
 
 def outlier_map(

@@ -59,7 +59,7 @@ class Channel:
     value: float
 
 
-Derived = tuple[float, float, float, float, float, float]
+DerivativeValues = tuple[float, float, float, float, float, float]
 """Value, derivatives by κ and by log d, and second derivatives: by κ twice, by both, by log d twice."""
 
 
@@ -111,7 +111,7 @@ def _energy_terms(q: ndarray, kappa: float) -> tuple[ndarray, ndarray, ndarray, 
     return w, e, first, second
 
 
-def _energy(error: ndarray, weight: ndarray | None, at: Channel) -> Derived:
+def _energy(error: ndarray, weight: ndarray | None, at: Channel) -> DerivativeValues:
     z = error * math.exp(-at.log_d)
     q = 0.5 * (z * z)
     w, e, first, second = _energy_terms(q, at.kappa)
@@ -146,7 +146,7 @@ def _log_partition(kappa: float, log_length: float) -> float:
     return math.log(_integral(np.exp(-_energy_at(0.5 * nodes * nodes, kappa)), tail, length, weights))
 
 
-def _normaliser(at: Channel) -> Derived:
+def _normaliser(at: Channel) -> DerivativeValues:
     """Derivatives of log(d Z); as :func:`mkc_torch.density.likelihood.normaliser_derivatives`."""
     kappa, length = at.kappa, math.exp(at.log_bound - at.log_d)
     nodes, weights, tail = _head(kappa, length)

@@ -30,14 +30,14 @@ class ElementEnergy(NamedTuple):
     by_kappa: Any
 
 
-def element_energy(xp: Any, z: Any, kappa: Any, *, wants_kappa: bool, has_gaussian: bool = True) -> ElementEnergy:
+def element_energy(xp: Any, z: Any, kappa: Any, *, with_kappa: bool, has_gaussian: bool = True) -> ElementEnergy:
     """``energy(z, kappa)`` with its first derivatives.
 
     Args:
         xp: ``numpy`` or ``torch``, the library of the other arrays.
         z: standardised errors.
         kappa: ``1 / sigma² >= 0``, broadcast.
-        wants_kappa: whether the derivative by kappa is needed; else it is None.
+        with_kappa: whether to compute the derivative by kappa; else it is None.
         has_gaussian: whether any kappa may be 0.
     """
     minus_x = (z * (-0.5 * kappa)) * z  # this order gives 0 at kappa = 0, even where z² overflows
@@ -47,7 +47,7 @@ def element_energy(xp: Any, z: Any, kappa: Any, *, wants_kappa: bool, has_gaussi
     else:
         value = value / kappa
     by_z = z * inlier
-    if not wants_kappa:
+    if not with_kappa:
         return ElementEnergy(value, by_z, None)
     minus_x = at_least(xp, minus_x, _LEAST_EXPONENT)
     near_x = at_most(xp, -minus_x, _SERIES_BELOW)

@@ -31,7 +31,7 @@ _FIELDS = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
 """Fields of the density's state in the order of the kernel."""
 
 
-class Alternated(NamedTuple):
+class AlternationResult(NamedTuple):
     """Coefficients, the density's state, which problems ended, and the values at the start and after each step."""
 
     beta: Float[Tensor, "B n"]
@@ -49,7 +49,7 @@ def _kernel() -> CachedKernel:
     return CachedKernel(alternation_kernel)
 
 
-def alternated(
+def alternate_by_kernel(
     problem: SmallProblem,
     beta: Float[Tensor, "B n"],
     state: DensityState,
@@ -57,7 +57,7 @@ def alternated(
     max_iter: int,
     tol: float,
     patience: int,
-) -> Alternated:
+) -> AlternationResult:
     """Alternate until ``patience`` alternations of a problem gain no more than ``tol`` and rounding."""
     given, count, device = kernel_data(problem), beta.shape[0], beta.device
     numbers = torch.zeros(len(_FIELDS) + 3, count, dtype=torch.float64, device=device)
@@ -87,6 +87,6 @@ def alternated(
     made = int(numbers[8].max())
     fields = {name: row.unsqueeze(-1).to(beta.dtype) for name, row in zip(_FIELDS, numbers, strict=False)}
     ended = (numbers[7] > 0) & torch.isfinite(numbers[5])
-    return Alternated(
+    return AlternationResult(
         coef.to(beta.dtype), replace(state, **fields), ended, [entry.to(beta.dtype) for entry in history[: made + 1]]
     )

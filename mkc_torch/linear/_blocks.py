@@ -1,4 +1,4 @@
-"""Sums over the rows of a regression that the MKC likelihood needs, of a block of rows in float64.
+"""Sums over rows of a regression for the MKC likelihood, formed for blocks of rows in float64.
 
 The sums of blocks add up to those of all rows.
 """
@@ -63,7 +63,7 @@ class CurvatureSums(NamedTuple):
 
 
 class ResidualRange(NamedTuple):
-    """Least and largest residual of each channel over the samples in use."""
+    """Smallest and largest residual of each channel over the samples in use."""
 
     low: Float64[Tensor, " m"]
     high: Float64[Tensor, " m"]
@@ -74,7 +74,7 @@ class ResidualRange(NamedTuple):
 
 
 class PassResult(NamedTuple):
-    """Sums of a pass over rows, and the curvature sums and the range of the residuals if they were wanted."""
+    """Sums of a pass over rows, and the curvature sums and the range of the residuals if requested."""
 
     total: Sums
     curvature: CurvatureSums | None

@@ -70,7 +70,7 @@ class SmallProblem(Protocol):
 
 
 class ScaleOptions(NamedTuple):
-    """A scale as the kernel takes it.
+    """Arguments of the kernel for a scale.
 
     Attributes:
         rule: :data:`QUANTILE`, :data:`TRIMMED` or :data:`M_SCALE`.
@@ -89,7 +89,7 @@ class ScaleOptions(NamedTuple):
     exact: bool = False
 
 
-class Concentrated(NamedTuple):
+class ConcentrationResult(NamedTuple):
     """Coefficients, the scale at them, whether the last step did not lower it, and the number of steps."""
 
     beta: Float[Tensor, "B S n"]
@@ -134,7 +134,7 @@ def on_device(values: tuple[float, ...], device: torch.device) -> Float[Tensor, 
 
 
 class KernelData(NamedTuple):
-    """A problem as the kernels take it: columns, targets and sample weights with their numbers, and constants."""
+    """Arguments of the kernels: columns, targets and sample weights with their numbers, and constants."""
 
     tensors: tuple[Tensor, Tensor, Tensor]
     numbers: tuple[int, int, int]
@@ -179,7 +179,7 @@ def concentrate(
     max_iter: int = 0,
     tolerance: float = -torch.inf,
     keeps: bool = True,
-) -> Concentrated:
+) -> ConcentrationResult:
     """Make concentration steps from every start, each until its log scale falls by no more than ``tolerance``.
 
     ``near`` is the first guess of an M-scale at the starts; ``keeps``: the scale before a step is that after it.
@@ -204,7 +204,7 @@ def concentrate(
         given.warps,
     )  # fmt: skip
     most = int(torch.where(steps < 0, -steps - 1, steps).max()) if max_iter > 0 and tolerance > -torch.inf else max_iter
-    return Concentrated(found, scale, steps >= 0, most)
+    return ConcentrationResult(found, scale, steps >= 0, most)
 
 
 def weighted_fits(problem: SmallProblem, weight: Float[Tensor, "B S N 1"]) -> Float[Tensor, "B S n"]:

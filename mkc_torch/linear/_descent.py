@@ -61,7 +61,7 @@ def _state(fit_state: FitState, point: Unknowns) -> DensityState:
     return DensityState(kappa, log_d, bound[0], least[0], damping, damping, *free)
 
 
-def _place(
+def _evaluated_point(
     fit_state: FitState, point: Unknowns, result: PassResult, slopes: PassDerivatives, unit: Tensor
 ) -> EvaluatedPoint:
     total, kappa = result.total, point.kappa[0].unsqueeze(-1)
@@ -141,9 +141,9 @@ class Descent:
         near: distance from the maximum, in standard errors, below which a pass computes the curvature; 0: never.
         stop: length in standard errors of the Newton step with the curvature of these rows at which the descent ends;
             ``move`` is that step, which is not made.
-        fresh: whether the last pass has to compute the curvature; otherwise that of a pass before it is used.
-        slow: share of the length of a step that the next may have; beyond it, the next pass computes the curvature.
-        alike: whether ``slopes`` are of similar rows; otherwise the first pass computes the curvature too.
+        fresh: whether the last pass has to compute the curvature; otherwise that of an earlier pass is used.
+        slow: largest ratio of the lengths of successive steps; above it, the next pass computes the curvature.
+        slopes_valid: whether ``slopes`` represent all rows; otherwise the next pass computes the curvature.
         best: the accepted point of least value.
         curvature_sums: sums of the last pass near the maximum that computed the curvature.
         length, left: length of the last step and expected length of the next, in standard errors.
@@ -160,7 +160,7 @@ class Descent:
     stop: float
     fresh: bool = False
     slow: float = math.inf
-    alike: bool = True
+    slopes_valid: bool = True
     best: EvaluatedPoint | None = None
     curvature_sums: CurvatureSums | None = None
     length: float = math.inf
@@ -188,7 +188,7 @@ class Descent:
     @property
     def with_curvature(self) -> bool:
         """Whether the next pass computes the curvature."""
-        return not self.alike or (self.close and (self.fresh or self.curvature_sums is None))
+        return not self.slopes_valid or (self.close and (self.fresh or self.curvature_sums is None))
 
     def density(self) -> Density:
         """κ and d of the next pass."""
@@ -200,10 +200,10 @@ class Descent:
         total_weight, close = total.weight.sum(), self.close
         now = self
         if more is not None:
-            now = replace(self, slopes=PassDerivatives.of(result, self.slopes.grams), alike=True)
+            now = replace(self, slopes=PassDerivatives.of(result, self.slopes.grams), slopes_valid=True)
         if more is not None or self.fresh:
             now = replace(now, curvature_sums=more if close else None)
-        here = _place(now.fit_state, now.point, result, now.slopes, now.unit)
+        here = _evaluated_point(now.fit_state, now.point, result, now.slopes, now.unit)
         rounding = _rounding_length(now.point, now.slopes, total_weight)
         best = now.best
         if best is not None and not here.value <= best.value + _slack(best.value, rounding, total_weight) + slack:
@@ -217,7 +217,7 @@ class Descent:
             return replace(now, move=move, length=length, done=True)
         rate = _FIRST_RATE if math.isinf(now.length) else min(1.0, length / now.length)
         slow = rate > now.slow and more is None and not math.isinf(now.length)
-        return replace(now, left=length * rate, length=length, alike=not slow)._moved(here, move, plain=False)
+        return replace(now, left=length * rate, length=length, slopes_valid=not slow)._moved(here, move, plain=False)
 
     @property
     def end(self) -> tuple[EvaluatedPoint, CurvatureSums]:
@@ -241,4 +241,4 @@ class Descent:
         if self.plain and self.move is not None:
             return self._moved(best, 0.25 * self.move, plain=True)
         move = _plain_move(self.fit_state, best, self.slopes, self.unit)
-        return replace(self, alike=math.isinf(self.slow))._moved(best, move, plain=True)
+        return replace(self, slopes_valid=math.isinf(self.slow))._moved(best, move, plain=True)

@@ -20,8 +20,8 @@ from mkc_torch.linear._basis import nearly_dependent
 from mkc_torch.linear._blocks import Density, PassResult
 from mkc_torch.linear._descent import Descent, PassDerivatives
 from mkc_torch.linear._implicit.stationary import FitState
-from mkc_torch.linear._many_rows import RowsMaximum, descended, maximum_of, more_likely_gaussian
-from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
+from mkc_torch.linear._many_rows import RowsMaximum, maximum_of, more_likely_gaussian, run_descent
+from mkc_torch.linear._maximum import TIGHT, FixedParameters, lower_limit_of_d, rough_fit
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at, rows_of
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
@@ -101,7 +101,7 @@ def large_maximum(
     """Maximise the likelihood of one problem of many rows; return the maximum and the weights of the values.
 
     Returns None if values are not finite, no pilot represents all rows, the rough fit finds no head, most values are
-    fitted exactly, d ends at its least, a Gaussian has a higher likelihood than the result, or the passes do not
+    fitted exactly, d ends at its lower limit, a Gaussian has a higher likelihood than the result, or the passes do not
     converge. An alternation over all rows then reports the error or finds the maximum.
     """
     rows, passes = rows_of(values), min(max_iter, _PASSES)
@@ -112,7 +112,9 @@ def large_maximum(
     source = _InMemory(rows, torch.empty_like(rows.Y))
     # rows drawn by leverage do not represent the curvature of all rows, and another draw may lack rare rows
     count = pilot.problem.num_samples
-    slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, fit_state)
+    slopes = _slopes(
+        _drawn_rows(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.representative else rows, fit_state
+    )
     first: PassResult | None = None
     if known.bound is None:
         descent = Descent.begin(fit_state, slopes, near=0.0, stop=1.0)
@@ -120,16 +122,16 @@ def large_maximum(
         begin = source.evaluate(descent, with_range=True)
         half = torch.maximum(_half_range(begin), TIGHT * pilot.begin.scale)
         fit_state = replace(fit_state, log_bound=torch.log(half))
-        if pilot.alike:
-            end = descended(source, replace(descent, fit_state=fit_state), passes, begin, with_range=True)
+        if pilot.representative:
+            end = run_descent(source, replace(descent, fit_state=fit_state), passes, begin, with_range=True)
             if end.done and end.best is not None:
                 point, begin = end.point, end.best.result
                 fit_state = replace(fit_state, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
-        fit_state, same = _on_final_domain(pilot, known, fit_state, begin)
+        fit_state, same = _start_on_final_domain(pilot, known, fit_state, begin)
         first = begin if same else None
-    descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, alike=pilot.alike)
-    end = descended(source, descent, passes, first)
-    if not end.done or _d_is_at_its_least(end) or _gaussian_is_more_likely(rows, end):
+    descent = Descent.begin(fit_state, slopes, near=_NEAR, stop=_STOP, slopes_valid=pilot.representative)
+    end = run_descent(source, descent, passes, first)
+    if not end.done or _d_is_at_its_lower_limit(end) or _gaussian_is_more_likely(rows, end):
         return None
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     return maximum_of(end, used, rows.frame, with_last_step=False), source.weights
@@ -137,10 +139,10 @@ def large_maximum(
 
 @dataclass(frozen=True)
 class _Pilot:
-    """A rough fit to few rows, in the frame of :class:`Rows`; ``alike``: rows were drawn with equal probability."""
+    """A rough fit to few rows, in the frame of :class:`Rows`; ``representative``: all rows had the same probability."""
 
     problem: LinearProblem
-    alike: bool
+    representative: bool
     begin: RobustStart
     frame: Float64[Tensor, "n n"] | None
     fit_state: FitState
@@ -154,7 +156,7 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
     drawn = pilot_problem(values, seed)
     if drawn is None:
         return None
-    problem, alike = drawn
+    problem, representative = drawn
     begin = robust_start(problem, known.start, seed=seed, pilot=True)
     if bool(begin.exact.any()):
         return None
@@ -164,21 +166,21 @@ def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed:
         return None
     frame = _frame(problem)
     beta = rough.beta if frame is not None else torch.matmul(rough.beta, problem.to_coef[0].mT)
-    return _Pilot(problem, alike, begin, frame, _at(beta, rough.state))
+    return _Pilot(problem, representative, begin, frame, _state_at(beta, rough.state))
 
 
-def _on_final_domain(
+def _start_on_final_domain(
     pilot: _Pilot, known: FixedParameters, rough: FitState, found: PassResult
 ) -> tuple[FitState, bool]:
     """Starting point on the domain of the rule, from the pass at the rough fit; whether it equals the rough fit."""
     d = torch.exp(rough.log_d)
     bound = torch.maximum(_half_range(found), WIDE * d)
     beta = pilot.in_basis(rough.beta)
-    least = least_d(pilot.problem, pilot.begin)
+    least = lower_limit_of_d(pilot.problem, pilot.begin)
     state = known.initial_state(pilot.problem, beta, d, bound, least, tails=(rough.kappa,))
     if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
         return replace(rough, log_bound=state.log_bound), True
-    return _at(rough.beta, state), False
+    return _state_at(rough.beta, state), False
 
 
 def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
@@ -186,7 +188,7 @@ def _half_range(found: PassResult) -> Float64[Tensor, " m"]:
     return found.extent.half()
 
 
-def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
+def _drawn_rows(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
     return replace(rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
 
 
@@ -203,8 +205,8 @@ def _is_valid(rows: Rows) -> bool:
     return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(value) for value in others)
 
 
-def _d_is_at_its_least(end: Descent) -> bool:
-    """Whether d ended at its least, which is that of the pilot."""
+def _d_is_at_its_lower_limit(end: Descent) -> bool:
+    """Whether d ended at its lower limit, which the pilot determines."""
     return end.fit_state.free_d and bool((end.point.log_d <= end.fit_state.limits[0]).any())
 
 
@@ -214,7 +216,7 @@ def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
     return to_coef if nearly_dependent(torch.linalg.inv(to_coef)) else None
 
 
-def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
+def _state_at(beta: Float64[Tensor, "1 n"], state: DensityState) -> FitState:
     return FitState.of(beta, state, torch.zeros(1, dtype=torch.bool))
 
 

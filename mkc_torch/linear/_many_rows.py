@@ -1,4 +1,4 @@
-"""The maximum of the MKC likelihood over many rows, wherever they are: passes over a source, from a pilot's fit.
+"""The maximum of the MKC likelihood over many rows of any source: passes over the source, from a pilot's fit.
 
 A source is rows in memory or on a GPU, or batches that one process or several read again in every pass.
 """
@@ -34,7 +34,7 @@ class Source(Protocol):
         ...
 
 
-def descended(
+def run_descent(
     source: Source, descent: Descent, passes: int, first: PassResult | None = None, *, with_range: bool = False
 ) -> Descent:
     """Make passes until the descent is done, at most ``passes``; ``first`` is the result of the first, if known."""

@@ -12,7 +12,7 @@ from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 from mkc_torch.density.em import gaussian_state, normalised, replace_problems, weighted_rms
 from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
-from mkc_torch.linear._alternation import alternated
+from mkc_torch.linear._alternation import alternate_by_kernel
 from mkc_torch.linear._concentration import runs_kernel
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
@@ -42,7 +42,7 @@ def _alternate(
 ) -> LikelihoodMaximum:
     """Alternate E-steps and M-steps; a problem leaves the batch after ``patience`` of them without progress."""
     if runs_kernel(problem):
-        found = alternated(problem, beta, state, max_iter=max_iter, tol=tol, patience=patience)
+        found = alternate_by_kernel(problem, beta, state, max_iter=max_iter, tol=tol, patience=patience)
         return LikelihoodMaximum(found.beta, found.state, found.history[-1], found.ended, found.history)
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
@@ -163,7 +163,7 @@ def maximise(
 ) -> tuple[RobustStart, LikelihoodMaximum]:
     """Return the robust start and the maximum of the likelihood."""
     begin = robust_start(problem, known.start, seed=seed)
-    d_min = least_d(problem, begin)
+    d_min = lower_limit_of_d(problem, begin)
     if known.bound is None:
         rough = rough_fit(problem, known, begin, max_iter=max_iter)
         beta, kappa, d = rough.beta, rough.state.kappa, torch.exp(rough.state.log_d)
@@ -178,7 +178,7 @@ def maximise(
     return begin, maximum
 
 
-def least_d(problem: LinearProblem, begin: RobustStart) -> Tensor:
+def lower_limit_of_d(problem: LinearProblem, begin: RobustStart) -> Tensor:
     """Lower bound of d; a whole-number weight counts as so many samples in its small-sample factor."""
     weight, N, p = problem.sample_weight, problem.num_samples, problem.coefficients_per_channel
     if weight is None:
@@ -217,7 +217,7 @@ def rough_fit(
         bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)
     else:
         bound = given_bound(problem, known, begin)
-    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(problem, begin), tails=tails)
+    state = known.initial_state(problem, begin.beta, begin.scale, bound, lower_limit_of_d(problem, begin), tails=tails)
     return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
 
 

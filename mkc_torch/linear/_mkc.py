@@ -63,7 +63,7 @@ def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tens
     return ((weight * e).sum(-2) / weight.sum(-2)).sum(-1)
 
 
-def values_left(problem: LinearProblem) -> Float[Tensor, " B"]:
+def residual_dof(problem: LinearProblem) -> Float[Tensor, " B"]:
     """Degrees of freedom: number of values with positive weight minus number of coefficients."""
     weight = problem.sample_weight
     used = problem.total_weight().sum(-1) if weight is None else (weight > 0).sum((-2, -1)).to(weight.dtype)
@@ -89,7 +89,7 @@ def coefficient_covariance(
     if problem.sample_weight is not None:
         psi = psi * problem.sample_weight
     score = torch.matmul(psi.unsqueeze(-2), problem.basis).squeeze(-2)
-    left = values_left(problem)
+    left = residual_dof(problem)
     dof = (left + problem.num_coefficients) / left.clamp(min=1)
     in_basis = sandwich(curvature, score, dof, kind, bandwidth)
     covariance = torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT)

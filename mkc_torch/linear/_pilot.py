@@ -79,14 +79,14 @@ def _problem(values: CanonicalShapes, index: Int[Tensor, " k"]) -> LinearProblem
         problem = linear_problem(some.X.cpu().double(), some.Y.cpu().double(), weight)
     except (RankDeficientError, ValueError):
         return None
-    return problem if _spans(problem) else None
+    return problem if _determines_coefficients(problem) else None
 
 
 def _used(values: CanonicalShapes) -> Bool[Tensor, " N"] | None:
     return None if values.sample_weight is None else (values.sample_weight > 0).any(-1).flatten()
 
 
-def _spans(problem: LinearProblem) -> bool:
+def _determines_coefficients(problem: LinearProblem) -> bool:
     """Whether the rows determine every coefficient without the rows of highest leverage."""
     basis = problem.basis[0]
     if problem.sample_weight is not None:

@@ -88,7 +88,7 @@ class LinearProblem:
         return solve_gram(gram, moment)
 
     def _derived(self, weight: Tensor) -> bool:
-        """Whether a derivative or a transform of a fit with these weights is wanted."""
+        """Whether a fit with these weights is differentiated or transformed by ``torch.func``."""
         recorded = torch.is_grad_enabled() and any(v.requires_grad for v in (self.basis, self.Y, weight))
         return recorded or is_wrapped(weight) or forward_mode_is_active()
 

@@ -63,7 +63,7 @@ class Rows:
         memory: Memory | None = None,
         rough: bool = False,
     ) -> PassResult:
-        """Make one pass: return the sums and what else is wanted; write the weights to ``weights``.
+        """Make one pass: return the sums and what else is requested; write the weights to ``weights``.
 
         Coefficients, density and results are on the CPU; ``memory`` is used again by the next batch. A ``rough`` pass
         over float32 rows forms products in float32, in half the time; the sums of blocks are added in float64.

@@ -32,7 +32,7 @@ class ScaleRule(Protocol):
     """A robust scale of residuals (B, S, N, m); ``near`` is a first guess of the scale, if known."""
 
     def options(self, problem: LinearProblem) -> ScaleOptions:
-        """The scale as the kernel takes it."""
+        """Arguments of the kernel for this scale."""
         ...
 
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]: ...
@@ -222,17 +222,17 @@ def minimise_scale(problem: LinearProblem, search: ScaleSearch) -> ScaleMinimum:
         found = _descended(problem, found, short).narrowed(left)
     # convergence judged by an approximate scale is not final
     found = replace(found, converged=torch.zeros_like(found.converged))
-    return _ended(problem, _descended(problem, found, search), search)
+    return _scale_minimum(problem, _descended(problem, found, search), search)
 
 
 def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: ScaleSearch) -> ScaleMinimum:
     """Iterate from given coefficients until convergence."""
     alone = beta.unsqueeze(1)
     found = _Candidates(alone, None, torch.zeros(alone.shape[:2], dtype=torch.bool, device=beta.device))
-    return _ended(problem, _descended(problem, found, search), search)
+    return _scale_minimum(problem, _descended(problem, found, search), search)
 
 
-def _ended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> ScaleMinimum:
+def _scale_minimum(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> ScaleMinimum:
     best = found.narrowed(1)
     scale, weight = search.final.weighted(problem, problem.residual(best.beta), best.scale)
     return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.converged[:, 0])

@@ -13,13 +13,13 @@ from mkc_torch._support.arrays import Data
 from mkc_torch.density.em import normalised
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.likelihood import negative_log_likelihood
-from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
+from mkc_torch.linear._implicit.layer import GivenParameters, fit_layer, needs_derivatives
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._large import is_large, large_maximum, problem_in_basis
 from mkc_torch.linear._many_rows import RowsMaximum
 from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
-from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
+from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, residual_dof
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
@@ -161,7 +161,7 @@ class MKCRegression(Inference):
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> MKCRegression:
-        def solve(problem: LinearProblem, given: Given) -> FitState:
+        def solve(problem: LinearProblem, given: GivenParameters) -> FitState:
             known = FixedParameters(
                 given.sigma, given.d, given.bound, self.start if given.start is None else given.start
             )
@@ -227,5 +227,5 @@ class MKCRegression(Inference):
         self.exact_fit_ = problem.restore(begin.exact)
         self.n_iter_ = len(maximum.history) - 1
         self.converged_ = problem.restore(maximum.converged | begin.exact)
-        self.dof_ = problem.restore(values_left(problem))
+        self.dof_ = problem.restore(residual_dof(problem))
         self.covariance_ = coefficient_covariance(problem, maximum.beta, kappa, d, self.covariance, self.bandwidth)

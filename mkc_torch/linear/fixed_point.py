@@ -20,7 +20,7 @@ from mkc_torch._support.arguments import (
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.side_by_side import steps_between_tests
 from mkc_torch._support.torch_internals import functorch_is_active
-from mkc_torch.linear._implicit.layer import Given, fit_layer, needs_derivatives
+from mkc_torch.linear._implicit.layer import GivenParameters, fit_layer, needs_derivatives
 from mkc_torch.linear._implicit.stationary import FitState
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._mkc import (
@@ -29,7 +29,7 @@ from mkc_torch.linear._mkc import (
     fixed_point_step,
     kernel_weight,
     mean_energy,
-    values_left,
+    residual_dof,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
@@ -228,14 +228,14 @@ class FixedPointLinear(Inference):
         self.history_ = torch.stack([problem.restore(h) for h in end.history])
         self.n_iter_ = len(end.history) - 1
         self.converged_ = problem.restore(end.converged)
-        self.dof_ = problem.restore(values_left(problem))
+        self.dof_ = problem.restore(residual_dof(problem))
         self.covariance_ = coefficient_covariance(problem, end.beta, end.kappa, end.d, self.covariance, self.bandwidth)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> FixedPointLinear:
         if self.noise_covariance is not None:
             X, Y = whitened(X, Y, self.noise_covariance)
 
-        def solve(problem: LinearProblem, given: Given) -> FitState:
+        def solve(problem: LinearProblem, given: GivenParameters) -> FitState:
             assert given.sigma is not None
             assert given.d is not None
             end = self._solve(problem, given.sigma, given.d, self.start if given.start is None else given.start)

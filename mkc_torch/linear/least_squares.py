@@ -8,7 +8,7 @@ from mkc_torch._support.arguments import checked_number
 from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._inference import Inference
-from mkc_torch.linear._mkc import coefficient_covariance, values_left
+from mkc_torch.linear._mkc import coefficient_covariance, residual_dof
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
@@ -57,7 +57,7 @@ class LeastSquares(Inference):
         unit_weight = torch.ones_like(problem.Y)
         beta = problem.weighted_fit(unit_weight)
         self._set_common(problem, beta, unit_weight)
-        self.dof_ = problem.restore(values_left(problem))
+        self.dof_ = problem.restore(residual_dof(problem))
         unit = torch.ones_like(problem.Y[:, 0])
         self.covariance_ = coefficient_covariance(
             problem, beta, torch.zeros_like(unit), unit, self.covariance, self.bandwidth

@@ -239,7 +239,7 @@ def _element_values(
     learns_kappa, learns_d = table.kappa_by_raw is not None, table.d_by_raw is not None
     has_gaussian = not can_read or bool((table.kappa == 0).any())
     each_kappa = learns_kappa and (not can_read or bool((table.kappa < SMALL_KAPPA).any()))
-    density = element_energy(xp, z, table.kappa, wants_kappa=each_kappa, has_gaussian=has_gaussian)
+    density = element_energy(xp, z, table.kappa, with_kappa=each_kappa, has_gaussian=has_gaussian)
     by_d = -z * density.by_z if learns_kappa or learns_d else None
     if table.share is None:
         network, by_input = None, density.by_z * (1.0 / (table.d * divisor))
@@ -257,7 +257,7 @@ def _network(xp: Any, error: Any, table: ChannelTable, divisor: Any, *, can_read
     share = table.share
     parts = []
     if not can_read or bool((share > 0).any()):
-        own = element_energy(xp, error / table.annealed_d, table.annealed_kappa, wants_kappa=False)
+        own = element_energy(xp, error / table.annealed_d, table.annealed_kappa, with_kappa=False)
         parts.append((share * own.value, own.by_z * (share / (table.annealed_d * divisor))))
     if not can_read or bool((share < 1).any()):
         z = error / table.scale

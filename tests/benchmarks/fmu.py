@@ -106,15 +106,17 @@ def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates:
                 began = time.process_time()
                 results.append(diagnose(simulation, case.recording, surrogates=surrogates, max_findings=1))
                 seconds.append(time.process_time() - began)
-            yield Pair(case.recording.name, _firsts(results), _off(results), (seconds[0], seconds[1]))
+            yield Pair(
+                case.recording.name, _first_findings(results), _largest_difference(results), (seconds[0], seconds[1])
+            )
 
 
-def _firsts(results: list[Diagnosis]) -> tuple[str, str]:
+def _first_findings(results: list[Diagnosis]) -> tuple[str, str]:
     first, second = (result.findings[0].effect if result.findings else "nothing" for result in results)
     return first, second
 
 
-def _off(results: list[Diagnosis]) -> float:
+def _largest_difference(results: list[Diagnosis]) -> float:
     """Largest relative difference of the simulation's parameters; 0 without parameters."""
     first, second = (result.model.theta for result in results)
     if len(first) != len(second) or not len(first):

@@ -39,7 +39,7 @@ def sample(N: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return X, y
 
 
-def least(works: dict[str, Callable[[], object]]) -> dict[str, float]:
+def least_milliseconds(works: dict[str, Callable[[], object]]) -> dict[str, float]:
     """The least CPU time of each work in ms, timed in turn: other load of the machine affects all alike."""
     times = {name: milliseconds(work, 1) for name, work in works.items()}
     for _ in range(REPEATS):
@@ -68,7 +68,7 @@ def bytes_read(X: Tensor, y: Tensor) -> int:
     return read + X.nbytes + y.nbytes
 
 
-def apart(fit: MKCRegression, X: Tensor, y: Tensor) -> float:
+def difference_in_standard_errors(fit: MKCRegression, X: Tensor, y: Tensor) -> float:
     """Largest distance of the coefficients from the converged coefficients on the same domain, in standard errors."""
     converged = MKCRegression(bound=fit.bound_, start=fit.coef_).fit(X.clone().requires_grad_(), y)
     return float(((fit.coef_ - converged.coef_.detach()) / fit.standard_error_).abs().max())
@@ -114,7 +114,7 @@ def main() -> None:
         "MKCRegression": lambda: MKCRegression().fit(X, y),
         "read and sum X, y": lambda: X.sum() + y.sum(),
     }
-    times = least(works)
+    times = least_milliseconds(works)
     for name, taken in times.items():
         print(f"  {name:<36}{taken:>9.1f}{taken / times['torch.linalg.lstsq']:>8.2f}", flush=True)
     passes = bytes_read(X, y) / (X.nbytes + y.nbytes)
@@ -128,7 +128,7 @@ def main() -> None:
         warnings.simplefilter("ignore")
         others = peers(X.numpy(), y.numpy())
         others.pop("statsmodels RLMDetSMM", None)  # for small fits only
-        times = least({"MKCRegression": lambda: MKCRegression().fit(X, y), **others})
+        times = least_milliseconds({"MKCRegression": lambda: MKCRegression().fit(X, y), **others})
     for name, taken in times.items():
         print(f"  {name:<36}{taken:>9.1f}{taken / times['MKCRegression']:>8.2f}", flush=True)
     print(f"  from fully converged: {apart(MKCRegression().fit(X, y), X, y):.0e} standard errors")

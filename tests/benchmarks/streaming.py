@@ -93,7 +93,7 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def in_turn(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+def least_seconds_in_turn(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """The least seconds of each work; the works are timed in turn, ``repeats`` times."""
     best = dict.fromkeys(work, math.inf)
     for _ in range(repeats):
@@ -109,7 +109,7 @@ def resident() -> dict[str, float]:
 
 
 @contextmanager
-def watched() -> Iterator[dict[str, float]]:
+def peak_memory() -> Iterator[dict[str, float]]:
     """The peak of resident memory within the context, in MB."""
     most, over = resident(), threading.Event()
 
@@ -181,13 +181,13 @@ def main() -> None:
         write_table(path, options.rows)
         table, batches = table_of(path), batches_of(path)
         read_and_sum(table)
-        with watched() as most:
+        with peak_memory() as most:
             taken = seconds(lambda: StreamedMKCRegression().fit(batches))
         fit = StreamedMKCRegression().fit(batches)
         print(f"{options.rows} rows of {COLUMNS} columns and a target, float32, {path.stat().st_size / 1e9:.2f} GB")
         print(f"whole fit, {fit.n_iter_} passes: {taken:.1f} s, off by {float((fit.coef_ - 1).abs().max()):.1e}")
         print(f"resident: anonymous {most['RssAnon']:.0f} MB, pages of the file {most['RssFile']:.0f} MB")
-        best = in_turn({"read and sum": lambda: read_and_sum(table), **passes(batches)}, options.repeats)
+        best = least_seconds_in_turn({"read and sum": lambda: read_and_sum(table), **passes(batches)}, options.repeats)
         print(f"{'a pass':<32}{'ns a row':>10}{'of the rate of read and sum':>30}")
         for name, time_taken in best.items():
             print(f"  {name:<30}{1e9 * time_taken / options.rows:>10.2f}{best['read and sum'] / time_taken:>29.0%}")

@@ -96,7 +96,7 @@ def test_standard_error_of_the_scaled_matrix_by_simulation():
     assert bool((claimed / spread < 1.7).all())
 
 
-def test_standard_errors_are_those_of_a_time_series_with_a_time_and_without():
+def test_standard_errors_are_autocorrelation_consistent_with_and_without_a_time():
     points = noisy_ellipsoid()
     time = torch.arange(len(points)) / 50.0
     fit = EllipsoidFit(MKCRegression(covariance="hac")).fit(points)
@@ -160,7 +160,7 @@ def test_unknown_standard_errors_are_null(demo_calibration):
         ('{"schema": NaN}', "NaN"),
     ],
 )
-def test_other_texts_are_refused(text, message):
+def test_text_that_is_not_a_calibration_is_refused(text, message):
     with pytest.raises(CalibrationFileError, match=message):
         Calibration.from_json(text)
 
@@ -214,7 +214,7 @@ def test_samples_that_are_not_finite_and_unsorted_times_are_reported():
     assert "ran backwards" in " ".join(c.warnings)
 
 
-def test_many_rejected_samples_are_warned_of():
+def test_many_rejected_samples_have_a_warning():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     c = calibrate(recorded(points))
@@ -233,7 +233,7 @@ def test_many_rejected_samples_are_warned_of():
         (30.0, "raw counts"),
     ],
 )
-def test_a_radius_that_is_no_field_of_the_earth_is_in_recorded_units(factor, guess):
+def test_a_radius_unlike_the_earths_field_is_in_recorded_units_with_a_warning(factor, guess):
     c = calibrate(recorded(factor * noisy_ellipsoid()))
     assert (c.unit, c.field_unit) == ("recorded units", "recorded units")
     assert any(guess in w and "--convert" in w for w in c.warnings)
@@ -248,7 +248,7 @@ def test_the_radius_without_the_offset_determines_the_unit():
     assert not c.warnings
 
 
-def test_a_unit_of_the_users_own_is_believed():
+def test_a_given_unit_has_no_warning():
     points = 1e3 * noisy_ellipsoid()
     c = calibrate(Recording(dict(zip(AXES, points.unbind(-1), strict=True)), units=dict.fromkeys(AXES, "nT")))
     assert c.unit == "nT"
@@ -260,13 +260,13 @@ def test_times_in_milliseconds_have_a_warning():
     assert any("looks like ms" in w for w in c.warnings)
 
 
-def test_much_scatter_is_warned_of():
+def test_large_scatter_has_a_warning():
     (warning,) = calibrate(recorded(noisy_ellipsoid(2000, noise=5.1))).warnings
     assert "scatters by 10 % of the radius" in warning
     assert "mkc diagnose" in warning
 
 
-def test_semi_axes_of_unusual_lengths_are_warned_of():
+def test_semi_axes_of_unusual_lengths_have_a_warning():
     points = noisy_ellipsoid()
     points[:, 2] *= 2.0
     (warning,) = calibrate(recorded(points)).warnings
@@ -281,7 +281,7 @@ def test_a_warning_of_missing_directions_states_whether_the_result_is_valid():
     assert re.search(r"semi-axes to 0\.0\d % of the radius, so the calibration is still valid", warning)
     (warning,) = calibrate(recorded(large)).warnings
     assert "if nothing changed during the recording" in warning
-    assert "holds all the same" not in warning
+    assert "still valid" not in warning
 
 
 def test_exact_points_are_calibrated():
@@ -292,19 +292,19 @@ def test_exact_points_are_calibrated():
     assert again.center == c.center
 
 
-def test_nine_samples_or_a_clear_refusal():
+def test_fewer_than_nine_samples_are_refused():
     with pytest.raises(RecordingError, match="rec: 8 samples are too few; an ellipsoid needs at least 9"):
         calibrate(recorded(noisy_ellipsoid(8)))
     with pytest.raises(RecordingError, match="1 sample is too few"):
         calibrate(recorded(noisy_ellipsoid(1)))
 
 
-def test_a_time_that_stands_still_is_named():
+def test_a_constant_time_is_refused():
     with pytest.raises(RecordingError, match="repeat the time"):
         calibrate(recorded(noisy_ellipsoid(50), time=torch.zeros(50)))
 
 
-def test_missing_column():
+def test_a_missing_column_is_refused_by_name():
     with pytest.raises(MissingColumnError, match="mag_z"):
         prepared(Recording({"mag_x": torch.zeros(20), "mag_y": torch.zeros(20)}))
 
@@ -328,7 +328,7 @@ def test_refusals_carry_coverage_and_directions():
     assert refused.value.coverage is None
 
 
-def test_scattered_rejections_are_no_interval():
+def test_scattered_rejections_form_no_interval():
     time = torch.arange(5000) / 50.0
     assert disturbed_intervals(time, torch.arange(5000) % 20 == 0) == ()
 
@@ -342,7 +342,7 @@ def test_intervals_end_where_the_time_restarts():
     assert second == pytest.approx(RejectedInterval(0.0, 0.38))
 
 
-def test_a_few_rejections_at_the_edge_are_no_interval():
+def test_a_few_rejections_at_the_edge_form_no_interval():
     time = torch.arange(1000) / 50.0
     rejected = torch.zeros(1000, dtype=torch.bool)
     rejected[:2] = True
@@ -350,7 +350,7 @@ def test_a_few_rejections_at_the_edge_are_no_interval():
 
 
 @pytest.mark.e2e
-def test_broad_28_semi_axes_are_those_of_the_undisturbed_recording():
+def test_a_disturbed_recording_has_the_semi_axes_of_the_undisturbed_recording():
     c = calibrate(Recording.read(shared_data("magnetometer/broad_28_stationary_magnet.csv")))
     assert c.semi_axes == pytest.approx((44.17, 44.50, 45.61), abs=0.6)
     assert 0.02 < c.rejected_share < 0.1

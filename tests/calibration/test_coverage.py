@@ -17,13 +17,13 @@ def cap_share(degrees: float) -> float:
     return 0.5 * (1.0 - math.cos(math.radians(degrees)))
 
 
-def within(degrees: float, count: int = 4000) -> Tensor:
+def directions_within(degrees: float, count: int = 4000) -> Tensor:
     """Directions within an angle of +z."""
     sphere = fibonacci_sphere(count)
     return sphere[sphere[:, 2] > math.cos(math.radians(degrees))]
 
 
-def test_the_spiral_is_even():
+def test_the_spiral_covers_the_sphere_evenly():
     points = fibonacci_sphere(5000)
     torch.testing.assert_close(torch.linalg.vector_norm(points, dim=-1), torch.ones(5000).double())
     assert float(points.mean(0).abs().max()) < 1e-3
@@ -40,14 +40,14 @@ def test_a_full_sphere_is_covered():
 
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
-def test_the_fraction_of_a_cap_is_its_share_and_the_near_band(degrees):
-    found = coverage(within(degrees, 20_000))
+def test_the_fraction_of_a_cap_includes_the_band_around_it(degrees):
+    found = coverage(directions_within(degrees, 20_000))
     assert found.fraction == pytest.approx(cap_share(degrees + NEAR_DEGREES), abs=0.01)
 
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0])
 def test_the_gap_of_a_cap_is_opposite_and_as_wide_as_the_rest(degrees):
-    gap = coverage(within(degrees, 20_000)).gaps[0]
+    gap = coverage(directions_within(degrees, 20_000)).gaps[0]
     assert gap.direction[2] < -0.99
     assert gap.degrees == pytest.approx(180.0 - degrees, abs=3.0)
     assert nearest_axis(gap.direction) == "-z"
@@ -60,7 +60,7 @@ def test_a_single_direction_covers_its_cap():
     assert found.information == pytest.approx(0.0, abs=1e-12)
 
 
-def test_an_equator_leaves_both_poles():
+def test_an_equator_leaves_gaps_at_both_poles():
     angle = torch.linspace(0.0, 2 * math.pi, 400, dtype=torch.float64)
     found = coverage(torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1))
     assert found.fraction == pytest.approx(math.sin(math.radians(NEAR_DEGREES)), abs=0.01)
@@ -69,7 +69,7 @@ def test_an_equator_leaves_both_poles():
     assert found.information == pytest.approx(0.0, abs=1e-9)
 
 
-def test_two_holes_are_named_largest_first():
+def test_two_gaps_are_reported_largest_first():
     sphere = fibonacci_sphere(4000)
     keep = (sphere[:, 0] < math.cos(math.radians(60))) & (sphere[:, 1] > -math.cos(math.radians(45)))
     gaps = coverage(sphere[keep]).gaps
@@ -78,7 +78,7 @@ def test_two_holes_are_named_largest_first():
     assert gaps[1].degrees == pytest.approx(45.0, abs=3.0)
 
 
-def test_a_hole_smaller_than_the_least_is_not_named():
+def test_a_gap_below_the_limit_is_not_reported():
     sphere = fibonacci_sphere(4000)
     assert coverage(sphere[sphere[:, 2] < math.cos(math.radians(GAP_DEGREES - 5))]).gaps == ()
     assert len(coverage(sphere[sphere[:, 2] < math.cos(math.radians(GAP_DEGREES + 5))]).gaps) == 1
@@ -88,8 +88,8 @@ def test_thirty_even_samples_leave_no_gap():
     assert coverage(fibonacci_sphere(30)).gaps == ()
 
 
-def test_information_falls_with_the_cap():
-    values = [coverage(within(d)).information for d in (180.0, 120.0, 90.0, 60.0, 30.0)]
+def test_information_decreases_with_the_size_of_the_cap():
+    values = [coverage(directions_within(d)).information for d in (180.0, 120.0, 90.0, 60.0, 30.0)]
     assert values == sorted(values, reverse=True)
     assert values[0] > 0.9
     assert values[-1] < 1e-3
@@ -115,7 +115,7 @@ def test_information_is_the_least_eigenvalue_relative_to_even_coverage():
 
 @settings(derandomize=True, deadline=None, max_examples=20)
 @given(seed=st.integers(0, 10_000))
-def test_turning_and_stretching_the_vectors_changes_nothing_that_should_not_change(seed):
+def test_coverage_does_not_depend_on_rotation_and_lengths(seed):
     directions = sample(seed, 40, 3) + torch.tensor([0.0, 0.0, 1.0])
     Q, _ = torch.linalg.qr(sample(seed + 1, 3, 3))
     first = coverage(directions)
@@ -146,16 +146,16 @@ def test_directions_are_named_after_their_axes(direction, name):
     assert nearest_axis(direction) == name
 
 
-def test_a_gap_reads_as_a_sentence():
+def test_a_gap_is_described_by_a_sentence():
     assert str(Gap((0.0, -0.6, 0.8), 57.4)) == "-y+z (+0.00, -0.60, +0.80): no sample within 57°"
 
 
-def test_float32_and_many_vectors():
+def test_many_float32_vectors_are_accepted():
     assert coverage(sample(0, 10_000, 3).float()).fraction == 1.0
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e-13, 1e300])
-def test_the_length_of_directions_does_not_matter(length):
+def test_coverage_does_not_depend_on_the_length_of_directions(length):
     assert coverage(length * fibonacci_sphere(500)).fraction == coverage(fibonacci_sphere(500)).fraction
 
 

@@ -17,12 +17,12 @@ def points():
 
 
 @pytest.fixture(scope="module")
-def pair(points):
+def two_calibrations(points):
     return calibrate(recorded(points), name="new"), calibrate(recorded(noisy_ellipsoid(300, seed=2)), name="old")
 
 
-def test_the_same_sensor_is_the_same_within_errors(pair, points):
-    found = differences(*pair, points)
+def test_calibrations_of_a_sensor_agree_within_errors(two_calibrations, points):
+    found = differences(*two_calibrations, points)
     assert len(found.numbers) == 10
     assert found.beyond == ()
     assert "offset" in difference_sentences(found)[0] or "matrix" in difference_sentences(found)[0]
@@ -30,15 +30,15 @@ def test_the_same_sensor_is_the_same_within_errors(pair, points):
     assert found.name == "old"
 
 
-def test_a_calibration_does_not_differ_from_itself(pair, points):
-    found = differences(pair[0], pair[0], points)
+def test_a_calibration_does_not_differ_from_itself(two_calibrations, points):
+    found = differences(two_calibrations[0], two_calibrations[0], points)
     assert {difference.in_errors for difference in found.numbers} == {0.0}
     assert (found.angle_max, found.length_max) == pytest.approx((0.0, 0.0), abs=1e-12)
     assert difference_sentences(found)[1].count("0° and 0 µT") == 2
 
 
-def test_errors_combine_and_the_limit_is_bonferronis(pair, points):
-    new, old = pair
+def test_errors_are_combined_and_the_limit_is_that_of_bonferroni(two_calibrations, points):
+    new, old = two_calibrations
     found = differences(new, old, points)
     offset_x, matrix_yz = found.numbers[0], found.numbers[-2]
     assert offset_x.error == pytest.approx(math.sqrt(new.center_se[0] ** 2 + old.center_se[0] ** 2))
@@ -48,9 +48,9 @@ def test_errors_combine_and_the_limit_is_bonferronis(pair, points):
     assert float(tail) * 10 == pytest.approx(LEVEL)
 
 
-def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
+def test_a_changed_offset_and_its_effect_on_the_field_are_reported(two_calibrations, points):
     """0.8 µT across the field turns it by 0.8/48 rad at most, and 0.8 µT along makes it so much longer."""
-    new, _ = pair
+    new, _ = two_calibrations
     old = dataclasses.replace(new, center=(new.center[0] + 0.8, *new.center[1:]), name="before")
     found = differences(new, old, points)
     assert [difference.name for difference in found.beyond] == ["offset x"]
@@ -68,8 +68,8 @@ def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
     assert f"{len(points)} samples" in sentences[1]
 
 
-def test_an_older_calibration_in_other_units_is_converted(pair, points):
-    new, old = pair
+def test_an_older_calibration_in_other_units_is_converted(two_calibrations, points):
+    new, old = two_calibrations
     in_gauss = dataclasses.replace(
         old,
         unit="gauss",
@@ -86,16 +86,16 @@ def test_an_older_calibration_in_other_units_is_converted(pair, points):
     assert found.angle_rms == pytest.approx(expected.angle_rms)
 
 
-def test_units_without_a_size_are_refused_with_what_to_do(pair, points):
-    new, old = pair
+def test_units_without_a_conversion_are_refused_with_a_remedy(two_calibrations, points):
+    new, old = two_calibrations
     with pytest.raises(ValueError, match=r"counts .* with the same unit options"):
         differences(new, dataclasses.replace(old, unit="counts"), points)
     with pytest.raises(ValueError, match="--field-strength"):
         differences(new, dataclasses.replace(old, field_unit="counts"), points)
 
 
-def test_unknown_errors_are_shown_as_unknown(pair, points):
-    new, old = pair
+def test_unknown_errors_are_shown_as_unknown(two_calibrations, points):
+    new, old = two_calibrations
     nothing = (math.nan,) * 3
     unknown = dataclasses.replace(old, center_se=nothing, semi_axes_se=nothing, matrix_se=(nothing,) * 3)
     found = differences(new, unknown, points)
@@ -107,15 +107,15 @@ def test_unknown_errors_are_shown_as_unknown(pair, points):
     assert [difference.name for difference in differences(new, half, points).beyond] == ["offset x"]
 
 
-def test_many_differences_are_counted(pair, points):
-    new, _ = pair
+def test_many_differences_are_counted(two_calibrations, points):
+    new, _ = two_calibrations
     other = dataclasses.replace(new, matrix=tuple(tuple(1.1 * v for v in row) for row in new.matrix))
     sentence = difference_sentences(differences(new, other, points))[0]
     assert "matrix" in sentence
     assert sentence.count("matrix") == 3
 
 
-def test_a_gain_of_all_axes_shows_in_the_radius_alone(points):
+def test_a_gain_of_all_axes_changes_the_radius_alone(points):
     """Each calibration corrects to its own measured length, so their matrices are equal."""
     new, old = calibrate(recorded(1.02 * points)), calibrate(recorded(points))
     radius = [difference for difference in differences(new, old, points).beyond if difference.name == "radius"]

@@ -1,4 +1,4 @@
-"""Frozen and clipped samples: named and left out; rest and coarse digits are neither."""
+"""Frozen and clipped samples are reported and left out; a rest and coarse digits are not."""
 
 import pytest
 import torch
@@ -36,22 +36,22 @@ def recorded(points, rate=50.0, **columns):
 def test_a_sensor_frozen_to_the_end_is_recognised_by_its_noise():
     points = turned()
     points[1500:] = points[1500]
-    (warning,) = faults(recorded(points))
+    (warning,) = fault_warnings(recorded(points))
     assert "from 30 to 39.98 s (500)" in warning
-    points = digits(turned(noise=0.05), 0.5)
+    points = rounded_to(turned(noise=0.05), 0.5)
     points[1500:] = points[1500]
-    assert faults(recorded(points)) == []
+    assert fault_warnings(recorded(points)) == []
 
 
-def faults(recording):
+def fault_warnings(recording):
     return [w for w in prepared(recording).warnings if FROZEN in w or CLIPPED in w]
 
 
-def digits(points, step):
+def rounded_to(points, step):
     return (points / step).round() * step
 
 
-def test_a_frozen_sensor_of_the_kept_case_is_named_and_left_out():
+def test_a_frozen_sensor_of_the_stored_case_is_reported_and_left_out():
     c = calibrate(Recording.read(shared_case("messy/frozen_sensor.csv")))
     (warning,) = c.warnings
     assert "800 of 2730" in warning
@@ -61,7 +61,7 @@ def test_a_frozen_sensor_of_the_kept_case_is_named_and_left_out():
     assert max(abs(a - b) / s for a, b, s in zip(c.center, whole, c.center_se, strict=True)) < 2.0
 
 
-def test_clipping_of_the_kept_case_is_named_and_left_out():
+def test_clipping_of_the_stored_case_is_reported_and_left_out():
     c = calibrate(Recording.read(shared_case("messy/clipped.csv")))
     for warning in ("`mag_x` is cut off at 40", "`mag_y` is cut off at -40 (924", "Left out 2339 of 2730"):
         assert warning in " ".join(c.warnings)
@@ -69,7 +69,7 @@ def test_clipping_of_the_kept_case_is_named_and_left_out():
     assert max(abs(a - b) / s for a, b, s in zip(c.center, whole, c.center_se, strict=True)) < 2.0
 
 
-def test_without_time_standard_errors_and_block_are_those_with_it():
+def test_standard_errors_and_block_without_a_time_equal_those_with_a_time():
     timed = calibrate(Recording.read(shared_case("messy/one_block.csv")))
     rows = calibrate(Recording.read(shared_case("messy/one_block_no_time.csv")))
     assert rows.center == timed.center
@@ -82,26 +82,26 @@ def test_without_time_standard_errors_and_block_are_those_with_it():
 
 @pytest.mark.parametrize("name", REAL)
 def test_real_recordings_are_neither_frozen_nor_clipped(name):
-    assert faults(Recording.read(shared_data(f"magnetometer/{name}.csv"))) == []
+    assert fault_warnings(Recording.read(shared_data(f"magnetometer/{name}.csv"))) == []
 
 
 @pytest.mark.e2e
 @given(st.sampled_from(REAL), st.floats(0.0, 5.0), st.integers(1, 4), st.booleans())
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
-def test_nor_are_they_with_coarser_digits_polled_oftener_or_with_a_rest(name, coarse, polled, rests):
+def test_real_recordings_of_coarser_digits_repeated_samples_or_a_rest_have_no_faults(name, coarse, polled, rests):
     points = Recording.read(shared_data(f"magnetometer/{name}.csv")).magnetometer()[:3000]
     size = float(torch.linalg.vector_norm(points - points.median(0).values, dim=-1).median())
     if rests:
         points = torch.cat([points[:1000], points[1000:1001].expand(400, 3), points[1000:]])
     if coarse > 0.05:
-        points = digits(points, 0.01 * coarse * size)
-    assert faults(recorded(points.repeat_interleave(polled, 0))) == []
+        points = rounded_to(points, 0.01 * coarse * size)
+    assert fault_warnings(recorded(points.repeat_interleave(polled, 0))) == []
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.05, 4.0), st.floats(0.2, 3.0), st.integers(0, 99))
 @settings(max_examples=15, deadline=None)
 def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, speed, seed):
-    assert faults(recorded(digits(turned(noise=noise, seed=seed, speed=speed), step))) == []
+    assert fault_warnings(recorded(rounded_to(turned(noise=noise, seed=seed, speed=speed), step))) == []
 
 
 @pytest.mark.e2e
@@ -112,14 +112,14 @@ def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, spee
 def test_a_freeze_of_all_axes_or_a_single_axis_is_located(axis, length, begin, seed, coarse):
     points = turned(seed=seed)
     if coarse:
-        points = digits(points, 0.15)
+        points = rounded_to(points, 0.15)
     columns = [0, 1, 2] if axis is None else [axis]
     # what stays at the end of an axis's range looks like clipping as well
     low, high = points.amin(0), points.amax(0)
     assume(bool(((points[begin] > low + 3.0) & (points[begin] < high - 3.0))[columns].all()))
     for k in columns:
         points[begin : begin + length, k] = points[begin, k]
-    (warning,) = faults(recorded(points))
+    (warning,) = fault_warnings(recorded(points))
     names = "all of `mag_x`, `mag_y`, `mag_z`" if axis is None else f"`{AXES[axis]}`"
     assert f"{FROZEN}: {names} from " in warning
     # by chance the values before and after may be equal to it
@@ -132,18 +132,18 @@ def test_a_freeze_of_all_axes_or_a_single_axis_is_located(axis, length, begin, s
 @given(st.sampled_from([0, 1, 2]), st.sampled_from([-1.0, 1.0]), st.floats(0.6, 0.9), st.integers(0, 99))
 @settings(max_examples=12, deadline=None)
 def test_a_clipped_axis_is_reported_and_the_rest_is_calibrated(axis, side, share, seed):
-    points = digits(turned(seed=seed), 0.1)
+    points = rounded_to(turned(seed=seed), 0.1)
     center = torch.tensor([4.0, -7.0, 11.0])
     limit = round(float(center[axis]) + side * share * 45.0, 1)
     points[:, axis] = points[:, axis].clamp(max=limit) if side > 0 else points[:, axis].clamp(min=limit)
     recording = recorded(points)
-    (warning,) = faults(recording)
+    (warning,) = fault_warnings(recording)
     assert f"`{AXES[axis]}` is cut off at {limit:.6g} (" in warning
     assert warning.count("cut off") == 1
 
 
 def test_the_remaining_samples_of_a_clipped_recording_are_calibrated():
-    points = digits(turned(4000), 0.1)
+    points = rounded_to(turned(4000), 0.1)
     points[:, 0] = points[:, 0].clamp(max=40.0)
     c = calibrate(recorded(points))
     assert any(CLIPPED in w for w in c.warnings)
@@ -152,7 +152,7 @@ def test_the_remaining_samples_of_a_clipped_recording_are_calibrated():
 
 
 def test_clipping_is_reported_before_the_directions_that_it_removed():
-    points = digits(turned(4000), 0.1)
+    points = rounded_to(turned(4000), 0.1)
     points[:, 0] = points[:, 0].clamp(max=30.0)
     warnings = calibrate(recorded(points)).warnings
     assert CLIPPED in warnings[0]
@@ -160,7 +160,7 @@ def test_clipping_is_reported_before_the_directions_that_it_removed():
 
 
 def test_a_refusal_begins_with_the_clipping():
-    points = digits(turned(4000), 0.1)
+    points = rounded_to(turned(4000), 0.1)
     points[:, 0] = points[:, 0].clamp(max=-20.0)
     with pytest.raises(NotIdentifiableError, match=r"^Not identifiable: Left out \d+ of 4000 clipped samples"):
         calibrate(recorded(points))
@@ -183,6 +183,6 @@ def test_standard_errors_treat_runs_as_independent():
 
 
 @given(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=60))
-def test_distinct_rows_are_those_of_torch(rows):
+def test_distinct_rows_equal_those_of_torch(rows):
     values = torch.tensor(rows, dtype=torch.float64)
     assert torch.equal(distinct_rows(values), values.unique(dim=0))

@@ -22,7 +22,7 @@ def calibration(recording):
     return calibrate(recording)
 
 
-def test_the_field_is_that_of_apply_in_tesla(recording, calibration):
+def test_the_field_equals_that_of_apply_in_tesla(recording, calibration):
     field = torch.stack(list(calibration.apply(recording).values())[1:], -1)
     found = magnetic_field_messages(calibration, recording.magnetometer())
     assert torch.allclose(found.magnetic_field, 1e-6 * field, rtol=1e-12)
@@ -41,7 +41,7 @@ def test_an_undisturbed_sample_has_the_noise_of_the_sensor(calibration):
 
 
 def test_the_error_of_every_sample_is_covered_and_bounded(recording, calibration):
-    """Along the field: no length is further off than its standard deviation, or four times the noise."""
+    """The length of the field deviates by at most its standard deviation or four times the noise."""
     found = magnetic_field_messages(calibration, recording.magnetometer())
     covariance = found.magnetic_field_covariance.reshape(-1, 3, 3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all()
@@ -63,7 +63,7 @@ def test_a_lower_weight_never_has_a_lower_covariance(recording, calibration):
     assert (ordered.diff() >= 0).all()
 
 
-def test_a_chosen_bound_and_a_missing_measurement(calibration):
+def test_a_given_bound_limits_the_covariance_and_missing_values_stay_nan(calibration):
     readings = torch.tensor([[500.0, 0.0, 0.0], [math.nan, 0.0, 0.0]])
     found = magnetic_field_messages(calibration, readings, largest_error=5e-6)
     assert found.magnetic_field_covariance[:, 0].sqrt().tolist() == pytest.approx([5e-6, 5e-6], rel=1e-2)
@@ -77,7 +77,7 @@ def test_gaussian_noise_is_bounded_by_the_misfit_alone(calibration):
     assert found.magnetic_field_covariance[0, 0].sqrt() == pytest.approx(float(off), rel=1e-3)
 
 
-def test_an_undetermined_offset_counts_as_the_radius(calibration):
+def test_an_undetermined_offset_has_an_error_of_the_radius(calibration):
     unknown = dataclasses.replace(calibration, center_se=(0.1, 0.1, math.nan))
     assert math.sqrt(field_covariance(unknown)[2][2]) == pytest.approx(calibration.radius, rel=0.1)
 
@@ -89,18 +89,18 @@ def test_an_undetermined_offset_counts_as_the_radius(calibration):
         ({"field_unit": "counts"}, "in counts"),
     ],
 )
-def test_what_is_no_magnetic_field_is_refused(calibration, change, message):
+def test_other_sensors_and_units_are_refused(calibration, change, message):
     with pytest.raises(ValueError, match=message):
         magnetic_field_messages(dataclasses.replace(calibration, **change), torch.zeros(1, 3))
 
 
 @pytest.mark.parametrize("bound", [1e-9, math.inf, math.nan])
-def test_a_bound_below_the_noise_or_without_end_is_refused(calibration, bound):
+def test_a_bound_below_the_noise_or_infinite_is_refused(calibration, bound):
     with pytest.raises(ValueError, match="largest_error"):
         magnetic_field_messages(calibration, torch.zeros(1, 3), largest_error=bound)
 
 
-def test_another_unit_of_the_field(calibration):
+def test_messages_do_not_depend_on_the_unit_of_the_calibration(calibration):
     def scaled(vector):
         return tuple(0.01 * v for v in vector)
 

@@ -14,7 +14,7 @@ def unit_weights(points):
     return torch.ones(points.shape[:-1], dtype=points.dtype)
 
 
-def test_what_noise_lends_is_half_its_variance_times_the_laplacian():
+def test_information_by_noise_is_half_its_variance_times_the_laplacian():
     points = torch.tensor([[[1.0, 2.0, 3.0]]], dtype=torch.float64)
     moments = moments_of(lambda p: p.square(), points, unit_weights(points), NOISE)
     squares = points[0, 0].square()
@@ -25,7 +25,7 @@ def test_what_noise_lends_is_half_its_variance_times_the_laplacian():
     torch.testing.assert_close(moments.lent[0], expected, rtol=1e-3, atol=0)
 
 
-def test_without_noise_there_is_neither():
+def test_without_noise_there_is_no_bias_and_no_spurious_information():
     points = fibonacci_sphere(200).unsqueeze(0)
     moments = moments_of(algebraic_rows(SPHERE), points, unit_weights(points), torch.zeros(1).double())
     bias = bias_by_noise(moments)
@@ -34,7 +34,7 @@ def test_without_noise_there_is_neither():
     torch.testing.assert_close(bias.growth[0], torch.eye(9).double())
 
 
-def test_the_bias_of_the_algebraic_fit_is_what_repeated_fits_have():
+def test_the_bias_of_the_algebraic_fit_equals_that_of_repeated_fits():
     """Least squares of many points on a sphere, each noise of 5 %."""
     generator = torch.Generator().manual_seed(0)
     points = fibonacci_sphere(200_000)
@@ -48,7 +48,7 @@ def test_the_bias_of_the_algebraic_fit_is_what_repeated_fits_have():
     torch.testing.assert_close(bias, off, rtol=0.05, atol=3e-3)
 
 
-def test_the_bias_of_distances_is_that_of_a_mean_distance():
+def test_the_bias_of_distances_equals_that_of_a_mean_distance():
     """Of a sphere of radius 1 it is the variance, by which noise along the surface makes points lie outside."""
     points = fibonacci_sphere(2000).unsqueeze(0)
     bias = bias_by_noise(moments_of(distance_rows(ROOT), points, unit_weights(points), NOISE)).offset[0]
@@ -57,7 +57,7 @@ def test_the_bias_of_distances_is_that_of_a_mean_distance():
     assert float(bias[[0, 1, 2, 4, 5, 7]].abs().max()) < 1e-4
 
 
-def test_batches_are_loops():
+def test_a_batch_equals_a_loop():
     points = torch.stack([fibonacci_sphere(100), 1.1 * fibonacci_sphere(100)])
     theta, noise = torch.cat([SPHERE, 0.8 * SPHERE]), torch.tensor([0.1, 0.2]).double()
     both = moments_of(algebraic_rows(theta), points, unit_weights(points), noise)

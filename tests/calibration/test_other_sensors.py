@@ -85,7 +85,7 @@ def test_a_gyroscopes_bias_comes_from_its_rest():
     assert 15.0 < found.seconds < 20.1
 
 
-def test_a_gyroscope_that_never_rests_has_none():
+def test_a_gyroscope_that_never_rests_has_no_bias():
     assert rest_bias(recorded(gyroscope(turns=slice(0, 2000)), GYRO)) is None
     rates = torch.zeros(100, 3)
     assert rest_bias(Recording(dict(zip(GYRO, rates.unbind(-1), strict=True)))) is None
@@ -93,7 +93,7 @@ def test_a_gyroscope_that_never_rests_has_none():
 
 
 @pytest.mark.e2e
-def test_the_bias_is_in_the_calibration_of_a_magnetometer():
+def test_the_calibration_of_a_magnetometer_includes_the_gyroscope_bias():
     points = torch.cat([torch.tensor([[30.0, 20.0, 10.0]]).expand(500, 3), 45.0 * fibonacci_sphere(1500)])
     points = points + 0.3 * torch.randn(2000, 3, generator=torch.Generator().manual_seed(2))
     rates = gyroscope(turns=slice(500, 2000))

@@ -34,17 +34,17 @@ def calibration(recording):
 
 
 @pytest.fixture(autouse=True)
-def closed():
+def _close_figures():
     yield
     pyplot.close("all")
 
 
-def test_every_method_is_tried_here():
+def test_every_plot_method_has_a_test_case():
     assert {name for name in vars(CalibrationPlot) if not name.startswith("_")} == set(PICTURES)
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_each_draws_on_the_axes_it_is_given_and_on_a_new_figure(calibration, name):
+def test_each_plot_is_drawn_on_given_axes_or_on_a_new_figure(calibration, name):
     projection = "mollweide" if name == "coverage" else None
     given = pyplot.figure().add_subplot(projection=projection)
     assert PICTURES[name](calibration.plot, ax=given) is given
@@ -53,7 +53,7 @@ def test_each_draws_on_the_axes_it_is_given_and_on_a_new_figure(calibration, nam
     assert new.get_title() == given.get_title() or name == "weights"
 
 
-def test_names_units_and_samples(calibration, recording):
+def test_plots_show_names_units_and_every_sample(calibration, recording):
     ax = calibration.plot.residual()
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "residual (µT)")
     dots = [line for line in ax.lines if line.get_marker() == "."]
@@ -67,7 +67,7 @@ def test_names_units_and_samples(calibration, recording):
     np.testing.assert_allclose(radius, calibration.field_strength, rtol=1e-12)
 
 
-def test_weights_are_those_of_the_fit(calibration, recording):
+def test_weights_equal_those_of_the_fit(calibration, recording):
     ax = calibration.plot.weights()
     shown = np.sort(np.concatenate([line.get_ydata() for line in ax.lines]))
     np.testing.assert_array_equal(shown, np.sort(calibration.weight(recording.magnetometer()).numpy()))
@@ -81,7 +81,7 @@ def test_a_calibration_from_a_file_needs_a_recording(calibration, recording):
     assert read.plot.residual(recording=recording).has_data()
 
 
-def test_another_plane_and_other_axes_are_clear_errors(calibration):
+def test_an_unknown_plane_and_bad_axes_are_refused(calibration):
     with pytest.raises(ValueError, match=r"`plane`.*xy, xz, yz.*got 'zx'"):
         calibration.plot.sphere("zx")
     with pytest.raises(ValueError, match=r"projection 'mollweide'.*got 'rectilinear'"):

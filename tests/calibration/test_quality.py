@@ -27,7 +27,7 @@ def test_a_third_of_the_samples_rejected_is_doubtful(calibration, share, found):
     assert doubts(dataclasses.replace(calibration, rejected=round(share * calibration.samples))) == found
 
 
-def test_bursts_shorter_than_half_a_second_are_no_disturbance(calibration):
+def test_bursts_shorter_than_half_a_second_do_not_count_as_disturbance(calibration):
     intervals = (RejectedInterval(3.0, 3.3), RejectedInterval(48.8, 51.8))
     assert disturbances(dataclasses.replace(calibration, disturbed=intervals)) == intervals[1:]
     rows = (RejectedInterval(10.0, 30.0), RejectedInterval(100.0, 140.0))

@@ -1,4 +1,4 @@
-"""A sensor that rests for a while: a rest counts as a single direction, whatever its duration."""
+"""A sensor that rests for a while: a rest of any duration counts as a single direction."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_rest_is_distinguished_from_turning_despite_outliers(share):
     assert float(found[1430:].double().mean()) > 0.9
 
 
-def test_samples_in_no_order_are_neither():
+def test_shuffled_samples_are_neither_resting_nor_turning():
     points = tumbling(N, noise=0.3).magnetometer()
     assert turning(points[torch.randperm(N, generator=torch.Generator().manual_seed(0))]) is None
     assert bool(thin_at_rest(points[torch.randperm(N, generator=torch.Generator().manual_seed(0))]).all())

@@ -98,7 +98,7 @@ def test_attributes_before_fit_raise_not_fitted():
     assert repr(MCD(0.75)).startswith("MinimumCovarianceDeterminant(support_fraction=0.75, h=None, reweight=True")
 
 
-def frozen(array):
+def read_only(array):
     array.flags.writeable = False
     return array
 
@@ -107,7 +107,7 @@ def frozen(array):
     "make",
     [
         lambda a: a,
-        lambda a: frozen(a.copy()),
+        lambda a: read_only(a.copy()),
         np.asfortranarray,
         lambda a: a[::-1][::-1],
         lambda a: a.astype(">f8"),

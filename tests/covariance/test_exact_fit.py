@@ -15,7 +15,7 @@ from tests.draws import normal as sample
 MCD = MinimumCovarianceDeterminant
 
 
-def on_a_plane(on: int = 40, N: int = 60) -> Tensor:
+def samples_on_a_plane(on: int = 40, N: int = 60) -> Tensor:
     """(N, 3) samples; the first ``on`` fulfil z = 2 x - y + 5."""
     X = sample(0, N, 3)
     X[:on, 2] = 2.0 * X[:on, 0] - X[:on, 1] + 5.0
@@ -24,7 +24,7 @@ def on_a_plane(on: int = 40, N: int = 60) -> Tensor:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_error_reports_the_plane(dtype):
-    X = on_a_plane().to(dtype)
+    X = samples_on_a_plane().to(dtype)
     with pytest.raises(
         ExactFitError, match=r"40 of 60 lie on the hyperplane 0.8165·x0 - 0.4082·x1 - 0.4082·x2 = -2.04"
     ) as caught:
@@ -41,23 +41,23 @@ def test_the_error_reports_the_plane(dtype):
 
 
 def test_a_plane_of_fewer_than_h_samples_is_not_an_exact_fit():
-    X = on_a_plane()
+    X = samples_on_a_plane()
     assert float(torch.linalg.eigvalsh(MCD(h=50).fit(X).covariance_).min()) > 0.01
     with pytest.raises(ExactFitError):
         MCD(h=40).fit(X)
-    assert torch.isfinite(MCD().fit(on_a_plane(on=20)).distances_).all()
+    assert torch.isfinite(MCD().fit(samples_on_a_plane(on=20)).distances_).all()
 
 
 def test_an_exact_fit_in_a_batch_is_reported_by_its_index():
     batch = torch.stack([sample(seed, 60, 3) for seed in range(6)]).unflatten(0, (2, 3))
-    batch[1, 2] = on_a_plane()
+    batch[1, 2] = samples_on_a_plane()
     with pytest.raises(ExactFitError, match=r"40 of 60 of problem \(1, 2\) lie") as caught:
         MCD().fit(batch)
     assert caught.value.problem == (1, 2)
 
 
 def test_the_relevant_columns_are_reported_in_any_unit():
-    X = on_a_plane() * torch.tensor([1e8, 1.0, 1e-8]) + torch.tensor([1e9, 0.0, 0.0])
+    X = samples_on_a_plane() * torch.tensor([1e8, 1.0, 1e-8]) + torch.tensor([1e9, 0.0, 0.0])
     with pytest.raises(ExactFitError, match=r"40 of 60 lie on the hyperplane -2e-16·x0 \+ 1e-08·x1 \+ 1·x2 = -1.5e-07"):
         MCD().fit(X)
 
@@ -75,7 +75,7 @@ def test_a_column_of_equal_values_is_reported():
 
 
 def test_a_plane_of_the_reweighted_samples_is_reported():
-    X = on_a_plane()
+    X = samples_on_a_plane()
     assert torch.isfinite(MCD(h=41, reweight=False).fit(X).distances_).all()
     with pytest.raises(
         ExactFitError, match="40 of 60"
@@ -91,8 +91,8 @@ def test_equal_samples_are_reported(p):
         MCD().fit(X)
 
 
-def test_samples_near_a_plane_have_a_scatter():
-    X = on_a_plane(on=60)
+def test_samples_near_a_plane_are_fitted_with_a_small_scatter():
+    X = samples_on_a_plane(on=60)
     X[:, 2] += 1e-5 * sample(5, 60)
     fit = MCD().fit(X)
     normal = torch.tensor([2.0, -1.0, -1.0], dtype=torch.float64)

@@ -29,7 +29,7 @@ def covariance(X: Tensor) -> Tensor:
     return error.mT @ error / (X.shape[-2] - 1)
 
 
-def subsets(X: Tensor, h: int) -> Tensor:
+def smallest_log_determinant(X: Tensor, h: int) -> Tensor:
     """The smallest log determinant of all subsets."""
     index = torch.tensor(list(itertools.combinations(range(X.shape[0]), h)))
     return torch.logdet(covariance(X[index])).min()
@@ -67,7 +67,7 @@ def test_estimates_equal_robustbase(reference):
         ("stars_cyg_y", {7, 11, 20, 30, 34}),  # Rousseeuw & Leroy (1987), p. 262, and the star between
     ],
 )
-def test_published_outliers_are_far(name, rows):
+def test_published_outliers_have_distances_beyond_the_cutoff(name, rows):
     fit = MCD().fit(SETS[name]())
     assert rows <= {int(i) + 1 for i in (fit.distances_ > fit.distance_cutoff_).nonzero()}
 
@@ -111,7 +111,7 @@ def test_estimates_equal_scikit_learn_without_the_small_sample_correction(name):
 @pytest.mark.parametrize(("N", "p", "h"), [(10, 2, 7), (12, 3, 8), (11, 1, 6), (12, 1, 9), (9, 2, 9)])
 def test_the_optimum_equals_the_search_over_all_subsets(seed, N, p, h):
     X = sample(seed, N, p) * torch.exp(sample(seed + 100, N, 1))
-    assert float(MCD(h=h).fit(X).objective_) == pytest.approx(float(subsets(X, h)), abs=1e-9)
+    assert float(MCD(h=h).fit(X).objective_) == pytest.approx(float(smallest_log_determinant(X, h)), abs=1e-9)
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e70])
@@ -269,7 +269,7 @@ def test_a_problem_does_not_depend_on_the_others(N, p):
             torch.testing.assert_close(getattr(together, name)[at], getattr(alone, name), rtol=1e-10, atol=1e-12)
 
 
-def test_the_order_of_samples_does_not_matter():
+def test_the_estimate_does_not_depend_on_the_order_of_samples():
     X = SETS["hbk_y"]()
     order = torch.randperm(75, generator=torch.Generator().manual_seed(0))
     fit, shuffled = MCD().fit(X), MCD().fit(X[order])

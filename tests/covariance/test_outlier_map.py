@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.covariance import MinimumCovarianceDeterminant, OutlierMap, SampleKind, outlier_map
-from mkc_torch.covariance._picture_labels import Box, free_place, ranges, together
+from mkc_torch.covariance._picture_labels import Box, free_place, linked_groups, ranges
 from mkc_torch.linear import (
     LeastSquares,
     LeastTrimmedSquares,
@@ -21,12 +21,12 @@ from mkc_torch.linear import (
 from tests.literature import DATA_SETS
 
 
-def found(of: OutlierMap, kind: SampleKind) -> list[int]:
+def rows_of_kind(of: OutlierMap, kind: SampleKind) -> list[int]:
     """Rows counted from 1, as published."""
     return [int(i) + 1 for i in (of.kind == kind).nonzero()]
 
 
-def mapped(name: str, estimator=None) -> OutlierMap:
+def map_of(name: str, estimator=None) -> OutlierMap:
     X, y = DATA_SETS[name]()
     return outlier_map((estimator or MMRegression()).fit(X, y), X, y)
 
@@ -48,27 +48,27 @@ def pyplot():
     "estimator", [LeastTrimmedSquares(), SRegression(), MMRegression()], ids=lambda e: type(e).__name__
 )
 def test_hawkins_bradu_kass_has_ten_bad_and_four_good_leverage_points(estimator):
-    of = mapped("hbk", estimator)  # Rousseeuw & van Zomeren (1990), figure 4
-    assert found(of, SampleKind.BAD_LEVERAGE) == list(range(1, 11))
-    assert found(of, SampleKind.GOOD_LEVERAGE) == list(range(11, 15))
-    assert found(of, SampleKind.VERTICAL_OUTLIER) == []
+    of = map_of("hbk", estimator)  # Rousseeuw & van Zomeren (1990), figure 4
+    assert rows_of_kind(of, SampleKind.BAD_LEVERAGE) == list(range(1, 11))
+    assert rows_of_kind(of, SampleKind.GOOD_LEVERAGE) == list(range(11, 15))
+    assert rows_of_kind(of, SampleKind.VERTICAL_OUTLIER) == []
 
 
 def test_stackloss_has_vertical_outlier_4_and_bad_leverage_point_21():
-    of = mapped("stackloss", ReweightedLeastSquares("lms"))  # Rousseeuw & van Zomeren (1990), figure 3
-    assert found(of, SampleKind.VERTICAL_OUTLIER) == [4]
-    assert found(of, SampleKind.BAD_LEVERAGE) == [1, 3, 21]
-    assert 2 in found(of, SampleKind.GOOD_LEVERAGE)
+    of = map_of("stackloss", ReweightedLeastSquares("lms"))  # Rousseeuw & van Zomeren (1990), figure 3
+    assert rows_of_kind(of, SampleKind.VERTICAL_OUTLIER) == [4]
+    assert rows_of_kind(of, SampleKind.BAD_LEVERAGE) == [1, 3, 21]
+    assert 2 in rows_of_kind(of, SampleKind.GOOD_LEVERAGE)
 
 
 def test_the_giant_stars_are_bad_leverage_points():
-    assert found(mapped("stars_cyg"), SampleKind.BAD_LEVERAGE) == [11, 20, 30, 34]
+    assert rows_of_kind(map_of("stars_cyg"), SampleKind.BAD_LEVERAGE) == [11, 20, 30, 34]
 
 
 def test_the_calls_from_belgium_are_vertical_outliers():
-    of = mapped("telef")
-    assert found(of, SampleKind.VERTICAL_OUTLIER) == list(range(15, 22))
-    assert found(of, SampleKind.GOOD_LEVERAGE) == found(of, SampleKind.BAD_LEVERAGE) == []
+    of = map_of("telef")
+    assert rows_of_kind(of, SampleKind.VERTICAL_OUTLIER) == list(range(15, 22))
+    assert rows_of_kind(of, SampleKind.GOOD_LEVERAGE) == rows_of_kind(of, SampleKind.BAD_LEVERAGE) == []
 
 
 def test_the_map_has_residuals_over_the_scale_and_robust_distances():
@@ -162,8 +162,8 @@ def test_a_fit_of_several_channels_is_refused():
 
 
 @pytest.mark.usefixtures("pyplot")
-def test_the_picture_shows_every_sample_in_its_region():
-    of = mapped("hbk")
+def test_the_plot_shows_every_sample_in_its_region():
+    of = map_of("hbk")
     ax = of.plot()
     shown = {text.get_text() for text in ax.get_legend().get_texts()}
     assert shown == {"61 regular", "0 vertical outliers", "4 good leverage points", "10 bad leverage points"}
@@ -180,7 +180,7 @@ def test_the_picture_shows_every_sample_in_its_region():
 
 def test_the_map_is_drawn_on_given_axes_with_the_given_number_of_labels(pyplot):
     figure, (left, right) = pyplot.subplots(1, 2)
-    of = mapped("telef")
+    of = map_of("telef")
     assert of.plot(left) is left
     assert of.plot(right, labels=0) is right
     assert {text.get_text() for text in left.texts} >= {"17", "18", "19", "20"}
@@ -201,7 +201,7 @@ def test_without_matplotlib_the_error_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.delitem(sys.modules, "mkc_torch.covariance._outlier_picture", raising=False)
     with pytest.raises(ImportError, match=r"drawn with matplotlib; .*mkc-torch\[cli\]"):
-        mapped("telef").plot()
+        map_of("telef").plot()
 
 
 def test_long_ranges_of_labels_are_abbreviated():
@@ -213,7 +213,7 @@ def test_long_ranges_of_labels_are_abbreviated():
 
 def test_points_connected_by_short_distances_share_a_label():
     page = np.array([[0.0, 0.0], [100.0, 0.0], [10.0, 0.0], [20.0, 5.0], [101.0, 30.0]])
-    assert [sorted(group) for group in together(page, [1, 0, 2, 3, 4])] == [[1], [0, 2, 3], [4]]
+    assert [sorted(group) for group in linked_groups(page, [1, 0, 2, 3, 4])] == [[1], [0, 2, 3], [4]]
 
 
 def test_a_label_overlaps_nothing_or_is_left_out():
@@ -222,5 +222,5 @@ def test_a_label_overlaps_nothing_or_is_left_out():
     assert above.middle[1] > 50.0
     below = free_place(point, "7", 8.0, [above])
     assert below.middle[1] < 50.0
-    assert not below.meets(above)
+    assert not below.overlaps(above)
     assert free_place(point, "7", 8.0, [Box(0.0, 0.0, 100.0, 100.0)]) is None

@@ -31,7 +31,7 @@ scales = st.floats(math.log(1e-3), math.log(1e3)).map(math.exp)
 lengths = st.floats(0.0, math.log(1e5)).map(math.exp)
 
 
-def over_shapes(test):
+def parametrized_over_shapes(test):
     for mark in each_shape:
         test = mark(test)
     return test
@@ -67,7 +67,7 @@ def cumulative(u, sigma, length):
 # --- density and distribution function
 
 
-@over_shapes
+@parametrized_over_shapes
 def test_log_prob_is_the_negative_nll(sigma, length):
     p = distribution(sigma, length, d=0.7, loc=1.5)
     value = 1.5 + 0.7 * length * torch.linspace(-0.99, 0.99, 41, dtype=torch.float64)
@@ -87,7 +87,7 @@ def test_density_integrates_to_one_and_has_the_shape_of_the_definition(sigma, d,
         assert ratio == pytest.approx(head(u, sigma), rel=1e-9, abs=1e-300)
 
 
-@over_shapes
+@parametrized_over_shapes
 def test_cdf_equals_quadrature(sigma, length):
     p = distribution(sigma, length, d=2.0, loc=-3.0)
     for u in (-length, -0.6 * length, -min(0.5, 0.3 * length), 0.0, min(2.0, 0.9 * length), 0.5 * length, length):
@@ -95,7 +95,7 @@ def test_cdf_equals_quadrature(sigma, length):
         assert found == pytest.approx(cumulative(u, sigma, length), abs=1e-11)
 
 
-@over_shapes
+@parametrized_over_shapes
 def test_cdf_rises_from_zero_to_one_and_is_flat_outside_the_domain(sigma, length):
     p = distribution(sigma, length, validate_args=False)
     u = torch.cat([-torch.logspace(2, -3, 300), torch.zeros(1), torch.logspace(-3, 2, 300)]).double() * length / 50
@@ -117,7 +117,7 @@ def test_gradient_of_the_cdf_is_the_density():
 # --- quantiles
 
 
-@over_shapes
+@parametrized_over_shapes
 def test_icdf_inverts_the_cdf(sigma, length):
     p = distribution(sigma, length, d=0.3, loc=2.0)
     tails = [1e-12, 1e-9, 1e-6, 1e-3, 0.02]
@@ -159,7 +159,7 @@ def test_a_uniform_draw_of_zero_gives_a_plausible_sample(dtype, monkeypatch):
     assert p.rsample((3,)).abs().max() < 40  # float32 draws 0 once in 2^24, and the density at -1e5 is exp(-5e9)
 
 
-def test_icdf_takes_any_shape_and_broadcasts():
+def test_icdf_accepts_any_shape_and_broadcasts():
     p = MKCDistribution(torch.tensor([0.5, 2.0, INF]), 1.0, 10.0)
     assert p.icdf(torch.rand(4, 1)).shape == (4, 3)
     assert p.icdf(torch.tensor(0.3)).shape == (3,)
@@ -321,7 +321,7 @@ def test_gradients_of_icdf_at_the_ends_equal_those_of_the_support(sigma):
 # --- moments
 
 
-@over_shapes
+@parametrized_over_shapes
 def test_mean_variance_and_entropy_equal_quadrature(sigma, length):
     p = distribution(sigma, length, d=0.7, loc=4.0)
     mass = integral(lambda u: head(u, sigma), length)
@@ -343,7 +343,7 @@ def test_moments_are_differentiable():
 
 
 @pytest.mark.parametrize("length", [0.5, 1.0, 4.0, 30.0])
-def test_infinite_sigma_is_the_truncated_normal_in_every_method(length):
+def test_infinite_sigma_equals_the_truncated_normal_in_every_method(length):
     p = distribution(INF, length, d=1.7, loc=-0.4)
     exact = stats.truncnorm(-length, length, loc=-0.4, scale=1.7)
     x = np.linspace(-0.999 * length, 0.999 * length, 31) * 1.7 - 0.4
@@ -483,7 +483,7 @@ def test_kl_divergence_is_not_implemented():
         kl_divergence(MKCDistribution(2.0, 1.0, 5.0), MKCDistribution(2.0, 1.0, 5.0))
 
 
-def test_independent_and_transformed_distributions_accept_it():
+def test_independent_and_transformed_distributions_accept_the_distribution():
     base = MKCDistribution(torch.tensor([0.5, 2.0, INF]), 1.0, 10.0)
     joint = Independent(base, 1)
     x = torch.tensor([[0.1, -2.0, 3.0], [5.0, 0.0, 1.0]])

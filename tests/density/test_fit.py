@@ -143,7 +143,7 @@ def test_a_newton_step_never_increases_the_value():
 
 @pytest.mark.parametrize("free", [(True, True), (False, True), (True, False)])
 @pytest.mark.parametrize("weighted", [True, False])
-def test_a_newton_step_of_one_problem_is_that_of_a_batch(free, weighted, monkeypatch):
+def test_a_newton_step_of_a_problem_equals_that_in_a_batch(free, weighted, monkeypatch):
     error = torch.stack([contaminated(s, 80, share) for s, share in ((0, 0.0), (2, 0.3), (4, 0.45))], -1).unsqueeze(0)
     weight = uniform(5, *error.shape) if weighted else None
     weight = None if weight is None else weight / weight.sum(-2, keepdim=True)
@@ -327,7 +327,7 @@ def test_given_parameters_may_differ_by_channel():
 # weights, floor, domain
 
 
-def test_weight_is_repetition():
+def test_integer_weights_equal_repetition():
     error = contaminated(0, 60).unsqueeze(-1)
     count = 1 + (torch.arange(60) % 3)
     weighted = fit_density(error, weight=count.double().unsqueeze(-1), bound=25.0, d_min=1e-3)
@@ -338,7 +338,7 @@ def test_weight_is_repetition():
 
 
 @pytest.mark.parametrize("share", [0.2, 0.6])
-def test_weight_zero_is_removal(share):
+def test_weight_zero_equals_removal(share):
     error = contaminated(0, 100)
     junk = torch.full((round(share / (1 - share) * 100),), 1e5, dtype=torch.float64)
     weight = torch.cat([torch.ones(100), torch.zeros(junk.shape[0])]).double().unsqueeze(-1)
@@ -424,7 +424,7 @@ def test_float32_stays_float32_and_is_close():
     torch.testing.assert_close(fit.d.double(), exact.d, rtol=2e-2, atol=0)
 
 
-def test_float32_converges_too():
+def test_every_fit_in_float32_is_converged():
     fit = fit_density(torch.stack([contaminated(s, 200, 0.05 * (s % 5)) for s in range(20)], -1).float())
     assert bool(fit.converged.all()), f"{int((~fit.converged).sum())} of 20 not"
 

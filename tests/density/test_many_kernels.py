@@ -9,11 +9,11 @@ from scipy import stats
 from mkc_torch import MKCDistribution, fit_density, fit_kernels
 
 
-def drawn(seed, freedom, count=4000):
+def student_t_sample(seed, freedom, count=4000):
     return torch.as_tensor(stats.t(freedom).rvs(count, random_state=seed)).unsqueeze(-1)
 
 
-def mixed(seed, count=4000):
+def contaminated_sample(seed, count=4000):
     g = torch.Generator().manual_seed(seed)
     error = torch.randn(count, 1, generator=g, dtype=torch.float64)
     error[: count // 5] = 40.0 * torch.rand(count // 5, 1, generator=g, dtype=torch.float64) - 20.0
@@ -28,7 +28,7 @@ def single_kernel_likelihood(learned, other, bound):
 @pytest.mark.parametrize("freedom", [1.0, 1.5, 3.0])
 @pytest.mark.parametrize("seed", [10, 11])
 def test_held_out_likelihood_of_a_decreasing_tail_is_near_the_truth_and_above_a_flat_tail(freedom, seed):
-    learned, other = drawn(seed, freedom), drawn(seed + 100, freedom)
+    learned, other = student_t_sample(seed, freedom), student_t_sample(seed + 100, freedom)
     bound = 1.001 * float(torch.cat([learned, other]).abs().max())
     several = float(fit_kernels(learned, bound=bound).log_prob(other).mean())
     truth = float(stats.t(freedom).logpdf(other).mean())
@@ -37,9 +37,9 @@ def test_held_out_likelihood_of_a_decreasing_tail_is_near_the_truth_and_above_a_
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_uniform_outliers_and_gaussian_errors_are_described_as_by_a_single_kernel(seed):
+def test_on_uniform_outliers_and_gaussian_errors_the_likelihood_equals_that_of_a_single_kernel(seed):
     normal = torch.randn(4000, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    for error, bound in ((mixed(seed), 20.0), (normal, 10.0)):
+    for error, bound in ((contaminated_sample(seed), 20.0), (normal, 10.0)):
         order = torch.randperm(4000, generator=torch.Generator().manual_seed(seed))
         learned, other = error[order[:2000]], error[order[2000:]]
         first = single_kernel_likelihood(learned, other, bound)
@@ -47,7 +47,7 @@ def test_uniform_outliers_and_gaussian_errors_are_described_as_by_a_single_kerne
 
 
 def test_the_density_integrates_to_one_over_its_domain():
-    error = torch.cat([drawn(0, 1.0), mixed(1)], -1)
+    error = torch.cat([student_t_sample(0, 1.0), contaminated_sample(1)], -1)
     fit = fit_kernels(error)
     for k in range(2):
         place = torch.linspace(0.0, math.asinh(1e3 * float(fit.bound[k])), 100_001, dtype=torch.float64)
@@ -57,7 +57,7 @@ def test_the_density_integrates_to_one_over_its_domain():
 
 
 def test_the_depths_maximise_the_likelihood():
-    error = drawn(3, 2.0, 500)
+    error = student_t_sample(3, 2.0, 500)
     fit = fit_kernels(error, bound=60.0)
     # the fit adds an error at the bound
     counted = torch.cat([error, fit.bound.unsqueeze(0)])
@@ -76,14 +76,14 @@ def test_the_depths_maximise_the_likelihood():
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_density_is_equivariant_to_the_unit(unit):
-    error = drawn(2, 2.0, 1000)
+    error = student_t_sample(2, 2.0, 1000)
     first, other = fit_kernels(error), fit_kernels(unit * error)
     torch.testing.assert_close(first.log_prob(error), other.log_prob(unit * error) + math.log(unit))
     assert float(first.log_likelihood) == pytest.approx(float(first.log_prob(error).mean()), abs=1e-3)
 
 
 def test_channels_are_fitted_independently():
-    both = torch.cat([drawn(0, 1.0), 7.0 * drawn(1, 5.0)], -1)
+    both = torch.cat([student_t_sample(0, 1.0), 7.0 * student_t_sample(1, 5.0)], -1)
     fit = fit_kernels(both)
     for k in range(2):
         alone = fit_kernels(both[:, k : k + 1])
@@ -91,7 +91,7 @@ def test_channels_are_fitted_independently():
 
 
 def test_residuals_of_exactly_zero_do_not_make_a_spike():
-    error = drawn(0, 3.0)
+    error = student_t_sample(0, 3.0)
     error[:1200] = 0.0
     assert float(fit_kernels(error).log_prob(torch.zeros(1, 1)).exp()) < 100.0
 
@@ -114,13 +114,13 @@ def test_residuals_without_a_density_are_refused(error, bound, match):
 
 
 def test_a_bound_of_a_single_channel_applies_to_all():
-    both = torch.cat([drawn(0, 1.0), drawn(1, 1.0)], -1)
+    both = torch.cat([student_t_sample(0, 1.0), student_t_sample(1, 1.0)], -1)
     shared, separate = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
     assert shared.bound.tolist() == separate.bound.tolist() == [90.0, 90.0]
 
 
 def test_there_is_a_kernel_for_every_octave_up_to_the_bound():
-    bandwidth = fit_kernels(drawn(0, 2.0), bound=300.0).bandwidth[0]
+    bandwidth = fit_kernels(student_t_sample(0, 2.0), bound=300.0).bandwidth[0]
     torch.testing.assert_close(bandwidth[1:-1], 2.0 * bandwidth[:-2])
     assert 150.0 < float(bandwidth[-2]) <= 300.0
     assert math.isinf(float(bandwidth[-1]))

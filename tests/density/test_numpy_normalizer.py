@@ -12,7 +12,7 @@ from mkc_torch.density.head import HEAD_TOLERANCE, head_rule_constants
 from mkc_torch.density.normalizer import _log_partition_and_slopes, log_partition
 
 
-def of_few(kappa, length):
+def numpy_normalizer(kappa, length):
     return log_partition_and_slopes(kappa, length, *(value.numpy() for value in head_rule_constants()), HEAD_TOLERANCE)
 
 
@@ -20,11 +20,11 @@ def of_few(kappa, length):
     kappa=st.one_of(st.just(0.0), st.floats(1e-12, 400.0), st.floats(1e-4, 1e-2)),
     length=st.floats(1e-3, 1e7),
 )
-def test_the_numpy_normaliser_equals_that_of_tensors(kappa, length):
+def test_the_numpy_normaliser_equals_that_of_torch(kappa, length):
     expected = _log_partition_and_slopes(
         *(torch.tensor(value, dtype=torch.float64) for value in (kappa, length)), energy
     )
-    for value, other in zip(of_few(np.asarray(kappa), np.asarray(length)), expected, strict=True):
+    for value, other in zip(numpy_normalizer(np.asarray(kappa), np.asarray(length)), expected, strict=True):
         assert float(value) == pytest.approx(float(other), rel=1e-10, abs=1e-12)
 
 

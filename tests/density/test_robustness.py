@@ -134,7 +134,7 @@ def test_the_optimal_bandwidth_equals_a_numerical_search():
 
 @sampled
 @given(counts(10**6), widths)
-def test_corollary_2(sizes, epsilon):
+def test_the_optimal_bandwidth_satisfies_corollary_2(sizes, epsilon):
     N, M = sizes
     sigma = optimal_bandwidth(double(epsilon), N, M)
     p = torch.exp(-0.5 * (epsilon / sigma).square())
@@ -154,7 +154,7 @@ def test_phi_is_decreasing(q, share, step):
 
 @sampled
 @given(counts(10**4), widths, st.floats(1.001, 50.0))
-def test_the_slope_is_the_derivative(sizes, epsilon, above):
+def test_the_slope_equals_the_derivative(sizes, epsilon, above):
     sigma = (above * least_bandwidth(double(epsilon), *sizes)).requires_grad_()
     bound = error_bound(sigma, 0.5, epsilon, 2.0, *sizes)
     (slope,) = torch.autograd.grad(bound, sigma)
@@ -176,7 +176,7 @@ def test_least_squares_has_no_bound():
         assert float(LeastSquares().fit(torch.ones(100, 1).double(), y).coef_) > 0.009 * outlier
 
 
-def test_limits_of_the_bound():
+def test_the_bound_has_its_limits():
     least = least_bandwidth(double(2.0), 100, 70)
     assert error_bound(least * double([0.1, 1 - 1e-12]), 1.0, 2.0, 1.0, 100, 70).tolist() == [INF, INF]
     assert error_bound_slope(least * 0.5, 1.0, 2.0, 1.0, 100, 70).tolist() == -INF
@@ -280,7 +280,7 @@ def test_breakdown_point_of_a_line_under_leverage():
     assert moved(fewest + 2)
 
 
-def test_breakdown_at_gaussian_noise_is_the_limit():
+def test_the_breakdown_point_of_many_gaussian_errors_equals_its_limit():
     g = torch.Generator().manual_seed(0)
     e = torch.randn(200_000, generator=g, dtype=torch.float64)
     for h in (0.5, 1.0, 3.0):

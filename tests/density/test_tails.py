@@ -24,7 +24,7 @@ def with_outliers(seed: int, share: float, *shape: int) -> Tensor:
     return torch.where(wrong, 40.0 * uniform(seed + 2, *shape) - 20.0, normal(seed, *shape))
 
 
-def drawn(sigma: float, bound: float, seed: int, *shape: int) -> tuple[Tensor, float]:
+def mkc_draws(sigma: float, bound: float, seed: int, *shape: int) -> tuple[Tensor, float]:
     """Draws of the MKC density of scale 1, and its exact probability beyond 3 d."""
     density = MKCDistribution(*(torch.tensor(v, dtype=torch.float64) for v in (sigma, 1.0, bound)))
     exact = 2.0 * float(density.cdf(torch.tensor(-3.0, dtype=torch.float64)))
@@ -33,14 +33,14 @@ def drawn(sigma: float, bound: float, seed: int, *shape: int) -> tuple[Tensor, f
     return torch.from_numpy(np.interp(uniform(seed, *shape), density.cdf(grid), grid)), exact
 
 
-def numbers(tails: Tails) -> list[float]:
+def field_values(tails: Tails) -> list[float]:
     return [float(getattr(tails, name)) for name in FIELDS]
 
 
 # the test
 
 
-def test_the_limit_is_the_five_per_cent_point_of_the_mixture():
+def test_the_critical_value_is_the_five_per_cent_point_of_the_mixture():
     assert 0.5 * chi2.sf(GAUSSIAN_BELOW, 1) == pytest.approx(0.05, abs=2e-4)
 
 
@@ -51,7 +51,7 @@ def test_gaussian_residuals_are_rejected_in_no_more_than_five_per_cent_of_draws(
 
 
 @pytest.mark.parametrize("share", [0.02, 0.05, 0.3])
-def test_outliers_are_found(share):
+def test_outliers_are_detected_as_heavy_tails(share):
     tails = assess_tails(with_outliers(0, share, 200, 500, 1), bound=20.0)
     assert float((~tails.is_gaussian).double().mean()) > 0.95
 
@@ -87,7 +87,7 @@ def test_the_verdict_depends_on_the_ratio_alone():
 @pytest.mark.parametrize(("sigma", "bound"), [(1.5, 10.0), (2.0, 10.0), (2.5, 40.0)])
 @pytest.mark.parametrize("count", [200, 1000])
 def test_the_share_is_within_two_errors_of_the_exact_one_in_95_per_cent_of_draws(sigma, bound, count):
-    error, exact = drawn(sigma, bound, 0, 200, count, 1)
+    error, exact = mkc_draws(sigma, bound, 0, 200, count, 1)
     tails = assess_tails(error, bound=bound)
     covered = (tails.share_beyond - exact).abs() <= 1.96 * tails.share_error
     assert 0.90 <= float(covered.double().mean()) <= 0.99
@@ -96,7 +96,7 @@ def test_the_share_is_within_two_errors_of_the_exact_one_in_95_per_cent_of_draws
 
 
 def test_an_undetected_tail_is_mostly_within_two_errors():
-    error, exact = drawn(3.5, 10.0, 0, 300, 500, 1)
+    error, exact = mkc_draws(3.5, 10.0, 0, 300, 500, 1)
     tails = assess_tails(error, bound=10.0)
     assert 0.3 < float(tails.is_gaussian.double().mean()) < 0.8
     covered = (tails.share_beyond - exact).abs() <= 2.0 * tails.share_error
@@ -118,7 +118,7 @@ def test_the_share_of_a_gaussian_verdict_is_the_gaussian_share():
     assert bool((tails.share_error > 0).all())
     # a Gaussian truncated at 2.5 standard deviations has no mass beyond 3
     narrow = assess_tails(normal(1, 400, 1).clamp(-2.0, 2.0), bound=2.3)
-    assert numbers(narrow)[1:4] == [1.0, 0.0, 0.0]
+    assert field_values(narrow)[1:4] == [1.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(("sigma", "length"), [(1.2, 12.0), (2.5, 8.0), (6.0, 15.0)])
@@ -151,7 +151,9 @@ def test_channels_and_batches_are_assessed_independently():
     for i in range(2):
         for k in range(3):
             alone = assess_tails(error[i, :, k : k + 1], bound=20.0 + 10.0 * k)
-            assert numbers(alone) == pytest.approx([float(getattr(tails, name)[i, k]) for name in FIELDS], rel=1e-4)
+            assert field_values(alone) == pytest.approx(
+                [float(getattr(tails, name)[i, k]) for name in FIELDS], rel=1e-4
+            )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
@@ -177,14 +179,14 @@ def test_a_weight_of_zero_leaves_a_residual_out():
     error = with_outliers(0, 0.05, 300, 1)
     junk = torch.cat([error, torch.full((80, 1), 1e4, dtype=torch.float64)])
     weight = torch.cat([torch.ones(300), torch.zeros(80)]).unsqueeze(-1)
-    assert numbers(assess_tails(junk, weight)) == pytest.approx(numbers(assess_tails(error)), rel=1e-6)
+    assert field_values(assess_tails(junk, weight)) == pytest.approx(field_values(assess_tails(error)), rel=1e-6)
 
 
 def test_the_scale_of_weights_is_irrelevant_and_uneven_weights_reduce_the_count():
     error, weight = with_outliers(0, 0.05, 400, 1), uniform(7, 400, 1)
     tails = assess_tails(error, weight, bound=20.0)
     assert float(tails.count) == pytest.approx(float(weight.sum() ** 2 / weight.square().sum()))
-    assert numbers(assess_tails(error, 1e5 * weight, bound=20.0)) == pytest.approx(numbers(tails), rel=1e-5)
+    assert field_values(assess_tails(error, 1e5 * weight, bound=20.0)) == pytest.approx(field_values(tails), rel=1e-5)
 
 
 def test_weighted_gaussian_residuals_are_rejected_in_no_more_than_five_per_cent_of_draws():
@@ -203,13 +205,15 @@ def test_fewer_independent_residuals_give_a_smaller_ratio():
 
 def test_arrays_are_accepted():
     error = with_outliers(0, 0.05, 300, 1)
-    assert numbers(assess_tails(np.asarray(error), np.ones((300, 1)))) == pytest.approx(numbers(assess_tails(error)))
+    assert field_values(assess_tails(np.asarray(error), np.ones((300, 1)))) == pytest.approx(
+        field_values(assess_tails(error))
+    )
 
 
 # the result of fit_density
 
 
-def test_a_density_fit_has_its_tails():
+def test_the_tails_of_a_density_fit_equal_their_assessment():
     error = torch.stack([with_outliers(0, 0.05, 300), normal(3, 300)], -1)
     weight = uniform(7, 300, 1)
     fit = fit_density(error, weight=weight, bound=25.0, d_min=0.01)
@@ -229,7 +233,7 @@ def test_the_tails_use_a_copy_of_the_fitted_residuals():
     fit, expected = fit_density(error), assess_tails(error)
     with torch.no_grad():
         error.zero_()  # as if the caller overwrote its buffer
-    assert numbers(fit.tails) == numbers(expected)
+    assert field_values(fit.tails) == field_values(expected)
     assert not fit.tails.share_beyond.requires_grad
 
 
@@ -257,7 +261,7 @@ def test_autocorrelated_gaussian_series_are_rejected_in_no_more_than_five_per_ce
     assert rejected <= 4
 
 
-def test_outliers_of_an_autocorrelated_series_are_found():
+def test_outliers_of_an_autocorrelated_series_are_detected_as_heavy_tails():
     series = autoregressive(0, 0.9, 4, 1000)
     hit = uniform(3, 4, 1000) < 0.02
     found = time_series_tails(torch.where(hit, series + 8.0 * normal(5, 4, 1000), series).mT)

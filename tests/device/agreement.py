@@ -24,7 +24,7 @@ TOLERANCE = {torch.float32: 3e-5, torch.float64: 1e-7, torch.bfloat16: 2e-2, tor
 """Tolerance of the largest difference, relative to the largest number, by the dtype of the predictions."""
 
 
-def found(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> list[Tensor]:
+def value_and_gradients(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> list[Tensor]:
     """Value and gradients of the second of two batches, under an upstream gradient that is not 1."""
     for _ in range(2):
         leaf = input.clone().requires_grad_()
@@ -45,15 +45,15 @@ Case = tuple[str, tuple[int, ...], int, str, bool, torch.dtype]
 def cases() -> list[Case]:
     """All dtypes, weights and reductions on the first shape; the other shapes in float32."""
     first, *others = SHAPES
-    found: list[Case] = []
+    chosen: list[Case] = []
     for name in MODES:
-        found += [(name, *first, "mean", weighted, dtype) for weighted in (False, True) for dtype in TOLERANCE]
-        found += [(name, *first, reduction, True, torch.float32) for reduction in ("sum", "none")]
-        found += [(name, *shape, "mean", i % 2 == 0, torch.float32) for i, shape in enumerate(others)]
-    return found
+        chosen += [(name, *first, "mean", weighted, dtype) for weighted in (False, True) for dtype in TOLERANCE]
+        chosen += [(name, *first, reduction, True, torch.float32) for reduction in ("sum", "none")]
+        chosen += [(name, *shape, "mean", i % 2 == 0, torch.float32) for i, shape in enumerate(others)]
+    return chosen
 
 
-def compared(device: str, case: Case) -> list[tuple[str, float]]:
+def relative_differences(device: str, case: Case) -> list[tuple[str, float]]:
     """Name of each compared quantity, and its largest difference relative to the largest number."""
     name, shape, axis, reduction, weighted, dtype = case
     generator = torch.Generator().manual_seed(1)
@@ -64,8 +64,8 @@ def compared(device: str, case: Case) -> list[tuple[str, float]]:
     loss, reference = MKCLoss(shape[axis], **options).to(device), MKCLoss(shape[axis], **options).double()
     if dtype == torch.float64:
         loss = loss.double()
-    on_device = found(loss, x.to(device), y.to(device), None if weight is None else weight.to(device))
-    expected = found(reference, x.double(), y.double(), None if weight is None else weight.double())
+    on_device = value_and_gradients(loss, x.to(device), y.to(device), None if weight is None else weight.to(device))
+    expected = value_and_gradients(reference, x.double(), y.double(), None if weight is None else weight.double())
     rows = []
     for what, value, other in zip(("value", "input", "sigma", "d"), on_device, expected, strict=False):
         # gradients of float16 still have the gradient scaler's factor
@@ -79,7 +79,7 @@ def compared(device: str, case: Case) -> list[tuple[str, float]]:
 def print_agreement(device: torch.device) -> bool:
     """Print the largest difference of each dtype. Returns whether all are within the tolerances."""
     todo = cases()
-    run = functools.partial(compared, str(device))
+    run = functools.partial(relative_differences, str(device))
     if device.type == "cuda":  # compiling takes most of the time
         with torch.multiprocessing.get_context("spawn").Pool(8) as pool:
             answers = pool.map(run, todo, chunksize=1)

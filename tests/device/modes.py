@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mkc_torch import MKCLoss
 
 FIXED: dict[str, Any] = {"d": 1.0, "sigma": 2.0, "learn_sigma": False, "learn_d": False}
-MODES: dict[str, dict[str, Any]] = {"fixed": FIXED, "learned": {"d": 1.0}, "as it comes": {}}
+MODES: dict[str, dict[str, Any]] = {"fixed": FIXED, "learned": {"d": 1.0}, "default": {}}
 
 
 class LearnedGaussianNLL(nn.Module):
@@ -82,7 +82,7 @@ def synchronise(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def seconds(step: Callable[[], object], device: torch.device, *, budget: float = 0.4, least: int = 5) -> float:
+def median_seconds(step: Callable[[], object], device: torch.device, *, budget: float = 0.4, least: int = 5) -> float:
     """Median seconds of a step, over groups of steps within ``budget`` seconds."""
     for _ in range(3):
         step()
@@ -109,9 +109,9 @@ def copy_rate(device: torch.device, size: int) -> float:
     """Bytes read and written per second by a copy of ``size`` float32 numbers."""
     source = torch.empty(size, device=device).normal_()
     out = torch.empty_like(source)
-    return 8.0 * size / seconds(lambda: out.copy_(source), device, budget=0.2)
+    return 8.0 * size / median_seconds(lambda: out.copy_(source), device, budget=0.2)
 
 
-def made(name: str, channels: int, device: torch.device, **options: Any) -> MKCLoss:
+def make_loss(name: str, channels: int, device: torch.device, **options: Any) -> MKCLoss:
     """The loss in a mode."""
     return MKCLoss(channels, **{**MODES[name], **options}).to(device)

@@ -13,7 +13,7 @@ from mkc_torch.linear import MKCRegression
 from mkc_torch.nonlinear import fit as nonlinear_fit
 from tests.device.small_fits import problems
 
-MOST_APART = 1e-6
+TOLERANCE = 1e-6
 """Largest difference from the CPU's result, in units of its largest element."""
 
 CPU = torch.device("cpu")
@@ -65,6 +65,6 @@ def print_other_fits(device: torch.device) -> bool:
     for name, work in WORK.items():
         expected, found = work(CPU), work(device)
         apart = float((found.cpu() - expected).abs().max() / expected.abs().max())
-        right = right and apart <= MOST_APART and found.device.type == device.type
+        right = right and apart <= TOLERANCE and found.device.type == device.type
         print(f"  {name:30}{apart:10.1e} of {MOST_APART:.0e}", flush=True)
     return right

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss
 from tests.device.agreement import TOLERANCE
-from tests.device.modes import copy_rate, seconds
+from tests.device.modes import copy_rate, median_seconds
 
 ELEMENTS = 1 << 26
 """Elements of the timed batches on a GPU."""
@@ -111,7 +111,7 @@ def print_times(device: torch.device) -> None:
 
     def row(name: str, make: Callable[[], Callable[[], None]], floor: float) -> None:
         try:
-            time = seconds(make(), device, budget=0.2)
+            time = median_seconds(make(), device, budget=0.2)
         except torch.cuda.OutOfMemoryError:
             print(f"  {name:44} out of memory")
             return

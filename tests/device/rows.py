@@ -16,7 +16,7 @@ COLUMNS = 9
 REPEATS = 5
 """Number of timings; the least is printed."""
 
-MOST_APART = 1e-3
+TOLERANCE = 1e-3
 """Largest difference from the CPU's coefficients, in standard errors; those of float32 data are rounded to float32."""
 
 
@@ -30,7 +30,7 @@ def sample(rows: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor,
     return X, y
 
 
-def milliseconds(work: Callable[[], object], device: torch.device) -> float:
+def least_milliseconds(work: Callable[[], object], device: torch.device) -> float:
     """The least time of a few runs after a first run, which compiles."""
     work()
     best = float("inf")
@@ -43,7 +43,7 @@ def milliseconds(work: Callable[[], object], device: torch.device) -> float:
     return best
 
 
-def apart(fit: MKCRegression, other: MKCRegression) -> float:
+def difference_in_standard_errors(fit: MKCRegression, other: MKCRegression) -> float:
     """Largest difference of the coefficients, in standard errors."""
     difference = fit.coef_.cpu().double() - other.coef_.double()
     return float((difference.abs() / other.standard_error_.double()).max())
@@ -56,12 +56,12 @@ def print_rows(device: torch.device, sizes: tuple[int, ...]) -> bool:
     for rows in sizes:
         for dtype in (torch.float32, torch.float64):
             X, y = sample(rows, dtype, device)
-            taken = milliseconds(lambda: MKCRegression().fit(X, y), device)  # noqa: B023 - called in this round of the loop
-            normal = milliseconds(lambda: torch.linalg.solve(X.mT @ X, X.mT @ y), device)  # noqa: B023 - called in this round of the loop
+            taken = least_milliseconds(lambda: MKCRegression().fit(X, y), device)  # noqa: B023 - called in this round of the loop
+            normal = least_milliseconds(lambda: torch.linalg.solve(X.mT @ X, X.mT @ y), device)  # noqa: B023 - called in this round of the loop
             # the domain, which depends on the pilot's rounding, is that of the device
             fit = MKCRegression().fit(X, y)
-            own = apart(fit, MKCRegression(bound=fit.bound_.cpu()).fit(X.cpu(), y.cpu()))
-            agree = agree and own < MOST_APART
+            own = difference_in_standard_errors(fit, MKCRegression(bound=fit.bound_.cpu()).fit(X.cpu(), y.cpu()))
+            agree = agree and own < TOLERANCE
             name = str(dtype).removeprefix("torch.")
             print(f"  {rows:>12} {name:8}{taken:10.1f}{normal:18.2f}{taken / normal:8.0f}{own:13.1e}", flush=True)
     return agree

@@ -59,7 +59,7 @@ def standard_errors(X: Tensor, y: Tensor, coef: Tensor) -> Tensor:
     return scale.unsqueeze(-1) * inverse.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
-def objective(fit: LinearEstimator) -> Tensor | None:
+def objective_of(fit: LinearEstimator) -> Tensor | None:
     """What a fit makes small, (B,), where it has an attribute for that."""
     for name, sign in (("objective_", 1.0), ("log_likelihood_", -1.0), ("entropy_", 1.0)):
         if hasattr(fit, name):
@@ -77,7 +77,7 @@ def agreement(make: Callable[[], LinearEstimator], fit: LinearEstimator, X: Tens
     some = len(y)
     off = (fit.coef_[:some].cpu().double() - reference.coef_).abs() / standard_errors(X, y, reference.coef_)
     near = off.amax(-1) <= 1e-5
-    found, expected = objective(fit), objective(reference)
+    found, expected = objective_of(fit), objective_of(reference)
     if found is None or expected is None:
         return float(near.double().mean()), float(near.double().mean()) >= 0.999
     worse = ~near & (found[:some] > expected + 1e-6 * expected.abs().clamp(min=1.0))

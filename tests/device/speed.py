@@ -10,7 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch import MKCLoss
-from tests.device.modes import FIXED, MODES, LearnedGaussianNLL, LearnedStudentT, Step, batch, copy_rate, made, seconds
+from tests.device.modes import (
+    FIXED,
+    MODES,
+    LearnedGaussianNLL,
+    LearnedStudentT,
+    Step,
+    batch,
+    copy_rate,
+    make_loss,
+    median_seconds,
+)
 
 CHANNELS = 4
 
@@ -20,14 +30,14 @@ def step_of(loss: Any, input: Tensor, target: Tensor, **rest: Any) -> Step:
     return Step(loss, list(loss.parameters()), input, target, **rest)
 
 
-def makers(device: torch.device) -> dict[str, Callable[[], nn.Module]]:
+def loss_factories(device: torch.device) -> dict[str, Callable[[], nn.Module]]:
     """The losses of the table."""
     found: dict[str, Callable[[], nn.Module]] = {
         "HuberLoss": nn.HuberLoss,
         "GaussianNLLLoss, learned": lambda: LearnedGaussianNLL(CHANNELS).to(device),
     }
     for name in MODES:
-        found[f"MKCLoss, {name}"] = lambda name=name: made(name, CHANNELS, device)
+        found[f"MKCLoss, {name}"] = lambda name=name: make_loss(name, CHANNELS, device)
     return found
 
 
@@ -66,12 +76,12 @@ def captured_time(step: Step, device: torch.device) -> float | None:
     step.input.grad = None
     with torch.cuda.graph(graph):
         step()
-    return seconds(graph.replay, device, budget=0.1)
+    return median_seconds(graph.replay, device, budget=0.1)
 
 
-def measured(step: Step, size: int, rate: float, device: torch.device) -> str:
+def table_row(step: Step, size: int, rate: float, device: torch.device) -> str:
     """A row: time, time of the replayed graph, ratio to the floor, memory over the input, kernels, synchronisations."""
-    time = seconds(step, device, budget=0.2)
+    time = median_seconds(step, device, budget=0.2)
     try:
         alone = captured_time(step, device)
     except RuntimeError:  # a loss that reads values
@@ -97,16 +107,16 @@ def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool)
     print(
         f"  {'loss':34}{'elements':>12}{'ms':>10}{'graph':>10}{'over floor':>12}{'memory':>8}{'kernels':>9}{'syncs':>7}"
     )
-    rows: dict[str, Any] = {name: make() for name, make in makers(device).items()}
+    rows: dict[str, Any] = {name: make() for name, make in loss_factories(device).items()}
     if compiled:
         rows = {"Student t, learned": LearnedStudentT(CHANNELS).to(device)}
-        rows |= {f"MKCLoss, {name}": made(name, CHANNELS, device) for name in MODES}
+        rows |= {f"MKCLoss, {name}": make_loss(name, CHANNELS, device) for name in MODES}
         rows = {f"{name}, compiled": torch.compile(loss, fullgraph=True) for name, loss in rows.items()}
     for name, loss in rows.items():
         for size in sizes:
             step = step_of(loss, *batch(size // CHANNELS, CHANNELS, device))
             try:
-                row = measured(step, size, rate, device)
+                row = table_row(step, size, rate, device)
             except Exception as error:  # compilers raise their own exception types; the row names the type
                 row = f"{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}"
             print(f"  {name:34}{row}", flush=True)
@@ -133,7 +143,7 @@ def print_variants(device: torch.device, size: int) -> None:
     )
 
     def line(name: str, what: str, step: Step, bytes_each: float) -> None:
-        eager, alone = seconds(step, device, budget=0.1, least=3), captured_time(step, device)
+        eager, alone = median_seconds(step, device, budget=0.1, least=3), captured_time(step, device)
         over = (eager if alone is None else alone) * rate / (bytes_each * step.input.numel())
         text = "-" if alone is None else f"{1e3 * alone:.3f}"
         print(f"  {name:12} {what:22} {1e3 * eager:9.3f} ms, graph {text:>7} ms {over:6.2f} x its floor", flush=True)
@@ -141,7 +151,7 @@ def print_variants(device: torch.device, size: int) -> None:
     for name, options in MODES.items():
         for what, dtype, floor, extra, rest in rows:
             given = batch(size // CHANNELS, CHANNELS, device, dtype)
-            line(name, what, step_of(made(name, CHANNELS, device, **extra), *given, **rest), floor)
+            line(name, what, step_of(make_loss(name, CHANNELS, device, **extra), *given, **rest), floor)
         for what, shape, axis in layouts:
             x, y = torch.randn(shape, device=device).requires_grad_(), torch.randn(shape, device=device)
             line(name, what, step_of(MKCLoss(shape[axis], channel_dim=axis, **options).to(device), x, y), 12.0)
@@ -167,8 +177,8 @@ def print_training(device: torch.device) -> None:
     """Print the time of a training step with each loss, relative to Huber's; the losses in turn, three times."""
     times: dict[str, list[float]] = {}
     for _ in range(3):
-        for name, make in makers(device).items():
-            times.setdefault(name, []).append(seconds(Training(make(), device), device, budget=0.6))
+        for name, make in loss_factories(device).items():
+            times.setdefault(name, []).append(median_seconds(Training(make(), device), device, budget=0.6))
     reference = statistics.median(times["HuberLoss"])
     for name, found in times.items():
         time = statistics.median(found)
@@ -203,5 +213,5 @@ def print_capture(device: torch.device) -> None:
         torch.cuda.synchronize()
         pairs = zip(loss.state_dict().values(), twin.state_dict().values(), strict=True)
         off = max([0.0, *(float((value.double() - other.double()).abs().max()) for value, other in pairs)])
-        time = seconds(graph.replay, device, budget=0.2)
+        time = median_seconds(graph.replay, device, budget=0.2)
         print(f"  {name:20} captured; state differs by {off:.1e} after 50 batches; a replay {1e3 * time:.4f} ms")

@@ -1,7 +1,7 @@
-"""Feed the readers of recordings bytes that libFuzzer makes up, by atheris: `python -m tests.fuzz.readers --minutes N`.
+"""Fuzz the readers of recordings by atheris and libFuzzer: `python -m tests.fuzz.readers --minutes N`.
 
-Each format gets its share of the time, in a process of its own, and begins with a whole file of its kind. A crash is
-anything but rows, or one of the errors that are meant for the user; so is the end of the process, and a file that takes
+Each format gets an equal share of the time, in its own process, and starts from a valid file of its kind. A crash is
+any outcome other than rows or an error meant for the user; so is the end of the process, and a file that takes
 a minute. Inputs that crash are kept in the folder that `--output` names.
 """
 
@@ -52,7 +52,7 @@ SEEDS[".bag"].append(lambda path, given: writers.rosbag1(path, given, "lz4"))
 
 
 def main() -> None:
-    """All formats, or those named, one after the other; exit code 1 where something crashed."""
+    """Fuzz all formats, or those named, in turn, and print a row for each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--output", type=Path, default=Path("crashes"))
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def counts_of(ending: str, output: Path, minutes: float) -> dict[str, int]:
-    """Fuzz a format in processes of their own until its time is over: one that a crash ends is followed by another."""
+    """Fuzz a format until its time is over; a process that crashes is restarted. Returns its counts."""
     folder = output / ending.lstrip(".")
     folder.mkdir(parents=True, exist_ok=True)
     total = {"tried": 0, "rows": 0, "crashed": 0}

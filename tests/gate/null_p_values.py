@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     settings = {"seed": options.seed, "surrogates": options.surrogates}
     found = run(options.output, options.kinds, options.per_kind, settings)
-    rows = {kind: {**numbers(values), "counts": counts(values)} for kind, values in found.items()}
+    rows = {kind: {**summary_row(values), "counts": counts(values)} for kind, values in found.items()}
     (options.output / "summary.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
     (options.output / "null_p_values.svg").write_text(picture(found), encoding="utf-8")
     print("\n".join(table(rows)))
@@ -93,7 +93,7 @@ def searched(empty: Recording, surrogates: int) -> float:
     return diagnose(Spring(), empty, surrogates=surrogates, level=LEVEL, max_findings=0).p_value
 
 
-def numbers(p_values: Sequence[float]) -> dict[str, float]:
+def summary_row(p_values: Sequence[float]) -> dict[str, float]:
     """The numbers of a row of the table.
 
     Example:

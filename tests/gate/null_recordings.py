@@ -69,12 +69,12 @@ def recording(kind: str, seed: int) -> Recording:
     force = sum(
         random.normal() * np.sin(w * time + random.uniform(0.0, 2.0 * np.pi)) for w in (0.4, 0.9, 1.7, 2.9, 6.0)
     )
-    place = _moved(force, disturbance(random), held, random.normal(0.0, 0.5, 2))
+    place = _simulated_place(force, disturbance(random), held, random.normal(0.0, 0.5, 2))
     columns = {"time": time, "force": force, "place": place + sensor(random)}
     return Recording({name: torch.from_numpy(values) for name, values in columns.items()}, name=kind)
 
 
-def _moved(force: Array, disturbance: Array, held: bool, begin: Array) -> Array:
+def _simulated_place(force: Array, disturbance: Array, held: bool, begin: Array) -> Array:
     """The place at the samples, by the midpoint rule, with errors far below the noise."""
     h, found, x = STEP / FINE, [], begin
     for k in range(SAMPLES):

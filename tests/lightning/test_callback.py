@@ -38,7 +38,7 @@ LEARNED = {"learn_sigma": True, "learn_d": True}
 each_kind = pytest.mark.parametrize("kind", [FIXED, LEARNED], ids=["fixed", "learned"])
 
 
-def drawn(*shape, sigma=2.5, d=0.5, bound=100.0, seed=0):
+def residual_draws(*shape, sigma=2.5, d=0.5, bound=100.0, seed=0):
     """Residuals of a heavy-tailed density."""
     torch.manual_seed(seed)
     return MKCDistribution(torch.tensor(sigma), torch.tensor(d), bound).sample(shape)
@@ -90,7 +90,7 @@ class Regression(LightningModule):
         return [optimiser], [torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.95)]
 
 
-class Watch(Callback):
+class ParameterHistory(Callback):
     """Records the parameters after each training batch and each epoch."""
 
     def __init__(self):
@@ -153,7 +153,7 @@ def warnings_of(record):
 
 @each_kind
 def test_each_epoch_ends_with_the_maximum_likelihood_density_of_its_residuals(kind):
-    error = drawn(1000, 2)
+    error = residual_draws(1000, 2)
     module, _ = trained(Replay(**kind), loader(error), max_epochs=2)
     assert_fitted(module.criterion, error)
 
@@ -162,7 +162,7 @@ def test_each_epoch_ends_with_the_maximum_likelihood_density_of_its_residuals(ki
 def test_a_linear_model_agrees_with_mkc_regression():
     torch.manual_seed(0)
     x, truth = torch.randn(1000, 3), torch.tensor([1.0, -2.0, 0.5])
-    y = (x @ truth + drawn(1000)).unsqueeze(-1)
+    y = (x @ truth + residual_draws(1000)).unsqueeze(-1)
     module, trainer = trained(Regression(), loader(x, y, batch_size=200), max_epochs=50)
     design = torch.cat([x, torch.ones(1000, 1)], -1)
     fit = MKCRegression(bound=150.0).fit(design.double(), y.squeeze(-1).double())
@@ -185,7 +185,7 @@ def test_alternation_raises_the_likelihood():
             self.values.append(trainer.callback_metrics["criterion/log_likelihood_0"].item())
 
     x = torch.randn(600, 3, generator=torch.Generator().manual_seed(0))
-    y = x.sum(-1, keepdim=True) + drawn(600, 1)
+    y = x.sum(-1, keepdim=True) + residual_draws(600, 1)
     likelihood = Likelihood()
     trained(Regression(lr=0.02), loader(x, y), MKCExpectationMaximization(graduated=False), likelihood, max_epochs=12)
     rise = torch.tensor(likelihood.values).diff()
@@ -200,7 +200,7 @@ def quantiles(count):
 
 
 def test_a_clean_channel_becomes_gaussian_and_a_contaminated_channel_does_not():
-    error = torch.stack([0.3 * quantiles(2000), drawn(2000)], -1)
+    error = torch.stack([0.3 * quantiles(2000), residual_draws(2000)], -1)
     fixed, _ = trained(Replay(**FIXED), loader(error))
     learned, _ = trained(Replay(**LEARNED), loader(error))
     assert fixed.criterion.sigma[0] == INF
@@ -218,20 +218,20 @@ def test_infinite_sigma_is_exact_for_a_fixed_loss_and_capped_for_a_learned_one_a
     assert torch.isfinite(learned.criterion.raw_kappa).all()
 
 
-def test_channels_in_another_dimension_weights_per_sample_and_masked_nans():
-    error, keep = drawn(300, 3, 4), torch.rand(300, 4) < 0.7
+def test_channels_in_another_dimension_weights_per_sample_and_masked_nans_are_accepted():
+    error, keep = residual_draws(300, 3, 4), torch.rand(300, 4) < 0.7
     holed = torch.where(keep.unsqueeze(1), error, NAN)
     module, _ = trained(Replay(3, channel_dim=1), loader(holed, keep, batch_size=32))
     assert_fitted(module.criterion, error.movedim(1, -1)[keep])
 
 
-def test_weights_by_keyword():
+def test_weights_given_by_keyword_are_used():
     class ByKeyword(Replay):
         def training_step(self, batch):
             error, weight = batch
             return self.criterion(target=0 * error, weight=weight, input=error + 0 * self.shift)
 
-    error, weight = drawn(600, 2), torch.rand(600, 2)
+    error, weight = residual_draws(600, 2), torch.rand(600, 2)
     module, _ = trained(ByKeyword(), loader(error, weight))
     assert_fitted(module.criterion, error, weight.double())
 
@@ -240,8 +240,8 @@ def test_weights_by_keyword():
 
 
 def test_gradient_accumulation_counts_optimiser_steps():
-    watch = Watch()
-    data = loader(drawn(1600, 2))  # 16 batches, 6 steps an epoch: the last of 1 batch
+    watch = ParameterHistory()
+    data = loader(residual_draws(1600, 2))  # 16 batches, 6 steps an epoch: the last of 1 batch
     callback = MKCExpectationMaximization(every_n_steps=2)
     trained(Replay(), data, callback, watch, max_epochs=2, accumulate_grad_batches=3)
     assert [step for step, *_ in watch.batches[:6]] == [0, 0, 1, 1, 1, 2]
@@ -249,13 +249,13 @@ def test_gradient_accumulation_counts_optimiser_steps():
 
 
 def test_steps_are_counted_over_epochs():
-    watch = Watch()
-    trained(Replay(), loader(drawn(500, 2)), MKCExpectationMaximization(every_n_steps=3), watch, max_epochs=3)
+    watch = ParameterHistory()
+    trained(Replay(), loader(residual_draws(500, 2)), MKCExpectationMaximization(every_n_steps=3), watch, max_epochs=3)
     assert watch.steps_of_change() == [3, 6, 9, 12, 15]
     assert len(watch.batches) == 15
 
 
-def test_steps_of_several_optimisers():
+def test_steps_of_several_optimisers_are_counted():
     class Manual(Replay):
         automatic_optimization = False
 
@@ -272,8 +272,8 @@ def test_steps_of_several_optimisers():
         def configure_optimizers(self):
             return [super(Manual, self).configure_optimizers() for _ in range(2)]
 
-    watch = Watch()
-    trained(Manual(), loader(drawn(500, 2)), MKCExpectationMaximization(every_n_steps=3), watch)
+    watch = ParameterHistory()
+    trained(Manual(), loader(residual_draws(500, 2)), MKCExpectationMaximization(every_n_steps=3), watch)
     assert watch.steps_of_change() == [4, 6, 10]
 
 
@@ -284,20 +284,22 @@ def test_the_epoch_ends_before_its_validation():
         def validation_step(self, _batch):
             seen.append(self.criterion.d.clone())
 
-    module, _ = trained(Validated(), loader(drawn(500, 2)), val=loader(drawn(50, 2)), num_sanity_val_steps=0)
+    module, _ = trained(
+        Validated(), loader(residual_draws(500, 2)), val=loader(residual_draws(50, 2)), num_sanity_val_steps=0
+    )
     assert torch.equal(seen[-1], module.criterion.d)
     assert not torch.equal(seen[-1], torch.ones(2))
 
 
 def test_training_that_stops_within_an_epoch_uses_the_collected_residuals():
-    error = drawn(1000, 2)
+    error = residual_draws(1000, 2)
     module, _ = trained(Replay(), loader(error), max_epochs=None, max_steps=4)
     assert_fitted(module.criterion, error[:400])
 
 
 def test_warm_up_changes_no_values_and_its_residuals_are_not_used():
-    watch, module = Watch(), Replay(growth=3.0, bound=900.0)
-    error = drawn(500, 2)
+    watch, module = ParameterHistory(), Replay(growth=3.0, bound=900.0)
+    error = residual_draws(500, 2)
     trained(module, loader(error), MKCExpectationMaximization(warmup_epochs=2), watch, max_epochs=3)
     assert all(torch.equal(d, torch.ones(2)) for _, _, d in watch.batches[:14])
     assert_fitted(module.criterion, 9 * error)
@@ -305,7 +307,7 @@ def test_warm_up_changes_no_values_and_its_residuals_are_not_used():
 
 @pytest.mark.parametrize("every_n_steps", [None, 5])
 def test_annealing_brings_sigma_down_and_refits_d(every_n_steps):
-    watch, error = Watch(), drawn(1000, 1)
+    watch, error = ParameterHistory(), residual_draws(1000, 1)
     callback = MKCExpectationMaximization(warmup_epochs=1, anneal_epochs=4, every_n_steps=every_n_steps)
     trained(Replay(1), loader(error, batch_size=200), callback, watch, max_epochs=6)
     fit = fit_density(error.double(), bound=100.0, d_min=1e-3)
@@ -317,7 +319,7 @@ def test_annealing_brings_sigma_down_and_refits_d(every_n_steps):
 
 
 def test_damping_keeps_part_of_the_values_from_the_second_step_on():
-    watch, error = Watch(), drawn(1000, 1)
+    watch, error = ParameterHistory(), residual_draws(1000, 1)
     trained(Replay(1, growth=0.25), loader(error), MKCExpectationMaximization(damping=0.5), watch, max_epochs=2)
     first, second = (fit_density(0.25**t * error.double(), bound=100.0, d_min=1e-3) for t in (0, 1))
     torch.testing.assert_close(watch.epochs[0][2].double(), first.d, rtol=1e-3, atol=0)
@@ -330,15 +332,20 @@ def test_damping_keeps_part_of_the_values_from_the_second_step_on():
 
 
 def test_only_residuals_of_the_last_epoch_are_used():
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     module, _ = trained(Replay(growth=2.0, bound=400.0), loader(error), max_epochs=3)
     assert_fitted(module.criterion, 4 * error)
 
 
 def test_sanity_check_and_validation_add_nothing():
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     module, _ = trained(
-        Replay(), loader(error), val=loader(drawn(300, 2)), num_sanity_val_steps=2, val_check_interval=2, max_epochs=2
+        Replay(),
+        loader(error),
+        val=loader(residual_draws(300, 2)),
+        num_sanity_val_steps=2,
+        val_check_interval=2,
+        max_epochs=2,
     )
     assert_fitted(module.criterion, error)
 
@@ -353,7 +360,7 @@ def test_calls_without_gradients_or_in_evaluation_mode_add_nothing():
             self.criterion.train()
             return super().training_step(batch)
 
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     module, _ = trained(Chatty(), loader(error))
     assert_fitted(module.criterion, error)
 
@@ -363,20 +370,20 @@ def test_validate_and_test_change_nothing(call):
     module = Replay(**LEARNED)
     before = copy.deepcopy(module.state_dict())
     trainer = trainer_of(MKCExpectationMaximization())
-    getattr(trainer, call)(module, loader(drawn(100, 2)), verbose=False)
+    getattr(trainer, call)(module, loader(residual_draws(100, 2)), verbose=False)
     assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())
     assert all(p.requires_grad for p in module.parameters())
     assert not module.criterion._forward_hooks
 
 
 def test_mixed_precision_keeps_the_residuals_in_float32():
-    error = drawn(1000, 2)
+    error = residual_draws(1000, 2)
     module, _ = trained(Replay(), loader(error), precision="bf16-mixed")
     assert_fitted(module.criterion, error)
 
 
-def test_double_precision():
-    error = drawn(500, 2).double()
+def test_double_precision_is_kept():
+    error = residual_draws(500, 2).double()
     module, _ = trained(Replay(), loader(error), MKCExpectationMaximization(damping=0.5), precision="64-true")
     assert module.criterion.d.dtype == torch.float64
     assert_fitted(module.criterion, error)
@@ -388,35 +395,35 @@ def test_low_precision_residuals_are_subtracted_in_float32():
             target = torch.full_like(batch[0], 64.0)
             return self.criterion((batch[0] + 64).bfloat16() + 0 * self.shift, target)
 
-    error = drawn(1000, 2)
+    error = residual_draws(1000, 2)
     module, _ = trained(Far(), loader(error))
     assert_fitted(module.criterion, (error + 64).bfloat16().float() - 64)
 
 
-def test_mixed_precision_of_a_network():
+def test_a_network_in_mixed_precision_learns_the_scale():
     x = torch.randn(600, 3, generator=torch.Generator().manual_seed(0))
-    y = x.sum(-1, keepdim=True) + drawn(600, 1)
+    y = x.sum(-1, keepdim=True) + residual_draws(600, 1)
     module, _ = trained(Regression(), loader(x, y), max_epochs=15, precision="bf16-mixed")
     assert module.criterion.d.item() == pytest.approx(0.5, rel=0.2)
 
 
-def test_several_loaders():
+def test_residuals_of_several_loaders_are_collected():
     class Two(Replay):
         def training_step(self, batch):
             return sum(Replay.training_step(self, batch[k]) for k in ("a", "b"))
 
-    a, b = drawn(300, 2), drawn(300, 2, d=1.0, seed=1)
+    a, b = residual_draws(300, 2), residual_draws(300, 2, d=1.0, seed=1)
     data = CombinedLoader({"a": loader(a), "b": loader(b)}, "max_size_cycle")
     module, _ = trained(Two(), data)
     assert_fitted(module.criterion, torch.cat([a, b]))
 
 
-def test_a_loader_without_a_length_and_a_limit_on_batches():
+def test_residuals_of_a_stream_and_of_a_limited_number_of_batches_are_collected():
     class Stream(IterableDataset):
         def __iter__(self):
             yield from error
 
-    error = drawn(450, 2)
+    error = residual_draws(450, 2)
     module, _ = trained(Streamed(), DataLoader(Stream(), batch_size=100))
     assert_fitted(module.criterion, error)
     module, _ = trained(Replay(), loader(error), limit_train_batches=2)
@@ -429,8 +436,8 @@ class Streamed(Replay):
 
 
 @pytest.mark.parametrize("batches", [True, 3])
-def test_fast_dev_run(batches):
-    error = drawn(1000, 2)
+def test_a_fast_dev_run_fits_its_batches(batches):
+    error = residual_draws(1000, 2)
     module, _ = trained(Replay(), loader(error), val=loader(error), fast_dev_run=batches)
     assert_fitted(module.criterion, error[: 100 * batches])
 
@@ -440,7 +447,7 @@ def test_batches_of_none_are_skipped():
         def on_before_batch_transfer(self, batch, _):
             return None if batch[0][0, 0] == 0 else batch
 
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     error[200] = error[400] = 0
     with pytest.warns(UserWarning, match="train_dataloader yielded None") as record:
         trained(Sparse(), loader(error), MKCExpectationMaximization(every_n_steps=2))
@@ -463,7 +470,7 @@ class Dropped(Regression):
 
 def pairs(count=500):
     x = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
-    return x, drawn(count, 2)
+    return x, residual_draws(count, 2)
 
 
 @pytest.mark.parametrize("combined", [False, True])
@@ -505,10 +512,10 @@ def test_a_separate_pass_does_not_change_the_order_of_training():
     assert torch.equal(*orders)
 
 
-def test_a_pass_every_few_steps():
-    watch = Watch()
+def test_a_separate_pass_runs_every_n_steps():
+    watch = ParameterHistory()
     callback = MKCExpectationMaximization(every_n_steps=2, residuals=lambda _, batch: (batch[0], 0 * batch[0]))
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     trained(Replay(), loader(error), callback, watch)
     assert watch.steps_of_change() == [2]  # the same residuals each time
     assert len(watch.batches) == 5
@@ -518,7 +525,7 @@ def test_a_pass_every_few_steps():
 
 
 def test_persistent_workers_with_a_separate_pass_are_refused():
-    error = drawn(100, 2)
+    error = residual_draws(100, 2)
     callback = MKCExpectationMaximization(every_n_steps=2, residuals=lambda _, batch: (batch[0], 0 * batch[0]))
     data = loader(error, num_workers=1, persistent_workers=True)
     trainer = SimpleNamespace(global_step=1, num_training_batches=4, train_dataloader={"a": loader(error), "b": data})
@@ -542,7 +549,7 @@ class TwoLosses(Replay):
 
 
 def test_two_losses_have_a_callback_each():
-    error = drawn(500, 3)
+    error = residual_draws(500, 3)
     callbacks = MKCExpectationMaximization("criterion"), MKCExpectationMaximization(loss="heads.b", log=False)
     module, trainer = trained(TwoLosses(), loader(error), *callbacks)
     assert_fitted(module.criterion, error[:, :2])
@@ -553,7 +560,7 @@ def test_two_losses_have_a_callback_each():
 
 
 def test_a_loss_of_two_names_is_a_single_loss():
-    module, error = Replay(bound=200.0), drawn(300, 2)
+    module, error = Replay(bound=200.0), residual_draws(300, 2)
     module.alias = module.criterion
     trained(module, loader(error), MKCExpectationMaximization("alias"))
     assert_fitted(module.criterion, error)
@@ -561,7 +568,7 @@ def test_a_loss_of_two_names_is_a_single_loss():
     assert_fitted(module.criterion, 2 * error)
 
 
-def test_a_loss_made_in_configure_model():
+def test_a_loss_made_in_configure_model_is_found():
     class Late(Replay):
         def __init__(self):
             super().__init__()
@@ -571,36 +578,36 @@ def test_a_loss_made_in_configure_model():
             if self.criterion is None:
                 self.criterion = MKCLoss(2, bound=100.0, **FIXED)
 
-    error = drawn(300, 2)
+    error = residual_draws(300, 2)
     module, _ = trained(Late(), loader(error))
     assert_fitted(module.criterion, error)
 
 
-def refused(module, *callbacks, error=None, match):
+def assert_refused(module, *callbacks, error=None, match):
     before = [p.requires_grad for p in module.parameters()]
     with pytest.raises(ValueError, match=match):
-        trained(module, loader(drawn(300, 3) if error is None else error), *callbacks)
+        trained(module, loader(residual_draws(300, 3) if error is None else error), *callbacks)
     assert not any(m._forward_hooks for m in module.modules())
     assert [p.requires_grad for p in module.parameters()] == before
 
 
 def test_several_losses_without_a_name_are_refused():
-    refused(TwoLosses(), match=r"`loss` to name one of `criterion`, `heads.b`.*got None")
+    assert_refused(TwoLosses(), match=r"`loss` to name one of `criterion`, `heads.b`.*got None")
 
 
 def test_another_name_is_refused():
-    refused(TwoLosses(), MKCExpectationMaximization("b"), match=r"one of `criterion`, `heads.b`.*got 'b'")
+    assert_refused(TwoLosses(), MKCExpectationMaximization("b"), match=r"one of `criterion`, `heads.b`.*got 'b'")
 
 
 def test_a_module_without_a_loss_is_refused():
     module = Replay()
     module.criterion = nn.MSELoss()
-    refused(module, match=r"Replay to hold an MKCLoss.*got none; make it an attribute")
+    assert_refused(module, match=r"Replay to hold an MKCLoss.*got none; make it an attribute")
 
 
 def test_two_callbacks_for_one_loss_are_refused():
     callbacks = MKCExpectationMaximization(), MKCExpectationMaximization("criterion")
-    refused(Replay(), *callbacks, match=r"one MKCExpectationMaximization for the loss `criterion`.*got two")
+    assert_refused(Replay(), *callbacks, match=r"one MKCExpectationMaximization for the loss `criterion`.*got two")
 
 
 @pytest.mark.parametrize(("learned", "named"), [("sigma", "raw_kappa"), ("d", "raw_d")])
@@ -610,7 +617,9 @@ def test_parameters_in_an_optimiser_are_refused_with_a_remedy(learned, named):
             return torch.optim.SGD(self.parameters(), lr=0.1)
 
     module = Joint(**{"learn_sigma": False, "learn_d": False, f"learn_{learned}": True})
-    refused(module, error=drawn(300, 2), match=f"got criterion.{named}: .*learn_sigma=False.*configure_optimizers")
+    assert_refused(
+        module, error=residual_draws(300, 2), match=f"got criterion.{named}: .*learn_sigma=False.*configure_optimizers"
+    )
 
 
 def test_learned_parameters_have_no_gradient_while_the_callback_owns_them():
@@ -620,7 +629,7 @@ def test_learned_parameters_have_no_gradient_while_the_callback_owns_them():
             assert not self.criterion.raw_d.requires_grad
             return super().training_step(batch)
 
-    module, _ = trained(Checked(**LEARNED), loader(drawn(300, 2)))
+    module, _ = trained(Checked(**LEARNED), loader(residual_draws(300, 2)))
     assert module.criterion.raw_kappa.requires_grad
     assert module.criterion.raw_d.requires_grad
     assert module.criterion.raw_d.grad is None
@@ -633,7 +642,7 @@ def test_an_exception_releases_the_loss():
 
     module = Failing(**LEARNED)
     with pytest.raises(RuntimeError, match="broken"):
-        trained(module, loader(drawn(300, 2)))
+        trained(module, loader(residual_draws(300, 2)))
     assert module.criterion.raw_d.requires_grad
     assert not module.criterion._forward_hooks
 
@@ -645,7 +654,7 @@ def test_a_copy_of_the_module_adds_nothing_and_the_module_can_be_pickled():
             for other in (twin, thawed):
                 other(torch.full((50, 2), 5.0, requires_grad=True), torch.zeros(50, 2))
 
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     module, _ = trained(Replay(), loader(error), MKCExpectationMaximization(), Copies())
     assert_fitted(module.criterion, error)
 
@@ -656,7 +665,7 @@ def test_a_copy_of_the_module_adds_nothing_and_the_module_can_be_pickled():
 @pytest.mark.parametrize("how", ["module", "in place", "whole"])
 def test_residuals_of_compiled_losses_are_collected(how):
     torch._dynamo.reset()
-    error, module = drawn(500, 2), Replay()
+    error, module = residual_draws(500, 2), Replay()
     if how == "module":
         module.criterion = torch.compile(module.criterion, backend="eager")
     elif how == "in place":
@@ -677,12 +686,14 @@ def _losses_of(module):
 
 @pytest.mark.parametrize("bad", [NAN, INF])
 def test_residuals_that_are_not_finite_are_refused_with_step_channel_and_remedy(bad, monkeypatch):
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     error[320, 1] = bad
-    refused(Replay(), error=error, match=r"`input`.*finite.*got 1.*\(20, 1\)")
+    assert_refused(Replay(), error=error, match=r"`input`.*finite.*got 1.*\(20, 1\)")
     # as on an accelerator, for which the loss does not wait
     monkeypatch.setattr("mkc_torch.losses.mkc.refuse_bad_batch", lambda *_: None)
-    refused(Replay(), error=error, match=r"step 3 of the loss `criterion`.*channel 1; .*torch.isfinite\(target\)")
+    assert_refused(
+        Replay(), error=error, match=r"step 3 of the loss `criterion`.*channel 1; .*torch.isfinite\(target\)"
+    )
 
 
 def test_a_loss_without_collected_residuals_warns_once():
@@ -691,14 +702,14 @@ def test_a_loss_without_collected_residuals_warns_once():
             return self.criterion.forward(batch[0] + 0 * self.shift, 0 * batch[0])
 
     with pytest.warns(UserWarning, match=r"No residual of the loss `criterion`.*`self.criterion\(input, ") as record:
-        module, _ = trained(Silent(), loader(drawn(300, 2)), max_epochs=3)
+        module, _ = trained(Silent(), loader(residual_draws(300, 2)), max_epochs=3)
     assert len(warnings_of(record)) == 1
     assert torch.equal(module.criterion.d, torch.ones(2))
 
 
 @each_kind
 def test_channels_with_too_few_residuals_keep_bitwise_equal_values(kind):
-    error, weight = drawn(500, 9), torch.ones(500, 9)
+    error, weight = residual_draws(500, 9), torch.ones(500, 9)
     weight[:, 1] = 0
     weight[29:, 2:] = 0
     sigma = torch.cat([torch.linspace(1.0, 3.0, 8), torch.tensor([5 * SIGMA_CAP])])
@@ -717,13 +728,13 @@ def test_zero_weights_change_nothing():
     module = Replay()
     before = copy.deepcopy(module.state_dict())
     with pytest.warns(UserWarning, match="Fewer than 30 residuals"):
-        _, trainer = trained(module, loader(drawn(300, 2), torch.zeros(300, 2)))
+        _, trainer = trained(module, loader(residual_draws(300, 2), torch.zeros(300, 2)))
     assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())
     assert "criterion/log_likelihood_0" not in trainer.callback_metrics
 
 
 def test_residuals_beyond_the_bound_are_counted_with_a_warning():
-    error = drawn(1000, 2)
+    error = residual_draws(1000, 2)
     error[:50, 1] = 140.0
     error[:5, 0] = 140.0
     with pytest.warns(UserWarning, match="More than 1 % of the residuals .* in channel 1; ") as record:
@@ -736,7 +747,7 @@ def test_residuals_beyond_the_bound_are_counted_with_a_warning():
 
 @each_kind
 def test_a_narrow_bound_falls_back_to_least_squares(kind):
-    error = drawn(500, 2) * torch.tensor([1.0, 1e5])
+    error = residual_draws(500, 2) * torch.tensor([1.0, 1e5])
     with pytest.warns(UserWarning, match="less than twice the typical residual in channel 1: least squares"):
         module, _ = trained(Replay(**kind), loader(error))
     assert module.criterion.d[1].item() == pytest.approx(50)
@@ -747,7 +758,7 @@ def test_a_narrow_bound_falls_back_to_least_squares(kind):
 def test_a_network_that_interpolates_warns_once(kind):
     module = Replay(growth=0.3, **kind)
     with pytest.warns(UserWarning, match=r"collapses in channel .*validation set.*weight decay.*d_min") as record:
-        trained(module, loader(drawn(300, 2)), max_epochs=9)
+        trained(module, loader(residual_draws(300, 2)), max_epochs=9)
     assert sorted(c for text in warnings_of(record) for c in text.partition(":")[0] if c.isdigit()) == ["0", "1"]
     assert (module.criterion.d >= module.criterion.d_min).all()
 
@@ -800,7 +811,7 @@ def test_arguments_of_another_type_are_refused(options, match):
 
 
 def test_a_logger_gets_finite_values_of_each_channel(tmp_path):
-    error = torch.stack([quantiles(500), drawn(500)], -1)
+    error = torch.stack([quantiles(500), residual_draws(500)], -1)
     logger = CSVLogger(tmp_path)
     _, trainer = trained(Replay(), loader(error), max_epochs=2, logger=logger)
     lines = (Path(logger.log_dir) / "metrics.csv").read_text().splitlines()
@@ -818,7 +829,14 @@ def test_a_logger_gets_finite_values_of_each_channel(tmp_path):
 def test_a_logger_gets_each_step_with_every_n_steps(tmp_path):
     logger = CSVLogger(tmp_path)
     callback = MKCExpectationMaximization(every_n_steps=2)
-    trained(Replay(1, growth=0.5), loader(drawn(600, 1)), callback, max_epochs=2, logger=logger, log_every_n_steps=1)
+    trained(
+        Replay(1, growth=0.5),
+        loader(residual_draws(600, 1)),
+        callback,
+        max_epochs=2,
+        logger=logger,
+        log_every_n_steps=1,
+    )
     lines = (Path(logger.log_dir) / "metrics.csv").read_text().splitlines()
     assert len(lines) > 6
 
@@ -827,7 +845,7 @@ def test_a_logger_gets_each_step_with_every_n_steps(tmp_path):
 def test_logging_can_be_switched_off(options):
     callback = MKCExpectationMaximization(log=bool(options))
     quiet = {"enable_progress_bar": None, "enable_model_summary": None, "enable_checkpointing": None} if options else {}
-    error = drawn(300, 2)
+    error = residual_draws(300, 2)
     module, trainer = trained(Replay(), loader(error), callback, **options, **quiet)
     assert "criterion/d_0" not in trainer.callback_metrics
     assert_fitted(module.criterion, error)
@@ -851,7 +869,7 @@ def test_logging_can_be_switched_off(options):
 )
 def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, saved, kind, options):
     x = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
-    y = torch.stack([x.sum(-1), x[:, 0]], -1) + drawn(500, 2)
+    y = torch.stack([x.sum(-1), x[:, 0]], -1) + residual_draws(500, 2)
     val = {"val": loader(x[:100], y[:100])} if saved == "validation" else {}
     data = loader(x, y)  # five steps an epoch: every fourth leaves residuals over
 
@@ -884,7 +902,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, saved,
 
 
 def test_a_checkpoint_restores_the_bound(tmp_path):
-    error = drawn(500, 2)
+    error = residual_draws(500, 2)
     _, trainer = trained(Replay(bound=400.0), loader(error))
     trainer.save_checkpoint(tmp_path / "c.ckpt")
     module = Replay(bound=50.0)
@@ -895,7 +913,7 @@ def test_a_checkpoint_restores_the_bound(tmp_path):
 def test_the_state_contains_only_tensors_and_plain_values(tmp_path):
     callback = MKCExpectationMaximization(every_n_steps=2)
     assert callback.state_dict() == {}
-    trained(Replay(), loader(drawn(500, 2)), callback)
+    trained(Replay(), loader(residual_draws(500, 2)), callback)
     torch.save(callback.state_dict(), tmp_path / "state.pt")
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     assert state["last_epoch"] == 0
@@ -904,14 +922,14 @@ def test_the_state_contains_only_tensors_and_plain_values(tmp_path):
 
 def test_a_checkpoint_of_other_channels_is_refused():
     few, many = MKCExpectationMaximization(), MKCExpectationMaximization()
-    trained(Replay(2), loader(drawn(300, 2)), few)
+    trained(Replay(2), loader(residual_draws(300, 2)), few)
     many.load_state_dict(few.state_dict())
     with pytest.raises(ValueError, match=r"a checkpoint of 3 channels.*got 2"):
-        trained(Replay(3), loader(drawn(300, 3)), many)
+        trained(Replay(3), loader(residual_draws(300, 3)), many)
 
 
 def test_a_second_fit_continues_and_a_new_training_starts_afresh():
-    callback, error = MKCExpectationMaximization(damping=0.5), drawn(500, 2)
+    callback, error = MKCExpectationMaximization(damping=0.5), residual_draws(500, 2)
     module, trainer = trained(Replay(bound=400.0), loader(error), callback)
     first = module.criterion.d.clone()
     trainer.fit_loop.max_epochs = 2
@@ -922,10 +940,10 @@ def test_a_second_fit_continues_and_a_new_training_starts_afresh():
 
 
 def test_the_callback_may_be_added_to_a_resumed_run(tmp_path):
-    error = drawn(500, 2)
-    _, trainer = trained(Replay(), loader(error), Watch(), max_epochs=2)
+    error = residual_draws(500, 2)
+    _, trainer = trained(Replay(), loader(error), ParameterHistory(), max_epochs=2)
     trainer.save_checkpoint(tmp_path / "c.ckpt")
-    watch = Watch()
+    watch = ParameterHistory()
     trainer = trainer_of(MKCExpectationMaximization(every_n_steps=4), watch, max_epochs=3)
     trainer.fit(Replay(), loader(error), ckpt_path=tmp_path / "c.ckpt")
     assert watch.steps_of_change() == [12]
@@ -934,7 +952,7 @@ def test_the_callback_may_be_added_to_a_resumed_run(tmp_path):
 # --- processes
 
 
-class Written(Callback):
+class SaveParameters(Callback):
     """Each process writes its final state."""
 
     def __init__(self, folder):
@@ -950,11 +968,11 @@ class Written(Callback):
 @pytest.mark.skipif(torch.cuda.is_initialized(), reason="a process that uses CUDA cannot fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
 def test_processes_end_with_equal_parameters_from_all_their_residuals(tmp_path):
-    error = drawn(800, 2) * torch.linspace(0.3, 1.0, 800).unsqueeze(-1)
+    error = residual_draws(800, 2) * torch.linspace(0.3, 1.0, 800).unsqueeze(-1)
     options = {"strategy": "ddp_fork", "devices": 2, "max_epochs": 2}
     data = loader(error, batch_size=100)
     # learned, so that DistributedDataParallel would wait for gradients of parameters that have none
-    trained(Replay(**LEARNED), data, MKCExpectationMaximization(), Written(tmp_path), **options)
+    trained(Replay(**LEARNED), data, MKCExpectationMaximization(), SaveParameters(tmp_path), **options)
     left, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     assert all(torch.equal(a, b) for a, b in zip(left, other, strict=True))
     alone, _ = trained(Replay(**LEARNED), data, max_epochs=2)
@@ -986,7 +1004,7 @@ def test_without_lightning_the_error_names_the_package_to_install(monkeypatch):
 
 
 def test_a_running_scale_is_frozen_and_fitted_from_the_first_e_step_on():
-    error = drawn(400, 2)
+    error = residual_draws(400, 2)
     module = Replay(d="auto")
     trainer_of(MKCExpectationMaximization()).fit(module, loader(error))
     given = Replay()
@@ -1002,7 +1020,7 @@ def test_automatic_d_and_bound_have_the_unit_of_the_targets():
     found = []
     for unit in (1.0, 1e-4, 1e4):
         module = Regression(lr=0.05, sigma=3.0, d="auto", bound="auto", **FIXED)
-        module.net = nn.Sequential(module.net, Times(unit))
+        module.net = nn.Sequential(module.net, TimesUnit(unit))
         trained(module, loader(x, unit * y), max_epochs=20)
         loss = module.criterion
         assert not loss.tails(module.net(x), unit * y).is_gaussian.any()
@@ -1012,7 +1030,7 @@ def test_automatic_d_and_bound_have_the_unit_of_the_targets():
     assert found[2] == pytest.approx(found[0], rel=1e-2)
 
 
-class Times(nn.Module):
+class TimesUnit(nn.Module):
     """The unit of the targets as the last step of a network."""
 
     def __init__(self, unit):
@@ -1064,7 +1082,7 @@ def permuted(seed, count=1200):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("kind", "d"), [(FIXED, 1.0), (LEARNED, 1.0), (FIXED, 5.0), (LEARNED, "auto")])
-def test_from_any_start_half_of_the_targets_may_be_permuted(kind, d):
+def test_the_truth_is_learned_from_any_start_with_half_of_the_targets_permuted(kind, d):
     x, y = permuted(0)
     module, _ = trained(Regression(d=d, sigma=3.0, **kind), loader(x, y), max_epochs=40)
     torch.testing.assert_close(module.net.weight.detach().T, TRUTH, rtol=0.0, atol=0.05)
@@ -1079,6 +1097,6 @@ def test_without_graduated_the_likelihood_alone_trains_the_network():
             Regression(sigma=math.inf), loader(x, y), MKCExpectationMaximization(graduated=graduated), max_epochs=1
         )
         weights.append(module.net.weight.detach())
-    module, _ = trained(Regression(sigma=math.inf), loader(x, y), Watch(), max_epochs=1)
+    module, _ = trained(Regression(sigma=math.inf), loader(x, y), ParameterHistory(), max_epochs=1)
     torch.testing.assert_close(weights[1], module.net.weight.detach())
     assert not torch.equal(*weights)

@@ -1,4 +1,4 @@
-"""Arguments that are invalid by their value are refused by the constructor, with name and remedy."""
+"""Invalid arguments are refused by the constructor, with the argument's name and a remedy."""
 
 import inspect
 import math
@@ -32,7 +32,7 @@ ESTIMATORS = [
 each_estimator = pytest.mark.parametrize("kind", ESTIMATORS)
 
 
-def made(kind, **options):
+def make_estimator(kind, **options):
     return kind(10.0, **options) if kind is GeneralizedMaximumEntropy else kind(**options)
 
 
@@ -40,41 +40,41 @@ def sample(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def taking(name):
-    """The estimators that have an argument of this name."""
+def estimators_with_argument(name):
+    """The estimators whose constructor has this argument."""
     return [kind for kind in ESTIMATORS if name in inspect.signature(kind).parameters]
 
 
 def test_every_estimator_is_covered():
     assert len(ESTIMATORS) == 14
-    assert len(taking("seed")) >= 8
+    assert len(estimators_with_argument("seed")) >= 8
 
 
 @pytest.mark.parametrize("name", ["max_iter", "starts", "seed"])
 @pytest.mark.parametrize("value", ["a", 2.5, None, True])
 def test_counts_must_be_whole_numbers(name, value):
-    for kind in taking(name):
+    for kind in estimators_with_argument(name):
         if (name == "starts" and value is None and kind is ReweightedLeastSquares) or kind is LeastEntropyLike:
             continue
         with pytest.raises(ValueError, match=f"Expected argument `{name}` to be a whole number.* but got"):
-            made(kind, **{name: value})
+            make_estimator(kind, **{name: value})
 
 
 @pytest.mark.parametrize("name", ["max_iter", "starts"])
 def test_counts_must_be_at_least_one(name):
-    for kind in taking(name):
+    for kind in estimators_with_argument(name):
         if (kind, name) != (LeastEntropyLike, "starts"):
             with pytest.raises(ValueError, match=rf"`{name}` .*at least 1 .*got 0; "):
-                made(kind, **{name: 0})
+                make_estimator(kind, **{name: 0})
 
 
 @pytest.mark.parametrize("value", [-1.0, NAN, INF])
 def test_tolerances_out_of_range_are_refused(value):
-    for kind in taking("tol"):
+    for kind in estimators_with_argument("tol"):
         with pytest.raises(ValueError, match=r"`tol` to be .* but got"):
-            made(kind, tol=value)
+            make_estimator(kind, tol=value)
         with pytest.raises(TypeError, match=r"`tol` to be a number .* but got 'a'"):
-            made(kind, tol="a")
+            make_estimator(kind, tol="a")
 
 
 @pytest.mark.parametrize("kind", [FixedPointLinear, MKCRegression])
@@ -95,7 +95,7 @@ def test_sigma_below_its_limit_is_refused_where_the_density_is_normalised():
         MKCRegression(sigma=0.01)
 
 
-def test_parameters_under_vmap_are_taken_as_they_are():
+def test_parameters_mapped_by_vmap_are_not_checked():
     X, y = sample(0, 30, 2), sample(1, 30)
     sigma = torch.tensor([1.0, 2.0]).double()
     found = torch.func.vmap(lambda s: FixedPointLinear(sigma=s).fit(X, y).coef_)(sigma)
@@ -156,22 +156,22 @@ def test_a_coverage_below_one_is_refused(kind):
         ),
     ],
 )
-def test_other_arguments_are_checked_by_the_constructor(make, error, message):
+def test_invalid_arguments_are_refused_by_the_constructor_with_a_remedy(make, error, message):
     with pytest.raises(error, match=message):
         make()
 
 
 @each_estimator
-def test_errors_for_other_types_name_the_conversion(kind):
+def test_errors_for_data_of_another_type_name_the_conversion(kind):
     X, y = sample(0, 30, 2), sample(1, 30)
     with pytest.raises(TypeError, match=r"`X` .* got list; .*torch\.as_tensor\(X\)"):
-        made(kind).fit(X.tolist(), y)
+        make_estimator(kind).fit(X.tolist(), y)
     with pytest.raises(TypeError, match=r"`Y` .* got torch\.int64; .*Y\.float\(\)"):
-        made(kind).fit(X, y.long())
+        make_estimator(kind).fit(X, y.long())
     with pytest.raises(TypeError, match=r"`sample_weight` .*tensor.*array.* got list; .*tensor"):
-        made(kind).fit(X, y, [1.0] * 30)
+        make_estimator(kind).fit(X, y, [1.0] * 30)
     with pytest.raises(TypeError, match=r"share dtype and device .*; use Y"):
-        made(kind).fit(X, y.float())
+        make_estimator(kind).fit(X, y.float())
 
 
 def test_data_are_checked_before_whitening():
@@ -194,9 +194,9 @@ def test_errors_for_wrong_shapes_name_the_remedy(x_shape, y_shape, remedy):
 
 
 @each_estimator
-def test_prediction_takes_what_the_fit_took(kind):
+def test_predict_checks_type_dtype_and_columns_against_the_fit(kind):
     X, y = sample(0, 30, 2), sample(1, 30)
-    fit = made(kind).fit(X, y)
+    fit = make_estimator(kind).fit(X, y)
     assert fit.predict(X).shape == (30,)
     with pytest.raises(TypeError, match=r"`X` .* but got list"):
         fit.predict(X.tolist())

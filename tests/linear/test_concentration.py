@@ -1,4 +1,4 @@
-"""Concentration steps as one Triton kernel: those of plain operations, on a GPU if there is one, else interpreted."""
+"""Concentration steps by a Triton kernel equal those by torch; run on a GPU, or by Triton's interpreter on the CPU."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 @pytest.fixture(autouse=True)
-def _runs():
+def _skip_without_interpreter():
     if DEVICE == "cpu" and not _concentration._kernels()[0].is_interpreted:
         pytest.skip("the kernel was imported before TRITON_INTERPRET=1 was set")
 
@@ -52,8 +52,8 @@ def weighted_problem(kind: str, n: int, dtype: torch.dtype = torch.float64) -> L
     return linear_problem(X, y, weight)
 
 
-def plain_alternation(problem: LinearProblem, *args: Any, **options: Any) -> _maximum.LikelihoodMaximum:
-    """The alternation in separate operations."""
+def torch_alternation(problem: LinearProblem, *args: Any, **options: Any) -> _maximum.LikelihoodMaximum:
+    """The alternation by operations of torch."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_maximum, "runs_kernel", lambda _: False)
         return _maximum._alternate(problem, *args, **options)
@@ -64,7 +64,7 @@ KINDS = ("plain", "shared X", "weights", "some left out")
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("rule", [QuantileScale(0.6), TrimmedScale(0.6), MScale(0), MScale(2), MScale(30)], ids=str)
-def test_the_kernel_has_the_scale_of_plain_operations(rule, kind):
+def test_scales_by_the_kernel_equal_those_of_torch(rule, kind):
     problem = weighted_problem(kind, n=3)
     beta = elemental_starts(problem, 1, 0)
     found = _concentration.concentrate(problem, beta, rule.options(problem))
@@ -76,7 +76,7 @@ def test_the_kernel_has_the_scale_of_plain_operations(rule, kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("n", [1, 4])
 @pytest.mark.parametrize("rule", [TrimmedScale(0.6), MScale(2)], ids=str)
-def test_the_kernel_makes_the_steps_of_plain_operations(rule, n, kind):
+def test_concentration_steps_by_the_kernel_equal_those_of_torch(rule, n, kind):
     problem = weighted_problem(kind, n)
     beta = start = elemental_starts(problem, 1, 0)
     for _ in range(2):
@@ -88,7 +88,7 @@ def test_the_kernel_makes_the_steps_of_plain_operations(rule, n, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_kernel_has_the_weighted_fits_of_plain_operations(kind, dtype):
+def test_weighted_fits_by_the_kernel_equal_those_of_torch(kind, dtype):
     problem = weighted_problem(kind, 4, dtype)
     weight = torch.rand(2, 3, 30, 1, generator=torch.Generator().manual_seed(0), dtype=dtype).to(DEVICE)
     expected = solve_gram(*problem.normal_equations(weight))
@@ -96,7 +96,7 @@ def test_the_kernel_has_the_weighted_fits_of_plain_operations(kind, dtype):
     torch.testing.assert_close(_concentration.weighted_fits(problem, weight), expected, rtol=tolerance, atol=tolerance)
 
 
-def test_a_descent_ends_with_the_coefficients_and_the_convergence_of_plain_operations():
+def test_a_descent_by_the_kernel_ends_at_the_coefficients_and_convergence_of_torch():
     problem = weighted_problem("plain", n=2)
     beta = elemental_starts(problem, 2, 0)
     rule = TrimmedScale(0.6)
@@ -111,7 +111,7 @@ def test_a_descent_ends_with_the_coefficients_and_the_convergence_of_plain_opera
         assert bool(found.converged.all()) == (steps > 1)
 
 
-def test_a_scale_that_collapses_is_solved_without_its_first_guess():
+def test_the_scale_does_not_depend_on_a_start_near_zero():
     problem = weighted_problem("plain", n=2)
     beta, rule = elemental_starts(problem, 1, 0), MScale(30)
     expected = rule.scale(problem, problem.residual(beta))
@@ -120,8 +120,8 @@ def test_a_scale_that_collapses_is_solved_without_its_first_guess():
     torch.testing.assert_close(found.scale, expected, rtol=1e-12, atol=0.0)
 
 
-def test_a_direction_without_weight_gets_no_part_of_the_solution():
-    """A dummy column that only trimmed samples have."""
+def test_a_column_that_is_zero_on_the_kept_samples_gives_finite_coefficients():
+    """The column is an indicator of trimmed samples."""
     X, y = (v[:1] for v in sample(2))
     X[..., 1] = 0.0
     X[:, :2, 1] = 1.0
@@ -150,7 +150,7 @@ def test_an_exact_fit_has_scale_zero_and_converges():
     [lambda: SRegression(starts=8), lambda: LeastTrimmedSquares(starts=8), MKCRegression],
     ids=["S", "LTS", "MKC"],
 )
-def test_a_fit_by_the_kernels_is_the_fit_by_plain_operations(make, dtype, monkeypatch):
+def test_a_fit_by_the_kernels_equals_the_fit_by_torch(make, dtype, monkeypatch):
     X, y = (v.to(dtype) for v in sample(2))
     plain = make().fit(X.cpu(), y.cpu())
     launches = []
@@ -167,7 +167,7 @@ def test_a_fit_by_the_kernels_is_the_fit_by_plain_operations(make, dtype, monkey
         torch.testing.assert_close(getattr(fit, name).cpu(), getattr(plain, name), rtol=tolerance, atol=tolerance)
 
 
-def test_derivatives_take_plain_operations(monkeypatch):
+def test_fits_that_require_derivatives_use_torch(monkeypatch):
     monkeypatch.setattr(_problem, "runs_kernel", _concentration.suits_kernel)
     X, y = sample(2)
     y.requires_grad_(True)
@@ -177,7 +177,7 @@ def test_derivatives_take_plain_operations(monkeypatch):
         assert not problem.weighted_fit(torch.ones_like(problem.Y)).requires_grad
 
 
-def test_large_problems_and_several_channels_take_plain_operations():
+def test_large_problems_and_several_channels_use_torch():
     X, y = sample(2)
     assert _concentration.suits_kernel(linear_problem(X, y))
     assert not _concentration.suits_kernel(linear_problem(X.unsqueeze(2).expand(-1, -1, 2, -1), y.unsqueeze(-1) + X))
@@ -186,16 +186,16 @@ def test_large_problems_and_several_channels_take_plain_operations():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("given", ["learned", "known width", "known scale"])
-def test_the_alternation_is_that_of_plain_operations(kind, given):
+def test_the_alternation_by_the_kernel_equals_that_of_torch(kind, given):
     problem = weighted_problem(kind, n=3)
     begin = _robust_start.robust_start(problem)
     sigma, d = {"known width": (2.0, None), "known scale": (None, 1.2)}.get(given, (None, None))
     known = _maximum.FixedParameters(sigma, d, None, "lts")
-    d_min, bound = _maximum.least_d(problem, begin), 60.0 * torch.ones_like(begin.scale)
+    d_min, bound = _maximum.lower_limit_of_d(problem, begin), 60.0 * torch.ones_like(begin.scale)
     start = known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
     for steps, ends in ((1, False), (100, True)):
-        plain = plain_alternation(problem, begin.beta, start, max_iter=steps, tol=1e-10)
-        found = _alternation.alternated(problem, begin.beta, start, max_iter=steps, tol=1e-10, patience=2)
+        plain = torch_alternation(problem, begin.beta, start, max_iter=steps, tol=1e-10)
+        found = _alternation.alternate_by_kernel(problem, begin.beta, start, max_iter=steps, tol=1e-10, patience=2)
         assert bool(found.ended.all()) == ends
         # rounding of second derivatives is a part of the steps, and of the last gain
         assert abs(len(found.history) - len(plain.history)) <= 2

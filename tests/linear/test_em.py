@@ -88,7 +88,7 @@ def oracle(X: Tensor, Y: Tensor, good: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", [1, 2, 3, 4, 5, 6])
-def test_example_2_of_the_paper(case):
+def test_errors_in_example_2_of_the_paper_are_near_those_of_the_oracle(case):
     X, Y, good = example_2(case, 60)
     error = rms_error(MKCRegression().fit(X, Y).coef_)
     best = rms_error(oracle(X, Y, good))
@@ -107,11 +107,11 @@ def test_example_2_is_at_the_maximum_of_the_likelihood(case):
     X, Y, _ = example_2(case, 3)
     fit = MKCRegression().fit(X, Y)
     for i in range(3):
-        assert best_from(X, Y[i], fit, i) <= float(fit.log_likelihood_[i]) + 1e-5
+        assert likelihood_by_bfgs(X, Y[i], fit, i) <= float(fit.log_likelihood_[i]) + 1e-5
 
 
-def best_from(X: Tensor, Y: Tensor, fit: MKCRegression, i: int | None = None) -> float:
-    """Likelihood that BFGS reaches from the solution in θ and every channel's log σ, log d at once."""
+def likelihood_by_bfgs(X: Tensor, Y: Tensor, fit: MKCRegression, i: int | None = None) -> float:
+    """Likelihood that BFGS reaches from the solution, jointly in θ and every channel's log σ and log d."""
     coef, sigma, d, bound = (
         getattr(fit, f)[i].numpy() if i is not None else getattr(fit, f).numpy()
         for f in ("coef_", "sigma_", "d_", "bound_")
@@ -141,7 +141,7 @@ def best_from(X: Tensor, Y: Tensor, fit: MKCRegression, i: int | None = None) ->
 
 
 @pytest.mark.e2e
-def test_nothing_is_lost_on_gaussian_data():
+def test_efficiency_on_gaussian_data_is_at_least_99_per_cent():
     X, noise = sample(0, 200, 4), sample(1, 1500, 200)
     fit = MKCRegression().fit(X, noise)
     ls = LeastSquares().fit(X, noise)
@@ -163,11 +163,11 @@ def test_log_likelihood_is_the_sum_of_log_densities(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_search_in_all_parameters_improves_the_solution(seed):
+def test_a_search_over_all_parameters_does_not_improve_the_likelihood(seed):
     X, Y = channels(10 * seed)
     fit = MKCRegression().fit(X, Y)
     assert bool(fit.converged_)
-    assert best_from(X, Y, fit) <= float(fit.log_likelihood_) + 1e-5
+    assert likelihood_by_bfgs(X, Y, fit) <= float(fit.log_likelihood_) + 1e-5
 
 
 def test_the_coefficients_satisfy_equation_15_at_the_learned_parameters():
@@ -198,7 +198,7 @@ def test_convergence_is_reported():
 
 @pytest.mark.parametrize("start", ["lts", "least_squares"])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.45])
-def test_a_converged_fit_has_nothing_left_to_gain_in_sigma_and_d(start, share):
+def test_a_converged_fit_is_optimal_in_sigma_and_d(start, share):
     X, e = sample(0, 300, 60, 1, 3), sample(1, 300, 60, 1)
     bad = int(share * 60)
     e[:, :bad] = 40.0 * (uniform(2, 300, bad, 1) - 0.5)
@@ -229,14 +229,14 @@ def mean_log_density(residual: Tensor, sigma: Tensor, d: Tensor, bound: float) -
     return -values(residual.squeeze(-1)).mean(-1) - torch.log((w * torch.exp(-values(u))).sum(-1))
 
 
-def test_covariance_is_that_of_the_fixed_point_at_the_learned_parameters():
+def test_covariance_equals_that_of_the_fixed_point_at_the_learned_parameters():
     X, Y = channels(0)
     fit = MKCRegression().fit(X, Y)
     fixed = FixedPointLinear(sigma=fit.sigma_, d=fit.d_, start=fit.coef_).fit(X, Y)
     torch.testing.assert_close(fit.covariance_, fixed.covariance_, rtol=1e-4, atol=1e-9)
 
 
-def test_standard_errors_are_the_spread_of_repeated_experiments():
+def test_standard_errors_equal_the_spread_of_repeated_experiments():
     X = torch.cat([torch.ones(150, 1).double(), sample(0, 150, 2)], 1)
     noise = torch.where(uniform(1, 300, 150) < 0.8, sample(2, 300, 150), 40.0 * (uniform(3, 300, 150) - 0.5))
     fit = MKCRegression().fit(X, X.sum(-1) + noise)
@@ -247,7 +247,7 @@ def test_standard_errors_are_the_spread_of_repeated_experiments():
 # Remarks 6 and 7
 
 
-def test_a_given_d_stays_and_sigma_is_learned():
+def test_a_given_d_is_kept_and_sigma_is_learned():
     X, Y = channels(0)
     d = torch.tensor([0.5, 2.0], dtype=torch.float64)
     fit = MKCRegression(d=d).fit(X, Y)
@@ -280,7 +280,7 @@ def test_an_infinite_sigma_of_one_channel_is_least_squares_exactly():
     torch.testing.assert_close(fit.d_[0], (y - X @ fit.coef_).square().mean().sqrt(), rtol=1e-6, atol=0)
 
 
-def test_given_sigma_and_d_are_the_fixed_point():
+def test_given_sigma_and_d_give_the_coefficients_of_the_fixed_point():
     X, Y = channels(0)
     sigma, d = torch.tensor([1.5, 4.0]).double(), torch.tensor([0.5, 2.0]).double()
     fit = MKCRegression(sigma=sigma, d=d).fit(X, Y)
@@ -324,7 +324,7 @@ def rms(values: Tensor) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_forty_per_cent_one_sided_outliers_do_not_trap_it(seed):
+def test_forty_per_cent_one_sided_outliers_do_not_trap_the_fit(seed):
     X = torch.cat([torch.ones(100, 1).double(), sample(10 * seed, 100, 1)], 1)
     y = X.sum(-1) + 0.5 * sample(10 * seed + 1, 100)
     y[:40] = X[:40].sum(-1) + 10.0 * uniform(10 * seed + 2, 40)
@@ -367,7 +367,7 @@ def test_an_exact_fit_is_flagged_and_finite():
         assert bool(torch.isfinite(getattr(fit, name)).all()), name
 
 
-def test_targets_that_are_all_fitted_exactly_are_finite():
+def test_targets_that_are_all_fitted_exactly_give_finite_results():
     X, _ = line(0)
     for y in (X.sum(-1), torch.zeros(100).double()):
         fit = MKCRegression().fit(X, y)
@@ -381,7 +381,7 @@ def test_an_ordinary_fit_is_not_flagged_as_exact():
     assert not bool(MKCRegression().fit(*line(0)).exact_fit_)
 
 
-def test_a_channel_of_zero_residuals_and_a_noisy_channel():
+def test_an_exactly_fitted_channel_determines_the_coefficients_of_a_noisy_channel():
     X, Y = channels(0)
     Y[:, 1] = X[:, 1].sum(-1)
     fit = MKCRegression().fit(X, Y)
@@ -395,7 +395,7 @@ def test_a_channel_of_zero_residuals_and_a_noisy_channel():
     assert float(fit.sigma_[0]) == pytest.approx(float(alone.sigma), rel=1e-3)
 
 
-def test_as_many_values_as_coefficients_are_finite():
+def test_as_many_values_as_coefficients_give_finite_results():
     X, y = sample(0, 5, 5), sample(1, 5)
     fit = MKCRegression().fit(X, y)
     torch.testing.assert_close(fit.coef_, torch.linalg.solve(X, y), rtol=1e-8, atol=1e-9)
@@ -405,7 +405,7 @@ def test_as_many_values_as_coefficients_are_finite():
 # weights and forms of input
 
 
-def test_weight_is_repetition():
+def test_integer_weights_equal_repetition():
     X, y = line(0, N=60)
     count = 1 + (torch.arange(60) % 2)
     fit = MKCRegression(bound=15.0).fit(X, y, count.double())
@@ -415,7 +415,7 @@ def test_weight_is_repetition():
     torch.testing.assert_close(fit.log_likelihood_, repeated.log_likelihood_, rtol=1e-7, atol=1e-6)
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = line(0, N=60)
     junk_X, junk_y = 5.0 + sample(9, 40, 3), torch.full((40,), 1e4, dtype=torch.float64)
     weight = torch.cat([torch.ones(60), torch.zeros(40)]).double()
@@ -444,7 +444,7 @@ def test_batch_equals_loop():
         torch.testing.assert_close(fit.log_likelihood_[a, b], alone.log_likelihood_, rtol=1e-9, atol=1e-7)
 
 
-def test_one_design_serves_many_targets():
+def test_a_shared_design_equals_a_loop_over_targets():
     X, y = line(0)
     Y = torch.stack([y, y.flip(0), 10.0 * y])
     fit = MKCRegression().fit(X, Y)
@@ -455,7 +455,7 @@ def test_one_design_serves_many_targets():
 
 @settings(derandomize=True, deadline=None, max_examples=8)
 @given(exponent=st.integers(-9, 9), sign=st.sampled_from([-1.0, 1.0]))
-def test_the_unit_of_the_targets_does_not_matter(exponent, sign):
+def test_the_fit_is_equivariant_to_the_unit_of_the_targets(exponent, sign):
     X, Y = channels(0)
     factor = 10.0**exponent
     reference, other = MKCRegression().fit(X, Y), MKCRegression().fit(X, sign * factor * Y)
@@ -468,7 +468,7 @@ def test_the_unit_of_the_targets_does_not_matter(exponent, sign):
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-def test_the_unit_of_one_channel_does_not_matter(factor):
+def test_the_fit_is_equivariant_to_the_unit_of_a_channel(factor):
     X, Y = channels(0)
     unit, bound = torch.tensor([1.0, factor]).double(), torch.tensor([10.0, 20.0]).double()
     reference = MKCRegression(bound=bound).fit(X, Y)
@@ -478,7 +478,7 @@ def test_the_unit_of_one_channel_does_not_matter(factor):
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-def test_the_unit_of_one_channel_hardly_moves_the_default_domain(factor):
+def test_the_default_domain_is_nearly_equivariant_to_the_unit_of_a_channel(factor):
     X, Y = channels(0)
     unit = torch.tensor([1.0, factor]).double()
     reference, other = MKCRegression().fit(X, Y), MKCRegression().fit(X * unit.unsqueeze(-1), Y * unit)
@@ -487,7 +487,7 @@ def test_the_unit_of_one_channel_hardly_moves_the_default_domain(factor):
     torch.testing.assert_close(other.d_, reference.d_ * unit, rtol=1e-3, atol=0)
 
 
-def test_columns_of_very_different_size_and_regression_equivariance():
+def test_the_fit_is_equivariant_to_column_scales_and_regression_shifts():
     X, y = line(0, n=4)
     factor, shift = torch.tensor([1e-8, 1.0, 1e3, 1e8], dtype=torch.float64), sample(7, 4)
     reference = MKCRegression().fit(X, y)
@@ -508,7 +508,7 @@ def test_float32_stays_float32():
     torch.testing.assert_close(fit.d_.double(), exact.d_, rtol=2e-2, atol=0)
 
 
-def test_one_channel_is_a_channel_dimension_of_one_in_every_result():
+def test_results_of_one_channel_have_a_channel_dimension_of_size_one():
     fit = MKCRegression().fit(*line(0))
     assert fit.sigma_.shape == fit.d_.shape == fit.bound_.shape == (1,)
     assert fit.weights_.shape == (100, 1)
@@ -590,8 +590,8 @@ def test_the_likelihood_is_never_below_that_of_a_gaussian_at_least_squares():
     assert float((fit.log_likelihood_ - gaussian).min()) > -1e-9
 
 
-def test_a_weight_of_two_is_two_samples_where_d_ends_at_its_least():
-    """The least of d is a share of a robust scale, whose small-sample factor counts the samples."""
+def test_a_weight_of_two_equals_two_samples_at_the_lower_limit_of_d():
+    """The lower limit of d is a share of a robust scale, whose small-sample factor depends on the number of samples."""
     apart = []
     for seed in (0, 6, 8, 13, 20, 32):
         X = torch.cat([torch.ones(20, 1).double(), sample(seed, 20, 2)], 1)

@@ -56,7 +56,7 @@ def equation_15(X: Tensor, Y: Tensor, coef: Tensor, sigma: Tensor, d: Tensor) ->
 # least squares as the limit
 
 
-def test_an_infinite_sigma_is_least_squares_exactly():
+def test_an_infinite_sigma_equals_least_squares():
     X, y = contaminated_line(0)
     fit = FixedPointLinear(sigma=math.inf, d=2.0).fit(X, y)
     torch.testing.assert_close(fit.coef_, lstsq(X, y), rtol=1e-12, atol=1e-12)
@@ -65,7 +65,7 @@ def test_an_infinite_sigma_is_least_squares_exactly():
     torch.testing.assert_close(fit.history_[-1], 0.5 * ((y - X @ fit.coef_) / 2.0).square().mean())
 
 
-def test_an_infinite_sigma_weights_samples_and_channels():
+def test_an_infinite_sigma_equals_least_squares_weighted_by_sample_and_channel():
     X, Y = channels(0)
     weight, d = sample(7, 50, 3).exp(), torch.tensor([0.2, 1.0, 5.0], dtype=torch.float64)
     root = (weight.sqrt() / d).flatten()
@@ -74,7 +74,7 @@ def test_an_infinite_sigma_weights_samples_and_channels():
     torch.testing.assert_close(fit.coef_, expected, rtol=1e-10, atol=1e-11)
 
 
-def test_channels_of_infinite_and_finite_sigma():
+def test_infinite_and_finite_sigma_can_be_mixed_between_channels():
     X, Y = channels(0, m=2)
     sigma, d = torch.tensor([math.inf, 1.5], dtype=torch.float64), torch.tensor([4.0, 1.0], dtype=torch.float64)
     fit = FixedPointLinear(sigma=sigma, d=d).fit(X, Y)
@@ -83,7 +83,7 @@ def test_channels_of_infinite_and_finite_sigma():
     assert torch.equal(fit.weights_[:, 0], torch.ones(50).double())
 
 
-def test_gradients_at_an_infinite_sigma_are_those_of_least_squares():
+def test_gradients_at_an_infinite_sigma_equal_those_of_least_squares():
     X, y = contaminated_line(0, N=12)
     leaf = y.clone().requires_grad_()
     (slope,) = torch.autograd.grad(FixedPointLinear(sigma=math.inf).fit(X, leaf).coef_.sum(), leaf)
@@ -93,44 +93,44 @@ def test_gradients_at_an_infinite_sigma_are_those_of_least_squares():
 # published fixed points
 
 
-def published(name: str, h: float, start: str) -> Tensor:
+def published_coef(name: str, h: float, start: str) -> Tensor:
     found = [r for r in REFERENCE[name].mkc if r.h == h and start in (r.starts or (start,))]
     return torch.tensor(found[0].coef, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("start", ["least_squares", "s", "lts"])
-def test_stackloss_at_h_4(start):
+def test_stackloss_at_h_4_has_the_published_solution(start):
     fit = FixedPointLinear(sigma=2.0, d=2.0, start=start).fit(*DATA_SETS["stackloss"]())
-    torch.testing.assert_close(fit.coef_, published("stackloss", 4.0, "s"), rtol=1e-5, atol=0)
+    torch.testing.assert_close(fit.coef_, published_coef("stackloss", 4.0, "s"), rtol=1e-5, atol=0)
 
 
-def test_hbk_from_the_s_estimate():
+def test_hbk_from_the_s_estimate_has_the_published_solution():
     X, y = DATA_SETS["hbk"]()
     fit = FixedPointLinear(sigma=1.5, d=1.0, start=SRegression().fit(X, y).coef_).fit(X, y)
-    torch.testing.assert_close(fit.coef_, published("hbk", 1.5, "s"), rtol=1e-5, atol=0)
+    torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "s"), rtol=1e-5, atol=0)
 
 
-def test_hbk_from_the_named_s_start():
+def test_hbk_from_the_named_s_start_has_the_published_solution():
     fit = FixedPointLinear(sigma=1.5, d=1.0, start="s").fit(*DATA_SETS["hbk"]())
-    torch.testing.assert_close(fit.coef_, published("hbk", 1.5, "s"), rtol=1e-5, atol=0)
+    torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "s"), rtol=1e-5, atol=0)
 
 
-def test_hbk_from_least_squares_is_trapped():
+def test_hbk_from_least_squares_ends_at_the_published_local_minimum():
     fit = FixedPointLinear(sigma=1.5, d=1.0, start="least_squares").fit(*DATA_SETS["hbk"]())
-    torch.testing.assert_close(fit.coef_, published("hbk", 1.5, "least_squares"), rtol=1e-5, atol=0)
+    torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "least_squares"), rtol=1e-5, atol=0)
 
 
-def test_the_robust_minimum_is_kept_where_leverage_points_make_another_lower():
+def test_the_robust_minimum_is_kept_where_leverage_points_form_a_lower_minimum():
     X, y = DATA_SETS["hbk"]()
     fit = FixedPointLinear(sigma=1.5, d=1.0).fit(X, y)
     trapped = FixedPointLinear(sigma=1.5, d=1.0, start="least_squares").fit(X, y)
     assert float(trapped.history_[-1]) < float(fit.history_[-1])
-    torch.testing.assert_close(fit.coef_, published("hbk", 1.5, "s"), rtol=1e-5, atol=1e-8)
+    torch.testing.assert_close(fit.coef_, published_coef("hbk", 1.5, "s"), rtol=1e-5, atol=1e-8)
 
 
-def test_telef_at_h_1():
+def test_telef_at_h_1_has_the_published_solution():
     fit = FixedPointLinear(sigma=1.0, d=1.0).fit(*DATA_SETS["telef"]())
-    torch.testing.assert_close(fit.coef_, published("telef", 1.0, "s"), rtol=1e-5, atol=0)
+    torch.testing.assert_close(fit.coef_, published_coef("telef", 1.0, "s"), rtol=1e-5, atol=0)
 
 
 @settings(derandomize=True, deadline=None, max_examples=6)
@@ -156,7 +156,7 @@ def test_the_solution_satisfies_equation_15(seed):
     torch.testing.assert_close(fit.weights_, torch.exp(-(e**2) / (2 * d**2 * sigma**2)))
 
 
-def test_one_step_is_one_application_of_equation_15():
+def test_a_single_step_equals_equation_15():
     X, Y = channels(0)
     sigma, d, begin = torch.tensor([2.0, 1.0, 4.0]).double(), torch.tensor([0.2, 1.0, 5.0]).double(), sample(5, 4)
     fit = FixedPointLinear(sigma=sigma, d=d, start=begin, max_iter=1).fit(X, Y)
@@ -208,7 +208,7 @@ def test_a_small_bandwidth_finds_the_majority_among_one_sided_outliers():
 # noise covariance
 
 
-def test_noise_covariance_is_whitening():
+def test_a_noise_covariance_equals_whitening():
     X, Y = channels(0, m=2)
     covariance = torch.tensor([[2.0, 0.6], [0.6, 0.5]], dtype=torch.float64)
     inverse = torch.from_numpy(np.linalg.inv(np.linalg.cholesky(covariance.numpy())))
@@ -222,7 +222,7 @@ def test_noise_covariance_is_whitening():
     torch.testing.assert_close(gls, torch.linalg.solve(gram, torch.einsum("kin,ij,kj->n", X, P, Y)))
 
 
-def test_a_diagonal_noise_covariance_is_d_squared():
+def test_a_diagonal_noise_covariance_equals_d_squared():
     X, Y = channels(0)
     d = torch.tensor([0.2, 1.0, 5.0], dtype=torch.float64)
     fit = FixedPointLinear(sigma=2.0, noise_covariance=torch.diag(d**2)).fit(X, Y)
@@ -267,7 +267,7 @@ def test_sandwich_equals_the_formula(sigma):
     torch.testing.assert_close(fit.covariance_, sandwich_by_hand(X, Y, fit.coef_, sigma, d), rtol=1e-8, atol=1e-12)
 
 
-def test_sandwich_is_the_inverse_curvature_times_scores_by_automatic_differentiation():
+def test_sandwich_equals_inverse_curvature_and_scores_by_automatic_differentiation():
     X, y = contaminated_line(0)
     fit = FixedPointLinear(sigma=2.0, d=0.5).fit(X, y)
 
@@ -282,7 +282,7 @@ def test_sandwich_is_the_inverse_curvature_times_scores_by_automatic_differentia
 
 
 @pytest.mark.parametrize("sigma", [4.0, math.inf])
-def test_sandwich_is_the_spread_of_repeated_experiments(sigma):
+def test_sandwich_errors_equal_the_spread_of_repeated_experiments(sigma):
     X = torch.cat([torch.ones(80, 1).double(), sample(0, 80, 2)], 1)
     noise = sample(1, 800, 80) * (0.5 + X[:, 1].abs())  # heteroscedastic
     fit = FixedPointLinear(sigma=sigma, start=torch.ones(3).double()).fit(X, X.sum(-1) + noise)
@@ -313,7 +313,7 @@ def test_hac_equals_newey_and_west(lags):
     np.testing.assert_allclose(fit.covariance_.numpy(), expected, rtol=1e-8)
 
 
-def test_hac_of_no_lags_is_the_sandwich():
+def test_hac_of_no_lags_equals_the_sandwich():
     X, y = contaminated_line(0)
     plain = FixedPointLinear(sigma=2.0).fit(X, y).covariance_
     torch.testing.assert_close(
@@ -329,7 +329,7 @@ def ar1(seed: int, rho: float, *shape: int) -> Tensor:
     return torch.stack(out, -1)
 
 
-def test_hac_is_much_larger_than_the_sandwich_on_autocorrelated_residuals_and_near_the_truth():
+def test_under_autocorrelation_hac_errors_equal_the_spread_and_sandwich_errors_are_too_small():
     X = torch.stack([torch.ones(2000), torch.linspace(-1, 1, 2000)], -1).double()
     y = X.sum(-1) + ar1(0, 0.9, 150, 2000)
     plain = FixedPointLinear(sigma=math.inf).fit(X, y)
@@ -342,7 +342,7 @@ def test_hac_is_much_larger_than_the_sandwich_on_autocorrelated_residuals_and_ne
     torch.testing.assert_close(of_hac, spread, rtol=0.25, atol=0)
 
 
-def test_andrews_bandwidth_is_that_of_the_book():
+def test_andrews_bandwidth_equals_the_published_formula():
     score = ar1(0, 0.6, 1, 500).mT  # (500, 1)
     e = (score[:, 0] - score.mean()).numpy()
     rho = (e[1:] * e[:-1]).sum() / (e**2).sum()
@@ -372,7 +372,7 @@ def test_batch_equals_loop():
         torch.testing.assert_close(fit.weights_.reshape(4, 50, 3)[i], alone.weights_, rtol=0, atol=1e-7)
 
 
-def test_one_design_serves_many_targets():
+def test_a_shared_design_equals_a_loop_over_targets():
     X, y = contaminated_line(0)
     Y = torch.stack([y, y.flip(0), 0.1 * y, y + 5.0])
     fit = FixedPointLinear(sigma=2.0).fit(X, Y)
@@ -381,7 +381,7 @@ def test_one_design_serves_many_targets():
         torch.testing.assert_close(fit.coef_[i], FixedPointLinear(sigma=2.0).fit(X, Y[i]).coef_, rtol=1e-6, atol=1e-8)
 
 
-def test_columns_of_very_different_size_are_solved():
+def test_the_fit_is_equivariant_to_column_scales():
     X, y = contaminated_line(0, n=4)
     factor = torch.tensor([1e-8, 1.0, 1e3, 1e8], dtype=torch.float64)
     reference, other = FixedPointLinear(sigma=2.0).fit(X, y), FixedPointLinear(sigma=2.0).fit(X * factor, y)
@@ -414,7 +414,7 @@ def test_as_many_values_as_coefficients_are_interpolated():
     assert bool(torch.isinf(fit.covariance_).all())
 
 
-def test_an_exact_fit_keeps_weight_one_and_the_others_lose_theirs():
+def test_exactly_fitted_samples_have_weight_one_and_outliers_weight_zero():
     X, _ = contaminated_line(0)
     truth = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     y = X @ truth
@@ -425,7 +425,7 @@ def test_an_exact_fit_keeps_weight_one_and_the_others_lose_theirs():
     assert bool(fit.converged_)
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = contaminated_line(0)
     weight = (torch.arange(60) % 4 > 0).double()
     dirty = torch.where(weight > 0, y, 1e6)
@@ -477,7 +477,7 @@ def test_unknown_options_are_refused(argument, value):
         FixedPointLinear(**{argument: value}).fit(*contaminated_line(0))
 
 
-def test_starts_agree_where_there_is_one_minimum():
+def test_every_start_reaches_a_unique_minimum():
     X, y = contaminated_line(0, share=0.0)
     expected = FixedPointLinear(sigma=20.0).fit(X, y).coef_
     for start in ("s", "least_squares", LeastSquares().fit(X, y).coef_):
@@ -485,7 +485,7 @@ def test_starts_agree_where_there_is_one_minimum():
         torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-8)
 
 
-def test_graduation_from_a_wide_bandwidth_ends_lower_where_minima_are_many():
+def test_graduation_from_a_wide_bandwidth_reaches_a_lower_minimum():
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(100, 3, generator=generator, dtype=torch.float64)
     Y = X.sum(-1) + torch.randn(60, 100, generator=generator, dtype=torch.float64)

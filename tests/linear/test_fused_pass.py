@@ -1,4 +1,4 @@
-"""The pass as one Triton kernel: the sums of the plain operations, on a GPU if there is one, else interpreted."""
+"""A pass over the rows by a Triton kernel has the sums of torch; on a GPU, or by Triton's interpreter on the CPU."""
 
 import math
 
@@ -18,7 +18,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 @pytest.fixture(autouse=True)
-def _runs():
+def _skip_without_interpreter():
     if DEVICE == "cpu" and not _fused_pass._KERNEL.is_interpreted:
         pytest.skip("the kernel was imported before TRITON_INTERPRET=1 was set")
     if DEVICE == "cpu":
@@ -39,7 +39,7 @@ def sample(n: int, rows: int = 150) -> tuple[Tensor, Tensor]:
     ("kappa", "n", "dtype"),
     [(0.0, 9, torch.float64), (1e-6, 1, torch.float64), (0.3, 9, torch.float32), (0.3, 20, torch.float64)],
 )
-def test_the_kernel_has_the_sums_of_the_plain_operations(kappa, n, dtype, weighted):
+def test_sums_by_the_kernel_equal_those_of_torch(kappa, n, dtype, weighted):
     X, y = (v.to(dtype) for v in sample(n))
     X = torch.cat([X, X], -1)[:, :n]  # rows that are apart in memory
     weight = (torch.arange(len(y)) % 3).to(dtype) if weighted else None
@@ -65,7 +65,7 @@ def test_the_kernel_has_the_sums_of_the_plain_operations(kappa, n, dtype, weight
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_fit_by_the_kernel_is_the_fit_by_plain_operations(dtype, monkeypatch):
+def test_a_fit_by_the_kernel_equals_the_fit_by_torch(dtype, monkeypatch):
     X, y = (v.to(dtype) for v in sample(4, rows=6000))
     monkeypatch.setattr(_large, "LARGE", 6000)
     plain = MKCRegression().fit(X, y)

@@ -39,7 +39,7 @@ def primal(X: np.ndarray, y: np.ndarray, z: np.ndarray, v: np.ndarray) -> tuple[
 
 
 @pytest.mark.parametrize("rank_deficient", [False, True])
-def test_it_solves_the_constrained_problem(rank_deficient):
+def test_the_fit_equals_constrained_optimisation_by_scipy(rank_deficient):
     X = sample(0, 6, 3)
     if rank_deficient:
         X[:, 2] = X[:, 0] - X[:, 1]
@@ -68,7 +68,7 @@ def test_the_solution_satisfies_the_constraints_and_is_stationary():
     assert float(fit.entropy_) == pytest.approx(float(total), rel=1e-12)
 
 
-def test_wide_supports_give_ridge_regression():
+def test_wide_supports_equal_ridge_regression():
     # the entropy is quadratic near uniform distributions: variances c² / 2 and d² / 2 of the five points
     X, y = sample(4, 30, 3), sample(5, 30)
     c, d = 2e3, 1e4
@@ -78,7 +78,7 @@ def test_wide_supports_give_ridge_regression():
     torch.testing.assert_close(loose.coef_, LeastSquares().fit(X, y).coef_, rtol=0, atol=0.01)
 
 
-def test_no_data_at_all_leave_the_middle_of_the_supports():
+def test_columns_of_zeros_give_the_middle_of_the_supports():
     y = sample(6, 20)
     fit = GeneralizedMaximumEntropy(7.0).fit(torch.zeros(20, 3).double(), y - y.mean())
     assert float(fit.coef_.abs().max()) < 1e-12
@@ -87,7 +87,7 @@ def test_no_data_at_all_leave_the_middle_of_the_supports():
     torch.testing.assert_close(shifted.coef_, torch.full((3,), 2.0, dtype=torch.float64), rtol=1e-10, atol=0)
 
 
-def test_equal_columns_share_and_fewer_samples_than_coefficients_are_allowed():
+def test_equal_columns_share_a_coefficient_and_fewer_samples_than_coefficients_are_fitted():
     x = sample(7, 30, 1)
     fit = GeneralizedMaximumEntropy(10.0, 5.0).fit(torch.cat([x, x], 1), 3 * x[:, 0] + 0.1 * sample(8, 30))
     assert float(fit.coef_[0] - fit.coef_[1]) == pytest.approx(0.0, abs=1e-9)
@@ -117,7 +117,7 @@ def test_scaling_the_target_and_the_supports_scales_the_fit():
     torch.testing.assert_close(again.coef_, 1e5 * default.coef_, rtol=1e-8, atol=1e-6)
 
 
-def test_a_weight_is_a_number_of_repetitions_and_samples_have_no_order():
+def test_integer_weights_equal_repetition_and_the_order_of_samples_is_irrelevant():
     X, y = sample(13, 20, 2), sample(14, 20)
     counts = torch.randint(0, 4, (20,), generator=torch.Generator().manual_seed(0))
     fit = GeneralizedMaximumEntropy(5.0, 6.0).fit(X, y, counts)
@@ -129,7 +129,7 @@ def test_a_weight_is_a_number_of_repetitions_and_samples_have_no_order():
     torch.testing.assert_close(turned.coef_, fit.coef_, rtol=1e-8, atol=1e-10)
 
 
-def test_a_batch_is_a_loop():
+def test_batch_equals_loop():
     X, Y = sample(15, 4, 25, 2, 3), sample(16, 4, 25, 2)
     d = torch.tensor([4.0, 8.0]).double().unsqueeze(1) * POINTS
     fit = GeneralizedMaximumEntropy(5.0, d).fit(X, Y)
@@ -142,7 +142,7 @@ def test_a_batch_is_a_loop():
     torch.testing.assert_close(fit.predict(X)[2], X[2] @ fit.coef_[2], rtol=1e-12, atol=1e-12)
 
 
-def test_float32_gives_the_fit_of_float64():
+def test_float32_agrees_with_float64():
     X, y = sample(17, 30, 3), sample(18, 30)
     single = GeneralizedMaximumEntropy(5.0).fit(X.float(), y.float())
     assert single.coef_.dtype == torch.float32
@@ -151,7 +151,7 @@ def test_float32_gives_the_fit_of_float64():
     )
 
 
-def test_infeasible_supports_are_refused_with_the_sample():
+def test_infeasible_supports_are_refused_naming_the_sample():
     X, y = torch.ones(10, 1).double(), torch.ones(10).double()
     y[6] = 100.0
     with pytest.raises(ValueError, match=r"sample 6 .* widen"):
@@ -159,7 +159,7 @@ def test_infeasible_supports_are_refused_with_the_sample():
 
 
 @pytest.mark.parametrize("seed", [1, 3, 7, 8, 9, 12])
-def test_errors_that_have_to_be_at_the_end_of_their_support_are_refused(seed):
+def test_errors_at_the_end_of_their_support_are_refused(seed):
     X = sample(seed, 10, 3)
     supports = torch.linspace(-10, 10, 5).double(), torch.linspace(-3, 3, 5).double()
     y = torch.full((10,), 3.0).double()
@@ -169,7 +169,7 @@ def test_errors_that_have_to_be_at_the_end_of_their_support_are_refused(seed):
     torch.testing.assert_close(X @ wider.coef_ + wider.error_.squeeze(-1), y, rtol=0, atol=1e-8)
 
 
-def test_arguments_and_input_without_an_answer_are_refused():
+def test_bad_supports_data_and_options_are_refused():
     X, y = sample(19, 10, 2), sample(20, 10)
     for support in (0.0, math.inf, torch.ones(1), torch.ones(5), torch.tensor([0.0, math.nan])):
         with pytest.raises(ValueError, match="`coef_support`"):

@@ -54,7 +54,7 @@ def unrolled(X: Tensor, Y: Tensor, weight: Tensor, sigma: Tensor, d: Tensor, ste
 # the fixed point
 
 
-def test_gradients_are_those_of_the_unrolled_fixed_point():
+def test_gradients_equal_those_of_the_unrolled_fixed_point():
     inputs, direction = leaves(*channels(0)), sample(9, 4)
     implicit = grad(fixed_point(*inputs) @ direction, inputs)
     explicit = grad(unrolled(*inputs) @ direction, inputs)
@@ -79,20 +79,20 @@ def test_the_hessian_is_that_of_the_loss_and_not_the_gram_matrix_of_the_step():
     assert float((slope - other).norm()) > 0.05 * float(slope.norm())
 
 
-def test_gradients_are_differences_of_fits_in_both_modes():
+def test_gradients_equal_differences_of_fits_in_both_modes():
     X, y, weight = line(0, N=12, n=2)
     inputs = leaves(X, y, weight, torch.tensor(1.7).double(), torch.tensor(0.6).double())
     assert gradcheck(fixed_point, inputs, check_forward_ad=True, check_batched_grad=True, fast_mode=True)
 
 
 @pytest.mark.e2e
-def test_second_derivatives_are_differences_of_first_derivatives():
+def test_second_derivatives_equal_differences_of_first_derivatives():
     X, y, weight = line(0, N=10, n=2)
     inputs = leaves(X, y, weight, torch.tensor(1.7).double(), torch.tensor(0.6).double())
     assert gradgradcheck(fixed_point, inputs, check_fwd_over_rev=True, fast_mode=True)
 
 
-def test_every_result_of_a_fixed_point_that_follows_the_data_does():
+def test_weights_and_predictions_of_a_fixed_point_are_differentiable():
     X, Y, weight, sigma, d = channels(1, N=12)
 
     def results(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -102,7 +102,7 @@ def test_every_result_of_a_fixed_point_that_follows_the_data_does():
     assert gradcheck(results, leaves(X, Y, weight, sigma, d), fast_mode=True)
 
 
-def test_an_infinite_sigma_has_the_derivatives_of_weighted_least_squares():
+def test_derivatives_at_an_infinite_sigma_equal_those_of_weighted_least_squares():
     X, y, weight = line(0)
     inputs = leaves(X, y, weight, torch.tensor(math.inf).double(), torch.tensor(0.7).double())
     slopes = grad(fixed_point(*inputs).square().sum(), inputs)
@@ -114,7 +114,7 @@ def test_an_infinite_sigma_has_the_derivatives_of_weighted_least_squares():
     assert slopes[4].abs().item() < 1e-12
 
 
-def test_columns_of_different_size_and_nearly_dependent_columns():
+def test_gradients_do_not_depend_on_scale_and_collinearity_of_the_columns():
     X, y, weight = line(3, N=30)
     mix = torch.tensor([[1e6, 1.0, 0.0], [0.0, 1e-3, 1.0], [0.0, 0.0, 1.001]]).double()
     straight, mixed = leaves(y, y)
@@ -161,16 +161,16 @@ def test_samples_of_weight_0_have_no_influence_but_a_derivative_by_their_weight(
 # MKC-EM
 
 
-def em(*inputs: Tensor) -> tuple[Tensor, ...]:
+def em_results(*inputs: Tensor) -> tuple[Tensor, ...]:
     fit = MKCRegression(bound=torch.tensor([25.0, 40.0, 80.0]).double()).fit(*inputs)
     return fit.coef_, fit.sigma_, fit.d_, fit.log_likelihood_
 
 
 @pytest.mark.e2e
-def test_gradients_of_the_maximum_are_differences_of_fits():
+def test_gradients_of_the_maximum_equal_differences_of_fits():
     X, Y, weight, _, _ = channels(0, N=40)
     inputs = leaves(X, Y, weight)
-    results = em(*inputs)
+    results = em_results(*inputs)
     assert bool((results[1] < 10).all())
     for k, result in enumerate(results):
         direction = sample(k, result.numel()).view_as(result)
@@ -181,12 +181,12 @@ def test_gradients_of_the_maximum_are_differences_of_fits():
             for step in (-2e-4, -1e-4, 1e-4, 2e-4):
                 moved = [v.detach() for v in inputs]
                 moved[i] = moved[i] + step * along
-                values.append((direction * em(*leaves(*moved))[k]).sum().item())
+                values.append((direction * em_results(*leaves(*moved))[k]).sum().item())
             difference = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / 12e-4
             assert float((slope * along).sum()) == pytest.approx(difference, rel=1e-6, abs=1e-8)
 
 
-def test_gradients_of_the_maximum_are_differences_of_fits_without_derivatives():
+def test_gradients_of_the_maximum_equal_differences_of_plain_fits():
     X, y, weight = line(0)
     long = MKCRegression(bound=25.0, tol=1e-16, max_iter=3000)
     leaf, along = y.clone().requires_grad_(), sample(4, 40)
@@ -196,30 +196,30 @@ def test_gradients_of_the_maximum_are_differences_of_fits_without_derivatives():
         assert slope.item() == pytest.approx(((high - low) / 2e-3).item(), rel=1e-3)
 
 
-def one_channel(X: Tensor, y: Tensor, weight: Tensor, bound: Tensor) -> tuple[Tensor, ...]:
+def em_results_of_one_channel(X: Tensor, y: Tensor, weight: Tensor, bound: Tensor) -> tuple[Tensor, ...]:
     fit = MKCRegression(bound=bound).fit(X, y, weight)
     return fit.coef_, fit.sigma_, fit.d_, fit.log_likelihood_, fit.weights_
 
 
 @pytest.mark.e2e
-def test_every_result_of_em_in_every_argument_in_both_modes():
+def test_derivatives_of_all_results_of_em_pass_gradcheck_in_both_modes():
     X, y, weight = line(0, N=25, n=2)
     inputs = leaves(X, y, weight, torch.tensor([20.0]).double())
-    assert 1.0 < one_channel(*inputs)[1].item() < 5.0
-    assert gradcheck(one_channel, inputs, check_forward_ad=True, fast_mode=True)
+    assert 1.0 < em_results_of_one_channel(*inputs)[1].item() < 5.0
+    assert gradcheck(em_results_of_one_channel, inputs, check_forward_ad=True, fast_mode=True)
 
 
-def test_second_derivatives_of_em():
+def test_second_derivatives_of_em_pass_gradgradcheck():
     X, y, weight = line(0, N=25, n=2)
 
     def results(*inputs: Tensor) -> Tensor:
-        return torch.cat([v.reshape(-1) for v in one_channel(X, *inputs)[:4]])
+        return torch.cat([v.reshape(-1) for v in em_results_of_one_channel(X, *inputs)[:4]])
 
     inputs = leaves(y, weight, torch.tensor([20.0]).double())
     assert gradgradcheck(results, inputs, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
-def test_the_unknowns_of_em_move_together():
+def test_gradients_of_em_include_the_change_of_sigma_and_d():
     X, y, weight = line(0)
     leaf, other = leaves(y, y)
     fit = MKCRegression(bound=25.0).fit(X, leaf, weight)
@@ -230,7 +230,7 @@ def test_the_unknowns_of_em_move_together():
 
 
 @pytest.mark.parametrize("name", ["sigma", "d"])
-def test_a_given_bandwidth_or_scale_passes_its_derivative_on(name):
+def test_derivatives_by_a_given_sigma_or_d_pass_gradcheck(name):
     X, y, weight = line(0)
 
     def results(value: Tensor) -> tuple[Tensor, ...]:
@@ -243,7 +243,7 @@ def test_a_given_bandwidth_or_scale_passes_its_derivative_on(name):
     assert own.item() == pytest.approx(1.0)
 
 
-def test_a_domain_from_the_data_counts_as_a_constant():
+def test_a_domain_from_the_data_is_differentiated_as_a_constant():
     X, y, weight = line(0)
     first, second = leaves(y, y)
     fit = MKCRegression().fit(X, first, weight)
@@ -253,7 +253,7 @@ def test_a_domain_from_the_data_counts_as_a_constant():
     assert not fit.bound_.requires_grad
 
 
-def test_a_gaussian_channel_stays_gaussian():
+def test_derivatives_of_a_gaussian_channel_equal_those_of_least_squares():
     X, y = sample(5, 200, 3), 0.3 * sample(6, 200)
     y = y + X.sum(-1)
     leaf, other = leaves(y, y)
@@ -265,7 +265,7 @@ def test_a_gaussian_channel_stays_gaussian():
     torch.testing.assert_close(grad(fit.coef_.sum() + fit.d_.sum(), leaf), grad(plain.sum() + spread, other))
 
 
-def test_a_scale_at_its_least_is_held_and_an_exact_fit_follows_its_values():
+def test_an_exact_fit_has_derivatives_by_the_fitted_values_and_none_of_d():
     X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
     y = 1 + 2 * X[:, 1]
     y[:4] = 100.0
@@ -278,7 +278,7 @@ def test_a_scale_at_its_least_is_held_and_an_exact_fit_follows_its_values():
     torch.testing.assert_close(slope[4:], torch.linalg.pinv(X[4:])[1], rtol=1e-6, atol=1e-9)
 
 
-def test_an_ellipsoid_follows_its_points():
+def test_the_centre_of_an_ellipsoid_moves_with_its_points():
     direction = sample(0, 60, 3)
     points = direction / direction.norm(dim=-1, keepdim=True) * torch.tensor([40.0, 50.0, 45.0]).double()
     points = (points + torch.tensor([5.0, -3.0, 8.0]).double() + 0.1 * sample(1, 60, 3)).requires_grad_()
@@ -290,7 +290,7 @@ def test_an_ellipsoid_follows_its_points():
 # transforms
 
 
-def test_forward_and_backward_derivatives_agree():
+def test_forward_and_reverse_mode_derivatives_agree():
     inputs = channels(0)
     tangents = [sample(20 + i, *v.shape) for i, v in enumerate(inputs)]
     _, forward = torch.func.jvp(fixed_point, inputs, tuple(tangents))
@@ -310,7 +310,7 @@ def graduated_scale(X: Tensor, y: Tensor, weight: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("function", [em_scale, graduated_scale])
-def test_vmap_is_a_loop(function):
+def test_vmap_equals_a_loop(function):
     X, y, weight = line(0, batch=(4,))
     one_by_one = torch.stack([function(*leaves(*v)) for v in zip(X, y, weight, strict=True)])
     torch.testing.assert_close(vmap(function)(X, y, weight), one_by_one, rtol=1e-8, atol=1e-10)
@@ -322,7 +322,7 @@ def test_vmap_is_a_loop(function):
 
 
 @pytest.mark.parametrize("function", [em_scale, graduated_scale])
-def test_gradients_under_vmap_are_those_of_a_loop(function):
+def test_gradients_under_vmap_equal_those_of_a_loop(function):
     data = line(0, batch=(3,))
     slope = torch.func.grad(lambda *a: function(*a).square().sum(), argnums=(0, 1, 2))
     together = vmap(slope)(*data)
@@ -331,7 +331,7 @@ def test_gradients_under_vmap_are_those_of_a_loop(function):
         torch.testing.assert_close(tuple(g[i] for g in together), alone, rtol=1e-7, atol=1e-9)
 
 
-def test_a_batch_of_the_fit_is_a_loop_with_its_gradients():
+def test_a_batch_and_its_gradients_equal_a_loop():
     X, y, weight = line(0, batch=(2, 3))
     batch = leaves(X[0, 0], y, weight[0])
     coef = FixedPointLinear(2.0, 0.3).fit(*batch).coef_
@@ -345,7 +345,7 @@ def test_a_batch_of_the_fit_is_a_loop_with_its_gradients():
     torch.testing.assert_close(grad(coef.square().sum(), batch), expected, rtol=1e-8, atol=1e-9)
 
 
-def test_vmap_over_bandwidths():
+def test_derivatives_under_vmap_over_bandwidths_equal_those_of_a_loop():
     X, y, _ = line(0)
     sigma = torch.tensor([1.0, 2.0, math.inf]).double()
 
@@ -367,7 +367,7 @@ def test_a_hessian_by_forward_over_reverse_is_symmetric():
 
 
 @pytest.mark.parametrize("estimator", [FixedPointLinear(2.0, 0.3), MKCRegression()])
-def test_nothing_is_recorded_without_a_gradient(estimator):
+def test_fits_without_a_gradient_record_no_graph(estimator):
     X, y, weight = line(0)
     plain = estimator.fit(X, y, weight).coef_
     assert not plain.requires_grad
@@ -386,7 +386,7 @@ def test_nothing_is_recorded_without_a_gradient(estimator):
 
 
 @pytest.mark.parametrize("estimator", [FixedPointLinear(2.0, 0.3), MKCRegression()])
-def test_a_layer_has_every_result_of_a_fit(estimator):
+def test_a_fit_with_a_gradient_has_the_results_of_a_plain_fit(estimator):
     X, y, weight = line(0, batch=(2,))
     estimator.fit(X, y, weight)
     plain = {k: v for k, v in vars(estimator).items() if k.endswith("_")}
@@ -405,27 +405,27 @@ def test_a_layer_has_every_result_of_a_fit(estimator):
 TWO_CLUSTERS = torch.tensor([-2.0, 2.0]).double().repeat(5)
 
 
-def between(y: Tensor) -> FixedPointLinear:
-    """A mean that stays halfway between two clusters, where the loss has its maximum."""
+def mean_between_clusters(y: Tensor) -> FixedPointLinear:
+    """A mean that remains halfway between two clusters, at a maximum of the loss."""
     start = torch.zeros(*y.shape[:-1], 1).double()
     return FixedPointLinear(1.0, 1.0, start=start).fit(torch.ones(10, 1).double(), y)
 
 
 def test_a_maximum_is_refused_when_its_derivative_is_taken():
     (y,) = leaves(TWO_CLUSTERS)
-    fit = between(y)
+    fit = mean_between_clusters(y)
     assert bool(fit.converged_)
     assert not bool(fit.differentiable_)
     assert fit.coef_.item() == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(NotDifferentiableError, match="strict minimum to differentiate at"):
         fit.coef_.sum().backward()
     with pytest.raises(NotDifferentiableError, match="Hessian"):
-        torch.func.jvp(lambda y: between(y).coef_, (TWO_CLUSTERS,), (torch.ones(10).double(),))
+        torch.func.jvp(lambda y: mean_between_clusters(y).coef_, (TWO_CLUSTERS,), (torch.ones(10).double(),))
     with pytest.raises(NotDifferentiableError, match="problem 0"):
-        vmap(torch.func.grad(lambda y: between(y).coef_.sum()))(TWO_CLUSTERS.expand(2, 10))
+        vmap(torch.func.grad(lambda y: mean_between_clusters(y).coef_.sum()))(TWO_CLUSTERS.expand(2, 10))
 
 
-def test_a_direction_that_no_weight_is_left_for_is_refused():
+def test_a_derivative_with_a_singular_weighted_gram_matrix_is_refused():
     X = torch.stack([torch.ones(6), torch.arange(6.0)], -1).double()
     y = torch.tensor([0.0, 1e3, -1e3, 4e3, 2e3, -5e3]).double().requires_grad_()
     fit = FixedPointLinear(1.0, 1.0, start=torch.zeros(2).double()).fit(X, y)
@@ -445,14 +445,16 @@ def test_a_fit_that_has_not_converged_is_refused(estimator):
         fit.coef_.sum().backward()
 
 
-def test_a_problem_without_a_derivative_can_be_left_out():
+def test_problems_without_a_derivative_can_be_masked_by_differentiable():
     good = 1.0 + 0.3 * sample(0, 10)
     (y,) = leaves(torch.stack([good, TWO_CLUSTERS]))
-    fit = between(y)
+    fit = mean_between_clusters(y)
     assert fit.differentiable_.tolist() == [True, False]
     slope = grad(fit.coef_[fit.differentiable_].sum(), y, retain_graph=True)[0]
     (alone,) = leaves(good)
-    torch.testing.assert_close(slope[0], grad(between(alone).coef_.sum(), alone)[0], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        slope[0], grad(mean_between_clusters(alone).coef_.sum(), alone)[0], rtol=1e-9, atol=1e-12
+    )
     assert not bool(slope[1].any())
     with pytest.raises(NotDifferentiableError, match="problem 1"):
         grad(fit.coef_.sum(), y, retain_graph=True)
@@ -460,7 +462,7 @@ def test_a_problem_without_a_derivative_can_be_left_out():
         grad(fit.coef_, y, torch.eye(2).double().unsqueeze(-1), is_grads_batched=True)
 
 
-def test_bad_input_is_refused():
+def test_bad_data_and_parameters_are_refused():
     X, y, _ = line(0)
     leaf = X.clone().requires_grad_()
     with pytest.raises(ValueError, match="Expected argument `Y` to be finite"):
@@ -498,7 +500,7 @@ def test_features_under_a_robust_last_layer_learn_from_contaminated_samples():
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
-def test_weights_of_samples_are_learned():
+def test_sample_weights_are_learned_through_the_fit():
     X, y, _ = line(0, N=60)
     y[:20] += 1.0  # too near for a robust loss to reject
     logits = torch.zeros(60, dtype=torch.float64, requires_grad=True)

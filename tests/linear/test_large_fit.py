@@ -62,7 +62,7 @@ def rare_column() -> tuple[Tensor, Tensor]:
     return X, y + 1.5 * X[:, -1]
 
 
-def changed(
+def rescaled_sample(
     move_x: float = 0.0, move_y: float = 0.0, unit_x: float = 1.0, unit_y: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     X, y = sample()
@@ -70,31 +70,31 @@ def changed(
     return X, unit_y * y + move_y
 
 
-def rounded() -> tuple[Tensor, Tensor]:
+def sample_of_rounded_targets() -> tuple[Tensor, Tensor]:
     X, y = sample()
     return X, y.round()
 
 
-HARD = {
+HARD_CASES = {
     "sorted": sample,
     "forty per cent on one side": lambda: sample(share=0.4),
     "near outliers": lambda: (sample(share=0.0)[0], sample(share=0.0)[1] + 3.5 * (torch.arange(N) < N // 20)),
     "Gaussian": lambda: sample(share=0.0),
     "clustered at a leverage point": clustered,
     "heavy tails": heavy_tailed,
-    "ties": rounded,
+    "ties": sample_of_rounded_targets,
     "two channels": channels,
     "a column that is seldom other than 0": rare_column,
-    "a column far from 0": lambda: changed(move_x=1e8),
-    "targets far from 0": lambda: changed(move_y=1e8),
-    "columns of different size": lambda: changed(unit_x=1e-8),
-    "targets of another unit": lambda: changed(unit_y=1e-6),
+    "a column far from 0": lambda: rescaled_sample(move_x=1e8),
+    "targets far from 0": lambda: rescaled_sample(move_y=1e8),
+    "columns of different size": lambda: rescaled_sample(unit_x=1e-8),
+    "targets of another unit": lambda: rescaled_sample(unit_y=1e-6),
 }
 
 
 @pytest.fixture
-def piloted(monkeypatch) -> list[bool]:
-    """For each large fit, whether it ended as such and not in the alternation over all rows."""
+def ended_as_large(monkeypatch) -> list[bool]:
+    """For each large fit, whether it ended by passes over blocks and not by the alternation over all rows."""
     ends: list[bool] = []
     whole = _large.large_maximum
 
@@ -107,12 +107,14 @@ def piloted(monkeypatch) -> list[bool]:
     return ends
 
 
-def directly(monkeypatch) -> None:
-    """Fit directly, without a pilot, from here on."""
+def fit_directly(monkeypatch) -> None:
+    """Make all later fits direct, without a pilot sample."""
     monkeypatch.setattr(_large, "LARGE", 1 << 60)
 
 
-def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = None, **given: float) -> MKCRegression:
+def converged_fit(
+    fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = None, **given: float
+) -> MKCRegression:
     """The converged fit on the same domain, by the Newton steps of a differentiable fit."""
     polished = MKCRegression(bound=fit.bound_, start=fit.coef_, **given).fit(X.clone().requires_grad_(), Y, weight)
     polished.coef_, polished.sigma_, polished.d_ = (
@@ -124,19 +126,19 @@ def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = 
     return polished
 
 
-def apart(fit: MKCRegression, other: MKCRegression) -> float:
+def difference_in_standard_errors(fit: MKCRegression, other: MKCRegression) -> float:
     """Largest difference of the coefficients, in standard errors."""
     return float(((fit.coef_ - other.coef_).abs() / other.standard_error_).detach().max())
 
 
-@pytest.mark.parametrize("case", HARD)
-def test_a_large_fit_is_fully_converged(case, piloted):
-    X, Y = HARD[case]()
+@pytest.mark.parametrize("case", HARD_CASES)
+def test_a_large_fit_is_fully_converged(case, ended_as_large):
+    X, Y = HARD_CASES[case]()
     fit = MKCRegression().fit(X, Y)
-    assert piloted == [True]
-    polished = converged(fit, X, Y)
+    assert ended_as_large == [True]
+    polished = converged_fit(fit, X, Y)
     # coefficients of 1e8 have coarser last digits
-    assert apart(fit, polished) < (1e-4 if "far" in case else 1e-6)
+    assert difference_in_standard_errors(fit, polished) < (1e-4 if "far" in case else 1e-6)
     gaussian = torch.isinf(polished.sigma_)
     assert torch.equal(torch.isinf(fit.sigma_), gaussian)
     torch.testing.assert_close(fit.sigma_[~gaussian], polished.sigma_[~gaussian], rtol=1e-6, atol=0.0)
@@ -148,87 +150,87 @@ def test_a_large_fit_is_fully_converged(case, piloted):
     assert not bool(fit.exact_fit_)
 
 
-@pytest.mark.parametrize("case", HARD)
-def test_a_large_fit_is_the_fit_of_all_rows_from_the_start(case, monkeypatch):
-    X, Y = HARD[case]()
+@pytest.mark.parametrize("case", HARD_CASES)
+def test_a_large_fit_equals_a_direct_fit_of_all_rows(case, monkeypatch):
+    X, Y = HARD_CASES[case]()
     fit = MKCRegression().fit(X, Y)
-    directly(monkeypatch)
+    fit_directly(monkeypatch)
     direct = MKCRegression().fit(X, Y)
     torch.testing.assert_close(fit.bound_, direct.bound_, rtol=0.02, atol=0.0)
-    assert apart(fit, direct) < 0.05
+    assert difference_in_standard_errors(fit, direct) < 0.05
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nearly_half_the_rows_are_outliers(seed, piloted):
+def test_a_large_fit_withstands_45_per_cent_outliers(seed, ended_as_large):
     X, y = sample(seed, n=15, share=0.45)
     fit = MKCRegression(seed=seed).fit(X, y)
-    assert len(piloted) == 1
+    assert len(ended_as_large) == 1
     assert float((fit.coef_ - 1.0).abs().max()) < 0.1
 
 
 @pytest.mark.parametrize(
     "given", [{"sigma": 2.0}, {"d": 1.1}, {"sigma": math.inf}, {"bound": 40.0}, {"sigma": 2.0, "d": 1.0}]
 )
-def test_given_parameters_are_kept(given, piloted):
+def test_given_parameters_are_kept(given, ended_as_large):
     X, y = sample()
     fit = MKCRegression(**given).fit(X, y)
-    assert piloted == [True]
+    assert ended_as_large == [True]
     for name, value in given.items():
         assert float(getattr(fit, f"{name}_")) == pytest.approx(value)
     given.pop("bound", None)
-    assert apart(fit, converged(fit, X, y, **given)) < 1e-6
+    assert difference_in_standard_errors(fit, converged_fit(fit, X, y, **given)) < 1e-6
 
 
 @pytest.mark.parametrize("start", ["s", "least_squares"])
-def test_any_start_ends_at_the_same_maximum(start, piloted):
+def test_any_start_ends_at_the_same_maximum(start, ended_as_large):
     X, y = sample(share=0.02)
     fit = MKCRegression(start=start, bound=20.0).fit(X, y)
     given = MKCRegression(start=torch.zeros(5).double(), bound=20.0).fit(X, y)
     lts = MKCRegression(bound=20.0).fit(X, y)
-    assert apart(fit, lts) < 1e-6
-    assert apart(given, lts) < 1e-6
-    assert piloted[-1]
+    assert difference_in_standard_errors(fit, lts) < 1e-6
+    assert difference_in_standard_errors(given, lts) < 1e-6
+    assert ended_as_large[-1]
 
 
-def test_weight_0_is_removal_and_weight_2_is_repetition(piloted):
+def test_weight_0_equals_removal_and_weight_2_equals_repetition(ended_as_large):
     X, y = sample()
     weight = torch.arange(N).double() % 3
     y[::3] = 1e6  # of no weight
     fit = MKCRegression().fit(X, y, weight)
     rows = torch.cat([torch.arange(N)[weight >= k] for k in (1, 2)])
-    repeated = converged(fit, X[rows], y[rows])
-    assert piloted[0]
-    assert apart(fit, repeated) < 1e-6
+    repeated = converged_fit(fit, X[rows], y[rows])
+    assert ended_as_large[0]
+    assert difference_in_standard_errors(fit, repeated) < 1e-6
     torch.testing.assert_close(fit.log_likelihood_, repeated.log_likelihood_, rtol=1e-9, atol=0.0)
     assert float(fit.bound_) < 100.0
-    assert apart(fit, converged(fit, X, y, weight)) < 1e-6
+    assert difference_in_standard_errors(fit, converged_fit(fit, X, y, weight)) < 1e-6
 
 
-def test_the_seed_hardly_matters_and_not_at_all_on_a_given_domain():
+def test_the_fit_nearly_agrees_for_all_seeds_and_fully_on_a_given_domain():
     X, y = sample()
     fits = [MKCRegression(seed=seed).fit(X, y) for seed in range(4)]
-    assert max(apart(fit, fits[0]) for fit in fits) < 1e-3
+    assert max(difference_in_standard_errors(fit, fits[0]) for fit in fits) < 1e-3
     fits = [MKCRegression(seed=seed, bound=20.0).fit(X, y) for seed in range(4)]
-    assert max(apart(fit, fits[0]) for fit in fits) < 1e-6
+    assert max(difference_in_standard_errors(fit, fits[0]) for fit in fits) < 1e-6
 
 
-def test_results_are_continuous_where_fits_become_large(monkeypatch, piloted):
+def test_results_are_continuous_where_fits_become_large(monkeypatch, ended_as_large):
     X, y = sample(rows=6000)
     monkeypatch.setattr(_large, "LARGE", 6000)
     large = MKCRegression(bound=20.0).fit(X, y)
     monkeypatch.setattr(_large, "LARGE", 6001)
     small = MKCRegression(bound=20.0, tol=0.0).fit(X, y)
-    assert piloted == [True]
-    assert apart(large, small) < 1e-4
+    assert ended_as_large == [True]
+    assert difference_in_standard_errors(large, small) < 1e-4
     assert large.n_iter_ < small.n_iter_
 
 
-def test_float32_data_have_float64_sums(monkeypatch):
-    X, y = (v.float() for v in changed(move_x=100.0))
+def test_float32_data_are_summed_in_float64(monkeypatch):
+    X, y = (v.float() for v in rescaled_sample(move_x=100.0))
     fit = MKCRegression(bound=20.0).fit(X, y)
     assert {fit.coef_.dtype, fit.weights_.dtype, fit.covariance_.dtype} == {torch.float32}
     exact = MKCRegression(bound=20.0).fit(X.double(), y.double())
-    directly(monkeypatch)
+    fit_directly(monkeypatch)
     direct = MKCRegression(bound=20.0).fit(X, y)
     off, direct_off = (((f.coef_ - exact.coef_) / exact.standard_error_).abs().max() for f in (fit, direct))
     assert off < 1e-4
@@ -242,7 +244,7 @@ def test_results_have_the_shapes_of_a_direct_fit(monkeypatch):
     for x, t in ((X, y), (X[None], y[None]), (Xc, Yc), (Xc[None], Yc[None])):
         fit = MKCRegression().fit(x, t)
         with monkeypatch.context() as patch:
-            directly(patch)
+            fit_directly(patch)
             direct = MKCRegression().fit(x, t)
         assert set(vars(fit)) == set(vars(direct))
         for name, value in vars(direct).items():
@@ -261,18 +263,18 @@ def test_history_never_rises_and_ends_at_the_likelihood():
     torch.testing.assert_close(-N * fit.history_[-1], fit.log_likelihood_)
 
 
-def test_gradients_through_a_large_fit(piloted):
+def test_gradients_through_a_large_fit_equal_differences(ended_as_large):
     X, y = sample()
     free = MKCRegression().fit(X, y)
     target = y.clone().requires_grad_()
     fit = MKCRegression(start="lts").fit(X, target)
-    assert piloted == [True, True]
+    assert ended_as_large == [True, True]
     assert bool(fit.differentiable_)
-    assert apart(free, fit) < 1e-6
+    assert difference_in_standard_errors(free, fit) < 1e-6
     torch.testing.assert_close(fit.bound_.detach(), free.bound_)
     plain = MKCRegression(bound=20.0).fit(X, y)
     fit = MKCRegression(bound=20.0, start=plain.coef_).fit(X, target)
-    assert apart(plain, fit) < 1e-6
+    assert difference_in_standard_errors(plain, fit) < 1e-6
     fit.coef_.sum().backward()
     change = torch.zeros(N).double()
     change[N // 2 :: 7] = 1e-3
@@ -281,7 +283,7 @@ def test_gradients_through_a_large_fit(piloted):
     assert float(moved) == pytest.approx(float((target.grad * change).sum()), rel=1e-3)
 
 
-class Largest(TorchDispatchMode):
+class LargestTensor(TorchDispatchMode):
     """Number of elements of the largest tensor that an operation creates, except views of ``given``."""
 
     def __init__(self, *given: Tensor) -> None:
@@ -309,7 +311,7 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
             yield block
 
     monkeypatch.setattr(_rows, "blocks", counted)
-    with Largest(X, y) as largest:
+    with LargestTensor(X, y) as largest:
         MKCRegression().fit(X, y)
     assert read < 12 * rows
     # the weights, and nothing larger at once
@@ -318,7 +320,7 @@ def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-4, 9.9e-3, 1.01e-2, 0.5])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
+def test_sums_of_blocks_equal_those_of_all_rows(kappa, weighted, monkeypatch):
     X, Y = channels()
     weight = torch.arange(2 * N).double().reshape(N, 2) % 3 if weighted else None
     beta = torch.tensor([1.1, 0.9, 1.2]).double()
@@ -343,7 +345,7 @@ def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
 
 
 class SumsByTorch(_block_sums.BlockSums):
-    """The operations of a GPU, on the CPU."""
+    """The sums by torch, as on a GPU, on the CPU."""
 
     def __init__(self, *args, **options) -> None:
         super().__init__(*args, **options)
@@ -355,7 +357,7 @@ class SumsByTorch(_block_sums.BlockSums):
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-3, 0.3])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_sums_by_the_operations_of_a_gpu(kappa, weighted, monkeypatch):
+def test_sums_by_torch_equal_sums_by_numpy(kappa, weighted, monkeypatch):
     X, Y = channels()
     rows = Rows(X, Y, (torch.arange(2 * N) % 3).double().reshape(N, 2) if weighted else None)
     density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
@@ -369,7 +371,7 @@ def test_sums_by_the_operations_of_a_gpu(kappa, weighted, monkeypatch):
     torch.testing.assert_close(by_torch, by_numpy)
 
 
-def test_a_frame_is_a_change_of_columns():
+def test_sums_in_a_frame_are_those_of_transformed_columns():
     X, y = sample()
     frame = torch.linalg.inv(normal(9, 5, 5))
     density = Density(torch.tensor([0.2]).double(), torch.tensor([1.0]).double())
@@ -384,7 +386,7 @@ def test_a_frame_is_a_change_of_columns():
     torch.testing.assert_close(transformed.curvature, frame.mT @ curvature_sums.curvature @ frame)
 
 
-def test_score_is_the_slope_of_the_energy():
+def test_the_score_is_the_derivative_of_the_energy():
     X, y = sample(rows=1000)
     density = Density(torch.tensor([0.3]).double(), torch.tensor([1.2]).double())
 
@@ -399,7 +401,7 @@ def test_score_is_the_slope_of_the_energy():
         assert float(slope) == pytest.approx(-float(energy_at(beta)[1 + k] / density.d.square()), rel=1e-6)
 
 
-def test_rows_in_use_are_drawn_and_rare_rows_by_leverage():
+def test_the_pilot_draws_rows_in_use_and_rare_rows_by_leverage():
     X, y = rare_column()
     weight = (torch.arange(N) % 2).double()
     index = drawn_rows(checked_shapes(X, y, weight), 2000, 0)
@@ -416,26 +418,26 @@ def test_rows_in_use_are_drawn_and_rare_rows_by_leverage():
     assert found[1]
 
 
-def test_an_exact_fit_is_left_to_the_alternation(piloted):
+def test_an_exact_fit_is_found_by_the_alternation(ended_as_large):
     X, y = sample()
     y[N // 10 :] = X[N // 10 :].sum(-1)
     fit = MKCRegression().fit(X, y)
-    assert piloted == [False]
+    assert ended_as_large == [False]
     assert bool(fit.exact_fit_)
 
 
-def test_a_more_likely_gaussian_is_left_to_the_alternation(piloted, monkeypatch):
+def test_a_more_likely_gaussian_is_found_by_the_alternation(ended_as_large, monkeypatch):
     X, y = sample(share=0.0)
     X[: N // 5, 1:] = 8.0 + 0.1 * normal(4, N // 5, 4)
     y[: N // 5] = X[: N // 5].sum(-1) - 40.0
     fit = MKCRegression().fit(X, y)
-    assert piloted == [False]
-    directly(monkeypatch)
+    assert ended_as_large == [False]
+    fit_directly(monkeypatch)
     assert torch.equal(MKCRegression().fit(X, y).coef_, fit.coef_)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_values_that_are_not_finite_are_refused_with_their_place(value):
+def test_values_that_are_not_finite_are_refused_with_their_index(value):
     X, y = sample()
     X[20_001, 2] = value
     with pytest.raises(ValueError, match=r"`X` to be finite but got .* at index \(20001, 2\)"):
@@ -460,21 +462,21 @@ def test_negative_weights_and_a_narrow_bound_are_refused():
         MKCRegression(bound=0.1).fit(X, y)
 
 
-def test_a_time_series_is_fitted_directly(piloted):
+def test_a_time_series_is_fitted_directly(ended_as_large):
     X, y = sample()
     fit = MKCRegression(covariance="hac", bandwidth=3.0).fit(X, y)
-    assert piloted == []
-    assert apart(fit, converged(fit, X, y)) < 0.05
+    assert ended_as_large == []
+    assert difference_in_standard_errors(fit, converged_fit(fit, X, y)) < 0.05
 
 
-def test_how_the_data_lie_in_memory_does_not_matter(piloted):
+def test_the_fit_does_not_depend_on_memory_layout(ended_as_large):
     X, y = sample()
     fit = MKCRegression().fit(X, y)
     apart_in_memory = torch.stack([y, y], -1)[:, 0]
     assert not apart_in_memory.is_contiguous()
     for x in (X.mT.contiguous().mT, torch.cat([X, X], 1)[:, :5], X.flip(0).flip(0)):
-        assert apart(MKCRegression().fit(x, apart_in_memory), fit) < 1e-6
-    assert apart(MKCRegression().fit(X.numpy(), y.numpy()), fit) < 1e-6
+        assert difference_in_standard_errors(MKCRegression().fit(x, apart_in_memory), fit) < 1e-6
+    assert difference_in_standard_errors(MKCRegression().fit(X.numpy(), y.numpy()), fit) < 1e-6
     with torch.inference_mode():
-        assert apart(MKCRegression().fit(X, y), fit) < 1e-6
-    assert piloted == [True] * 6
+        assert difference_in_standard_errors(MKCRegression().fit(X, y), fit) < 1e-6
+    assert ended_as_large == [True] * 6

@@ -29,7 +29,7 @@ def linear_program(X: Tensor, y: Tensor, weight: Tensor | None = None) -> tuple[
     return coef, float((w * (y - X @ coef).abs()).sum())
 
 
-def heavy(seed: int, *shape: int) -> Tensor:
+def heavy_tailed(seed: int, *shape: int) -> Tensor:
     """Noise like Student's t with two degrees of freedom: heavy tails, but a finite mean."""
     return sample(seed, *shape) / (sample(seed + 1, *shape).square() + sample(seed + 2, *shape).square()).sqrt()
 
@@ -60,8 +60,8 @@ def test_further_data_sets_give_the_optimum_of_the_linear_program(name):
 
 
 @pytest.mark.parametrize(("N", "n"), [(7, 6), (40, 3), (51, 1), (80, 20), (400, 2)])
-def test_single_problem_is_the_optimum_of_the_linear_program(N, n):
-    X, y = sample(N, N, n), heavy(n, N)
+def test_a_single_problem_reaches_the_optimum_of_the_linear_program(N, n):
+    X, y = sample(N, N, n), heavy_tailed(n, N)
     fit = LeastAbsoluteDeviations().fit(X, y)
     assert fit.coef_.shape == (n,)
     assert fit.objective_.shape == fit.converged_.shape == fit.n_iter_.shape == ()
@@ -69,8 +69,8 @@ def test_single_problem_is_the_optimum_of_the_linear_program(N, n):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_every_problem_of_a_batch_is_the_optimum_of_its_linear_program(weighted):
-    X, y = sample(0, 2, 5, 30, 3).unsqueeze(-2), heavy(1, 2, 5, 30).unsqueeze(-1)
+def test_every_problem_of_a_batch_reaches_the_optimum_of_its_linear_program(weighted):
+    X, y = sample(0, 2, 5, 30, 3).unsqueeze(-2), heavy_tailed(1, 2, 5, 30).unsqueeze(-1)
     weight = sample(4, 2, 5, 30).exp() if weighted else None
     fit = LeastAbsoluteDeviations().fit(X, y, weight)
     assert fit.coef_.shape == (2, 5, 3)
@@ -81,7 +81,7 @@ def test_every_problem_of_a_batch_is_the_optimum_of_its_linear_program(weighted)
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_channels_share_the_coefficients(weighted):
-    X, Y = sample(0, 4, 20, 3, 5), heavy(1, 4, 20, 3)
+    X, Y = sample(0, 4, 20, 3, 5), heavy_tailed(1, 4, 20, 3)
     weight = sample(4, 4, 20, 3).exp() if weighted else None
     fit = LeastAbsoluteDeviations().fit(X, Y, weight)
     assert fit.weights_.shape == Y.shape
@@ -90,16 +90,16 @@ def test_channels_share_the_coefficients(weighted):
         assert_is_optimum(fit, (i,), X[i].reshape(60, 5), Y[i].flatten(), w)
 
 
-def test_one_design_serves_many_targets():
-    X, Y = sample(0, 40, 2), heavy(1, 3, 40)
+def test_a_shared_design_equals_a_loop_over_targets():
+    X, Y = sample(0, 40, 2), heavy_tailed(1, 3, 40)
     fit = LeastAbsoluteDeviations().fit(X, Y)
     assert fit.coef_.shape == (3, 2)
     for i in range(3):
         assert_is_optimum(fit, (i,), X, Y[i], None)
 
 
-def test_weights_of_very_different_size():
-    X, y, w = sample(0, 50, 4), heavy(1, 50), 10.0 ** (4 * sample(2, 50).clamp(-2, 2))
+def test_weights_of_very_different_size_reach_the_optimum():
+    X, y, w = sample(0, 50, 4), heavy_tailed(1, 50), 10.0 ** (4 * sample(2, 50).clamp(-2, 2))
     fit = LeastAbsoluteDeviations().fit(X, y, w)
     coef, optimum = linear_program(X, y, w / w.max())
     assert float(fit.objective_ / w.max()) == pytest.approx(optimum, rel=1e-9)
@@ -107,7 +107,7 @@ def test_weights_of_very_different_size():
 
 
 def test_batch_equals_loop():
-    X, y = sample(0, 6, 25, 3).unsqueeze(-2), heavy(1, 6, 25).unsqueeze(-1)
+    X, y = sample(0, 6, 25, 3).unsqueeze(-2), heavy_tailed(1, 6, 25).unsqueeze(-1)
     y[2] = torch.matmul(X[2], torch.ones(3, dtype=X.dtype))  # a problem that needs no iteration
     together = LeastAbsoluteDeviations().fit(X, y)
     for i in range(6):
@@ -121,7 +121,7 @@ def test_batch_equals_loop():
 @properties
 @given(seed=seeds, factor=st.floats(-1e3, 1e3).filter(lambda c: abs(c) > 1e-3))
 def test_regression_and_scale_equivariance(seed, factor):
-    X, y, shift = sample(seed, 21, 3), heavy(seed + 10, 21), 10 * sample(seed + 20, 3)
+    X, y, shift = sample(seed, 21, 3), heavy_tailed(seed + 10, 21), 10 * sample(seed + 20, 3)
     plain = LeastAbsoluteDeviations().fit(X, y)
     moved = LeastAbsoluteDeviations().fit(X, factor * y + X @ shift)
     expected = factor * plain.coef_ + shift
@@ -132,7 +132,7 @@ def test_regression_and_scale_equivariance(seed, factor):
 @properties
 @given(seed=seeds, exponents=st.lists(st.integers(-8, 8), min_size=3, max_size=3))
 def test_affine_equivariance(seed, exponents):
-    X, y, mix = sample(seed, 21, 3), heavy(seed + 10, 21), torch.eye(3).double() + 0.2 * sample(seed + 20, 3, 3)
+    X, y, mix = sample(seed, 21, 3), heavy_tailed(seed + 10, 21), torch.eye(3).double() + 0.2 * sample(seed + 20, 3, 3)
     scale = torch.tensor([10.0**e for e in exponents], dtype=X.dtype)
     plain = LeastAbsoluteDeviations().fit(X, y)
     mixed = LeastAbsoluteDeviations().fit(X @ mix * scale, y)
@@ -169,7 +169,7 @@ def test_exact_fit_has_objective_zero():
     assert bool(fit.converged_.all())
 
 
-def test_all_targets_zero():
+def test_targets_of_zero_give_coefficients_of_zero():
     fit = LeastAbsoluteDeviations().fit(sample(0, 10, 2), torch.zeros(10, dtype=torch.float64))
     assert fit.coef_.tolist() == [0.0, 0.0]
     assert float(fit.objective_) == 0.0
@@ -185,7 +185,7 @@ def test_majority_on_a_line_is_fitted_exactly():
 
 
 def test_vast_outliers_leave_the_coefficients_exact():
-    X, y = sample(0, 10, 60, 4), heavy(1, 10, 60)
+    X, y = sample(0, 10, 60, 4), heavy_tailed(1, 10, 60)
     near, far = y.clone(), y.clone()
     outlier = 3.0 * sample(2, 10, 6).sign()
     near[:, :6] += 1e3 * outlier
@@ -207,7 +207,7 @@ def test_as_many_values_as_coefficients_are_interpolated(dtype):
 
 
 def test_float32_is_exact_to_its_precision():
-    X, y = sample(0, 100, 3), heavy(1, 100)
+    X, y = sample(0, 100, 3), heavy_tailed(1, 100)
     fit = LeastAbsoluteDeviations().fit(X.float(), y.float())
     coef, optimum = linear_program(X.float().double(), y.float().double())
     assert fit.coef_.dtype == fit.objective_.dtype == fit.weights_.dtype == torch.float32
@@ -216,8 +216,8 @@ def test_float32_is_exact_to_its_precision():
     assert bool(fit.converged_)
 
 
-def test_weight_zero_is_removal():
-    X, y = sample(0, 30, 3), heavy(1, 30)
+def test_weight_zero_equals_removal():
+    X, y = sample(0, 30, 3), heavy_tailed(1, 30)
     weight = (torch.arange(30) % 3 > 0).double()
     y[::3] = 1e9
     X[::3] = 1e3
@@ -227,8 +227,8 @@ def test_weight_zero_is_removal():
     torch.testing.assert_close(fit.objective_, removed.objective_, rtol=1e-12, atol=0.0)
 
 
-def test_value_of_weight_zero_is_not_among_those_the_solution_goes_through():
-    X, y = sample(0, 30, 3), heavy(1, 30)
+def test_the_solution_does_not_interpolate_values_of_weight_zero():
+    X, y = sample(0, 30, 3), heavy_tailed(1, 30)
     weight = (torch.arange(30) > 4).double()
     removed = LeastAbsoluteDeviations().fit(X[5:], y[5:])
     y[:5] = removed.predict(X[:5]) + 1e-6
@@ -236,8 +236,8 @@ def test_value_of_weight_zero_is_not_among_those_the_solution_goes_through():
     torch.testing.assert_close(fit.coef_, removed.coef_, rtol=1e-12, atol=1e-12)
 
 
-def test_weight_two_is_repetition():
-    X, y = sample(0, 31, 3), heavy(1, 31)
+def test_weight_two_equals_repetition():
+    X, y = sample(0, 31, 3), heavy_tailed(1, 31)
     weight = 1.0 + (torch.arange(31) % 2).double()
     fit = LeastAbsoluteDeviations().fit(X, y, weight)
     repeated = LeastAbsoluteDeviations().fit(*(v.repeat_interleave(weight.long(), 0) for v in (X, y)))
@@ -247,24 +247,24 @@ def test_weight_two_is_repetition():
 
 
 def test_result_goes_exactly_through_n_values():
-    X, y = sample(0, 100, 4), heavy(1, 100)
+    X, y = sample(0, 100, 4), heavy_tailed(1, 100)
     residual = (y - LeastAbsoluteDeviations(tol=1e-6).fit(X, y).predict(X)).abs().sort().values
     assert float(residual[3]) < 1e-13
     assert float(residual[4]) > 1e-6
 
 
 def test_weights_are_ones_of_the_shape_of_the_targets():
-    fit = LeastAbsoluteDeviations().fit(sample(0, 10, 2), heavy(1, 10), torch.arange(10.0).double())
+    fit = LeastAbsoluteDeviations().fit(sample(0, 10, 2), heavy_tailed(1, 10), torch.arange(10.0).double())
     torch.testing.assert_close(fit.weights_, torch.ones(10, 1, dtype=torch.float64))
 
 
-def test_gradient_is_that_of_the_line_through_the_values():
-    X, y = sample(0, 12, 2), heavy(1, 12).requires_grad_()
+def test_the_gradient_by_the_targets_passes_gradcheck():
+    X, y = sample(0, 12, 2), heavy_tailed(1, 12).requires_grad_()
     assert torch.autograd.gradcheck(lambda y: LeastAbsoluteDeviations().fit(X, y).coef_, (y,), eps=1e-7, atol=1e-5)
 
 
 def test_stopping_early_is_reported():
-    X, y = sample(0, 100, 4), heavy(1, 100)
+    X, y = sample(0, 100, 4), heavy_tailed(1, 100)
     early = LeastAbsoluteDeviations(max_iter=1).fit(X, y)
     assert not bool(early.converged_)
     assert int(early.n_iter_) == 1
@@ -275,7 +275,7 @@ def test_stopping_early_is_reported():
 def test_dependent_columns_raise():
     X = sample(0, 10, 2)
     with pytest.raises(RankDeficientError, match=r"columns \[0, 1, 2\]"):
-        LeastAbsoluteDeviations().fit(torch.cat([X, X.sum(1, keepdim=True)], dim=1), heavy(1, 10))
+        LeastAbsoluteDeviations().fit(torch.cat([X, X.sum(1, keepdim=True)], dim=1), heavy_tailed(1, 10))
 
 
 @pytest.mark.parametrize(
@@ -296,7 +296,7 @@ def test_repr_shows_the_parameters():
     assert repr(LeastAbsoluteDeviations(max_iter=7)) == "LeastAbsoluteDeviations(tol=1e-09, max_iter=7)"
 
 
-def test_a_result_that_the_estimator_lacks_is_not_blamed_on_a_missing_fit():
+def test_the_error_for_an_unknown_result_lists_the_results_of_the_fit():
     X, Y = torch.randn(20, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
     fitted = LeastAbsoluteDeviations().fit(X, Y)
     with pytest.raises(AttributeError, match=r"its results are .*coef_") as error:

@@ -30,7 +30,7 @@ def problem(seed: int, N: int = 60, n: int = 3, outliers: float = 0.15) -> tuple
     return X, y
 
 
-def h_of(X: np.ndarray, y: np.ndarray):
+def entropy_function(X: np.ndarray, y: np.ndarray):
     def h(theta: np.ndarray) -> float:
         r = y - X @ theta
         q = r**2 / (r**2).sum()
@@ -66,7 +66,7 @@ def test_hawkins_bradu_kass_has_the_published_minima():
     assert bool(fit.minima_converged_.all())
 
 
-def test_many_starts_find_no_other_minimum_there():
+def test_many_starts_on_hawkins_bradu_kass_find_no_other_minimum():
     X, y = hbk()
     starts = sample(0, 200, 3) * torch.tensor([0.1, 1.0, 10.0, 1e4]).double().repeat_interleave(50).unsqueeze(1)
     fit = LeastEntropyLike(starts=starts).fit(X[:, 1:], y)
@@ -79,7 +79,7 @@ def test_many_starts_find_no_other_minimum_there():
 
 
 @pytest.mark.parametrize(("shared", "weighted", "m"), [(False, True, 2), (True, False, 1), (False, False, 3)])
-def test_gradient_and_hessian_are_those_of_automatic_differentiation(shared, weighted, m):
+def test_gradient_and_hessian_equal_automatic_differentiation(shared, weighted, m):
     X, Y = sample(1, 1 if shared else 4, 15, m, 3), sample(2, 4, 15, m)
     weight = sample(3, 4, 15, m).abs() + 0.2 if weighted else None
     p = linear_problem(X, Y, weight)
@@ -107,7 +107,7 @@ def test_gradient_and_hessian_are_those_of_automatic_differentiation(shared, wei
 def test_scipy_confirms_every_minimum(seed):
     X, y = problem(seed)
     fit = LeastEntropyLike().fit(X, y)
-    h = h_of(X.numpy(), y.numpy())
+    h = entropy_function(X.numpy(), y.numpy())
     assert bool(fit.minima_converged_.all())
     for theta, value in zip(fit.minima_.numpy(), fit.minima_entropy_.tolist(), strict=True):
         assert value == pytest.approx(h(theta), abs=1e-12)
@@ -131,7 +131,7 @@ def test_outliers_in_y_have_weight_zero(seed):
     assert float(fit.weights_[30:].mean()) == 1.0
 
 
-def test_a_descent_passes_through_infinity():
+def test_descents_from_very_far_starts_converge():
     X, y = hbk()
     fit = LeastEntropyLike(starts=torch.tensor([[1e9, 2e9, -1e9], [-1e9, -2e9, 1e9]]).double()).fit(X[:, 1:], y)
     assert bool(fit.minima_converged_.all())
@@ -141,7 +141,7 @@ def test_a_descent_passes_through_infinity():
 # starts
 
 
-def test_starts_given_are_used():
+def test_given_starts_are_used():
     X, y = problem(7)
     guess = torch.tensor([3.0, 0.0, 0.0]).double()
     fit = LeastEntropyLike(guess).fit(X, y)
@@ -182,7 +182,7 @@ def test_regression_scale_and_affine_equivariance(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_by_default_the_estimate_scales_with_the_target_and_keeps_under_permutation(seed):
+def test_the_default_starts_are_equivariant_to_target_scale_and_sample_order(seed):
     X, y = problem(seed)
     fit = LeastEntropyLike().fit(X, y)
     torch.testing.assert_close(LeastEntropyLike().fit(X, -7 * y).coef_, -7 * fit.coef_, rtol=1e-8, atol=1e-8)
@@ -193,7 +193,7 @@ def test_by_default_the_estimate_scales_with_the_target_and_keeps_under_permutat
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_weight_is_a_number_of_repetitions(seed):
+def test_integer_weights_equal_repetition(seed):
     X, y = problem(seed)
     counts = torch.randint(0, 4, (60,), generator=torch.Generator().manual_seed(seed))
     again, weighted = (
@@ -205,7 +205,7 @@ def test_a_weight_is_a_number_of_repetitions(seed):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_a_batch_is_a_loop(weighted, monkeypatch):
+def test_batch_equals_loop(weighted, monkeypatch):
     pairs = [problem(seed) for seed in range(5)]
     X, Y = torch.stack([p[0] for p in pairs]), torch.stack([p[1] for p in pairs])
     w = sample(9, 5, 60).abs() if weighted else None
@@ -222,7 +222,7 @@ def test_a_batch_is_a_loop(weighted, monkeypatch):
     torch.testing.assert_close(parts.minima_, fit.minima_, rtol=1e-8, atol=1e-9)
 
 
-def test_one_design_for_many_targets():
+def test_a_shared_design_equals_a_loop_over_targets():
     X, _ = problem(0)
     Y = torch.stack([X @ sample(i, 3) + sample(i + 9, 60) for i in range(4)])
     fit = LeastEntropyLike().fit(X, Y)
@@ -230,7 +230,7 @@ def test_one_design_for_many_targets():
         torch.testing.assert_close(fit.minima_[i], LeastEntropyLike().fit(X, Y[i]).minima_, rtol=1e-7, atol=1e-8)
 
 
-def test_channels_have_units_of_their_own():
+def test_the_fit_is_equivariant_to_the_unit_of_each_channel():
     X = sample(10, 80, 2, 3)
     Y = X @ torch.arange(1.0, 4.0).double() + 0.1 * sample(11, 80, 2)
     Y[:8, 0] += 30.0
@@ -244,7 +244,7 @@ def test_channels_have_units_of_their_own():
     torch.testing.assert_close(fit.predict(X), X @ fit.coef_, rtol=1e-12, atol=1e-12)
 
 
-def test_columns_of_very_different_size():
+def test_the_fit_is_equivariant_to_column_scales():
     X, y = problem(12)
     size = torch.tensor([1e-8, 1.0, 1e8]).double()
     fit = LeastEntropyLike(starts=torch.ones(1, 3).double()).fit(X, y)
@@ -252,7 +252,7 @@ def test_columns_of_very_different_size():
     torch.testing.assert_close(again.coef_ * size, fit.coef_, rtol=1e-6, atol=1e-8)
 
 
-def test_float32_gives_the_fit_of_float64():
+def test_float32_agrees_with_float64():
     X, y = problem(13)
     single = LeastEntropyLike().fit(X.float(), y.float())
     assert single.coef_.dtype == single.minima_.dtype == single.entropy_.dtype == torch.float32
@@ -262,7 +262,7 @@ def test_float32_gives_the_fit_of_float64():
 # no solution, or an exact solution
 
 
-def test_an_exact_fit_is_least_squares_with_entropy_zero():
+def test_an_exact_fit_equals_least_squares_with_entropy_zero():
     X = sample(14, 20, 3)
     beta = sample(15, 3)
     Y = torch.stack([X @ beta, X @ beta + sample(16, 20), torch.zeros(20).double()])
@@ -275,7 +275,7 @@ def test_an_exact_fit_is_least_squares_with_entropy_zero():
     assert float(fit.weights_[0].min()) == 1.0
 
 
-def test_a_fit_that_is_exact_where_weights_are_positive():
+def test_outliers_of_weight_zero_leave_an_exact_fit():
     X = sample(14, 20, 3)
     beta, counts = sample(15, 3), torch.ones(20)
     y = X @ beta
@@ -294,7 +294,7 @@ def test_a_channel_without_residuals_does_not_affect_the_others():
     assert 0.0 <= float(fit.entropy_) <= 1.0
 
 
-def test_all_but_one_on_a_line_gives_the_line():
+def test_a_single_outlier_leaves_an_exact_line():
     x = torch.arange(12.0, dtype=torch.float64)
     y = 3 - 2 * x
     y[4] = 1e3
@@ -304,7 +304,7 @@ def test_all_but_one_on_a_line_gives_the_line():
     assert fit.weights_[:, 0].tolist() == [1.0] * 4 + [0.0] + [1.0] * 7
 
 
-def test_input_without_an_answer_is_refused():
+def test_dependent_columns_few_samples_and_bad_options_are_refused():
     X, y = problem(17)
     with pytest.raises(RankDeficientError):
         LeastEntropyLike().fit(torch.cat([X, X[:, :1]], 1), y)

@@ -33,7 +33,7 @@ def linear_program(X: np.ndarray, y: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", DATA_SETS)
-def test_the_largest_residual_is_that_of_a_linear_program(name):
+def test_the_largest_residual_equals_that_of_a_linear_program(name):
     X, y = DATA_SETS[name]()
     fit = LeastMedianOfSquares(len(y)).fit(X, y)
     best = linear_program(np.linalg.qr(X.numpy())[0], y.numpy())
@@ -46,7 +46,7 @@ def test_the_largest_residual_is_that_of_a_linear_program(name):
 
 @pytest.mark.parametrize(("N", "n"), [(8, 2), (30, 5), (300, 6)])
 @pytest.mark.parametrize("whole", [False, True])
-def test_minimax_of_a_batch_with_and_without_ties(N, n, whole):
+def test_minimax_of_a_batch_equals_a_linear_program_with_and_without_ties(N, n, whole):
     X, y = 1.5 * sample(N, 8, N, n), 1.5 * sample(N + 1, 8, N)
     if whole:  # many rows and targets are equal, and most vertices degenerate
         X, y = X.round().clamp(-1, 1), y.round()
@@ -63,7 +63,7 @@ def test_minimax_ignores_rows_that_are_not_in_use():
     assert float(fit.height) == pytest.approx(linear_program(X[used].numpy(), y[used].numpy()), rel=1e-6)
 
 
-def test_one_more_row_than_coefficients_has_residuals_of_one_size():
+def test_a_minimax_fit_of_one_more_row_than_coefficients_has_equal_absolute_residuals():
     X, y = sample(0, 50, 4, 3), sample(1, 50, 4)
     residual = y - (X @ equal_heights(X, y).unsqueeze(-1)).squeeze(-1)
     size = residual.abs()
@@ -87,7 +87,7 @@ def test_the_published_optimum_is_found(name):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("N", "n", "h"), [(9, 2, 5), (10, 3, 7), (8, 1, 6)])
-def test_the_optimum_is_that_of_all_subsets(seed, N, n, h):
+def test_the_optimum_equals_the_search_over_all_subsets(seed, N, n, h):
     X, y = sample(seed, N, n), sample(seed + 100, N) * torch.exp(sample(seed + 200, N))
     subsets = map(list, itertools.combinations(range(N), h))
     best = min(linear_program(X[s].numpy(), y[s].numpy()) for s in subsets)
@@ -97,7 +97,7 @@ def test_the_optimum_is_that_of_all_subsets(seed, N, n, h):
 
 
 @pytest.mark.parametrize("name", ["salinity", "coleman"])
-def test_random_sets_find_what_no_other_seed_beats_by_much(name):
+def test_the_objective_varies_little_between_seeds(name):
     X, y = DATA_SETS[name]()
     fits = [LeastMedianOfSquares(seed=s).fit(X, y) for s in range(4)]
     assert not fits[0].exact_
@@ -106,7 +106,7 @@ def test_random_sets_find_what_no_other_seed_beats_by_much(name):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_forty_five_per_cent_clustered_outliers_do_not_move_it(seed):
+def test_forty_five_per_cent_clustered_outliers_do_not_move_the_fit(seed):
     X, truth = sample(seed, 3, 300, 6), sample(seed + 1, 3, 6)
     y = (X @ truth.unsqueeze(-1)).squeeze(-1) + 0.1 * sample(seed + 2, 3, 300)
     X[:, :135] = 8.0 + 0.3 * sample(seed + 3, 3, 135, 6)
@@ -116,7 +116,7 @@ def test_forty_five_per_cent_clustered_outliers_do_not_move_it(seed):
     assert float(fit.weights_[:, :135].sum()) == 0.0
 
 
-def test_scale_of_gaussian_residuals_is_their_standard_deviation():
+def test_the_scale_of_gaussian_residuals_is_their_standard_deviation():
     y = 3.0 * sample(0, 40, 100)
     for h in (51, 100):
         fit = LeastMedianOfSquares(h, starts=50).fit(torch.ones(100, 1).double(), y)
@@ -124,7 +124,7 @@ def test_scale_of_gaussian_residuals_is_their_standard_deviation():
         assert 0.8 * 3.0 < float(fit.scale_.mean()) < 1.1 * 3.0
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = sample(0, 20, 2), sample(1, 20)
     weight = torch.cat([torch.ones(20), torch.zeros(10)]).double()
     both = torch.cat([X, 5.0 + sample(2, 10, 2)]), torch.cat([y, torch.full((10,), 1e3).double()])
@@ -134,7 +134,7 @@ def test_weight_zero_is_removal():
     torch.testing.assert_close(largest.objective_, LeastMedianOfSquares(20).fit(X, y).objective_, rtol=1e-9, atol=0)
 
 
-def test_no_channel_can_improve_without_another():
+def test_no_nearby_coefficients_improve_every_channel():
     X = torch.stack([torch.cat([torch.ones(60, 1).double(), sample(k, 60, 1)], 1) for k in range(2)], -2)
     Y = X.sum(-1) + 0.1 * sample(2, 60, 2) * torch.tensor([1.0, 50.0])
     Y[:20, 0] += 9.0
@@ -148,7 +148,7 @@ def test_no_channel_can_improve_without_another():
         assert not bool((quantiles(fit.coef_ + step) < fit.objective_ * (1 - 1e-9)).all())
 
 
-def test_rows_in_a_hyperplane_do_no_harm():
+def test_rows_in_a_hyperplane_give_finite_coefficients():
     X = torch.cat([torch.ones(20, 1), (torch.arange(20) < 6).unsqueeze(-1)], 1).double()
     y = sample(0, 20)
     fit = LeastMedianOfSquares().fit(X, y)
@@ -162,7 +162,7 @@ def test_a_quantile_out_of_range_is_refused(h):
 
 
 @pytest.mark.parametrize("h", [2.5, True])
-def test_a_quantile_that_is_no_whole_number_is_refused(h):
+def test_a_non_integer_quantile_is_refused(h):
     with pytest.raises(TypeError, match="`h` to be a whole number"):
         LeastMedianOfSquares(h)
 

@@ -42,21 +42,21 @@ def test_channels_share_the_coefficients():
     torch.testing.assert_close(LeastSquares().fit(X, Y).coef_, lstsq(X.reshape(60, 5), Y.flatten()))
 
 
-def test_weights_of_single_values_count_by_channel():
+def test_weights_of_values_differ_between_channels():
     X, Y, weight = sample(0, 20, 3, 5), sample(1, 20, 3), sample(2, 20, 3).exp()
     root = weight.sqrt().flatten()
     expected = lstsq(X.reshape(60, 5) * root.unsqueeze(-1), Y.flatten() * root)
     torch.testing.assert_close(LeastSquares().fit(X, Y, weight).coef_, expected)
 
 
-def test_weights_of_samples_count_for_all_their_channels():
+def test_weights_of_samples_apply_to_all_channels():
     X, Y, weight = sample(0, 20, 3, 5), sample(1, 20, 3), sample(2, 20).exp()
     by_value = LeastSquares().fit(X, Y, weight.unsqueeze(-1).expand(20, 3))
     torch.testing.assert_close(LeastSquares().fit(X, Y, weight).coef_, by_value.coef_)
     assert not torch.allclose(LeastSquares().fit(X, Y).coef_, by_value.coef_)
 
 
-def test_one_design_serves_many_targets():
+def test_a_shared_design_equals_a_loop_over_targets():
     X, Y = sample(0, 30, 4), sample(1, 2, 5, 30)
     fit = LeastSquares().fit(X, Y)
     assert fit.coef_.shape == (2, 5, 4)
@@ -64,7 +64,7 @@ def test_one_design_serves_many_targets():
 
 
 @pytest.mark.parametrize("zeros", [False, True])
-def test_many_weights_serve_one_problem(zeros):
+def test_a_batch_of_weights_broadcasts_against_a_single_problem(zeros):
     X, y, weight = sample(0, 30, 2), sample(1, 30), sample(2, 3, 30).exp()
     if zeros:
         weight[0, :10] = 0.0
@@ -88,14 +88,14 @@ def test_columns_of_very_different_size_are_exact():
     torch.testing.assert_close(fit.coef_ * scale, lstsq(X, y), rtol=1e-9, atol=1e-9)
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = sample(0, 30, 3), sample(1, 30)
     weight = (torch.arange(30) % 3 > 0).double()
     y[::3] = 1e6
     torch.testing.assert_close(LeastSquares().fit(X, y, weight).coef_, lstsq(X[weight > 0], y[weight > 0]))
 
 
-def test_weight_two_is_repetition():
+def test_weight_two_equals_repetition():
     X, y = sample(0, 30, 3), sample(1, 30)
     weight = 1.0 + (torch.arange(30) % 2).double()
     repeated = lstsq(X.repeat_interleave(weight.long(), 0), y.repeat_interleave(weight.long()))
@@ -109,7 +109,7 @@ def test_float32_stays_float32():
     torch.testing.assert_close(fit.coef_.double(), lstsq(X, y), rtol=1e-5, atol=1e-5)
 
 
-def test_gradient_in_the_targets():
+def test_the_gradient_by_the_targets_passes_gradcheck():
     X, y = sample(0, 8, 2), sample(1, 8).requires_grad_()
     assert torch.autograd.gradcheck(lambda y: LeastSquares().fit(X, y).coef_, (y,))
 
@@ -132,7 +132,7 @@ def test_ridge_of_dependent_columns_shares_the_coefficient():
     torch.testing.assert_close(coef, torch.full((2,), expected, dtype=torch.float64))
 
 
-def test_ridge_of_fewer_values_than_coefficients():
+def test_ridge_fits_fewer_values_than_coefficients():
     X, y = sample(0, 3, 6), sample(1, 3)
     expected = X.mT @ torch.linalg.solve(X @ X.mT + 0.5 * torch.eye(3, dtype=X.dtype), y)
     torch.testing.assert_close(Ridge(alpha=0.5).fit(X, y).coef_, expected)
@@ -149,7 +149,7 @@ def test_ridge_without_penalty_refuses_dependent_columns():
         Ridge(alpha=0.0).fit(column.expand(20, 2), sample(1, 20))
 
 
-def test_ridge_of_channels_and_batches():
+def test_ridge_of_channels_and_batches_solves_the_normal_equations():
     X, Y = sample(0, 4, 20, 3, 5), sample(1, 4, 20, 3)
     fit = Ridge(alpha=1.5).fit(X, Y)
     assert fit.weights_.shape == Y.shape
@@ -178,7 +178,7 @@ def test_predict_has_the_shape_of_the_targets(x_shape, y_shape):
         torch.testing.assert_close(fit.predict(X), Y, rtol=1e-10, atol=1e-10)
 
 
-def test_predict_on_another_number_of_samples():
+def test_predict_accepts_another_number_of_samples():
     X, coef = sample(0, 2, 30, 3, 4), sample(1, 4)
     fit = LeastSquares().fit(X, torch.matmul(X, coef))
     new = sample(2, 2, 7, 3, 4)
@@ -199,7 +199,7 @@ def test_result_before_fit_raises_not_fitted(estimator, name):
     assert not hasattr(estimator, name)
 
 
-def test_unknown_attribute_is_not_called_unfitted():
+def test_an_unknown_attribute_does_not_raise_not_fitted():
     with pytest.raises(AttributeError, match="no attribute 'slope'") as raised:
         LeastSquares().slope
     assert not isinstance(raised.value, NotFittedError)

@@ -14,7 +14,7 @@ from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, least_trimmed_sq
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_trimmed_squares import TrimmedScale, gaussian_consistency, order_statistic
 from tests.draws import normal as sample
-from tests.linear.test_mm_regression import clustered
+from tests.linear.test_mm_regression import clustered_outliers
 from tests.literature import COLEMAN_LTS, DATA_SETS, REFERENCE
 
 
@@ -63,7 +63,7 @@ def test_rows_rejected_at_two_and_a_half_scales_include_the_published_rows(name)
 @pytest.mark.parametrize("choices", [0, 20_000], ids=["searched", "all choices"])
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("N", "n", "h"), [(9, 2, 6), (10, 3, 7), (8, 1, 5), (11, 2, 8), (12, 3, 12)])
-def test_the_optimum_is_that_of_all_subsets(seed, N, n, h, choices, monkeypatch):
+def test_the_optimum_equals_the_search_over_all_subsets(seed, N, n, h, choices, monkeypatch):
     monkeypatch.setattr(least_trimmed_squares, "EXHAUSTIVE_CHOICES", choices)
     X, y = sample(seed, N, n), sample(seed + 100, N) * torch.exp(sample(seed + 200, N))
     objective, coef = exhaustive(X, y, h)
@@ -73,7 +73,7 @@ def test_the_optimum_is_that_of_all_subsets(seed, N, n, h, choices, monkeypatch)
     torch.testing.assert_close(fit.coef_, coef, rtol=1e-6, atol=1e-8)
 
 
-def test_the_optimum_of_coleman_is_that_of_all_subsets():
+def test_the_optimum_of_coleman_equals_the_search_over_all_subsets():
     X, y = DATA_SETS["coleman"]()
     reference = COLEMAN_LTS
     fit = LeastTrimmedSquares().fit(X, y)
@@ -83,7 +83,7 @@ def test_the_optimum_of_coleman_is_that_of_all_subsets():
 
 
 @pytest.mark.parametrize("name", DATA_SETS)
-def test_every_seed_finds_one_optimum(name):
+def test_every_seed_finds_the_same_optimum(name):
     X, y = DATA_SETS[name]()
     found = [float(LeastTrimmedSquares(seed=s).fit(X, y).objective_) for s in range(1, 9)]
     assert max(found) == pytest.approx(min(found), rel=1e-9)
@@ -103,7 +103,7 @@ def test_no_exchange_of_two_samples_lowers_the_sum():
     assert float(sums.min()) >= float(fit.objective_) * (1 - 1e-9)
 
 
-def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
+def test_the_gradient_equals_that_of_least_squares_on_the_values_kept():
     X, y = contaminated_line(0)
     keep = LeastTrimmedSquares().fit(X, y).weights_[:, 0]
     for leaf in (X, y):
@@ -113,7 +113,7 @@ def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
         torch.testing.assert_close(got, expected)
 
 
-def test_the_least_coverage_is_one_sample_more_than_coefficients():
+def test_the_smallest_coverage_is_one_sample_more_than_coefficients():
     X, y = sample(1, 9, 2), sample(2, 9)
     assert int(LeastTrimmedSquares(h=3).fit(X, y).weights_.sum()) == 3
     assert int(LeastTrimmedSquares(h=9).fit(X, y).weights_.sum()) == 9
@@ -122,12 +122,12 @@ def test_the_least_coverage_is_one_sample_more_than_coefficients():
             LeastTrimmedSquares(h=h).fit(X, y)
 
 
-def test_coverage_of_all_samples_is_least_squares():
+def test_coverage_of_all_samples_equals_least_squares():
     X, y = contaminated_line(0)
     torch.testing.assert_close(LeastTrimmedSquares(h=40).fit(X, y).coef_, LeastSquares().fit(X, y).coef_)
 
 
-def test_objective_scale_and_weights_belong_to_the_coefficients():
+def test_objective_scale_and_weights_follow_from_the_coefficients():
     X, y = contaminated_line(3)
     fit = LeastTrimmedSquares(h=25).fit(X, y)
     square = (y - X @ fit.coef_).square()
@@ -160,7 +160,7 @@ def test_order_statistic_counts_ties():
     values=st.lists(st.tuples(st.integers(0, 4), st.integers(1, 3)), min_size=3, max_size=8),
     share=st.floats(0.05, 1.0),
 )
-def test_weighted_order_statistic_is_that_of_repeated_values(values, share):
+def test_weighted_order_statistic_equals_that_of_repeated_values(values, share):
     value = torch.tensor([float(v) for v, _ in values], dtype=torch.float64)
     count = torch.tensor([c for _, c in values])
     repeated = value.repeat_interleave(count).sort().values
@@ -172,7 +172,7 @@ def test_weighted_order_statistic_is_that_of_repeated_values(values, share):
 
 @settings(derandomize=True, deadline=None, max_examples=20)
 @given(values=st.lists(st.tuples(st.integers(-3, 3), st.integers(1, 3)), min_size=4, max_size=9), h=st.integers(2, 4))
-def test_trimmed_scale_with_ties_is_that_of_repeated_values(values, h):
+def test_trimmed_scale_with_ties_equals_that_of_repeated_values(values, h):
     residual = torch.tensor([float(v) for v, _ in values], dtype=torch.float64)
     count = torch.tensor([c for _, c in values])
     N = len(values)
@@ -186,7 +186,7 @@ def test_trimmed_scale_with_ties_is_that_of_repeated_values(values, h):
     assert float(got) ** 2 == pytest.approx(expected / total, abs=1e-12)
 
 
-def test_weight_is_repetition():
+def test_integer_weights_equal_repetition():
     X, y = contaminated_line(0)
     weight = 1.0 + (torch.arange(40) % 2).double()
     repeated = LeastTrimmedSquares(h=33).fit(X.repeat_interleave(weight.long(), 0), y.repeat_interleave(weight.long()))
@@ -195,7 +195,7 @@ def test_weight_is_repetition():
     torch.testing.assert_close(fit.coef_, repeated.coef_, rtol=1e-9, atol=1e-10)
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = contaminated_line(0, 30)
     junk_X, junk_y = 5.0 + sample(9, 20, 3), torch.full((20,), 1e3, dtype=torch.float64)
     weight = torch.cat([torch.ones(30), torch.zeros(20)]).double()
@@ -208,14 +208,14 @@ def test_weight_zero_is_removal():
 # equivariance
 
 
-def test_columns_of_very_different_size_do_no_harm():
+def test_the_fit_is_equivariant_to_column_scales():
     X, y = contaminated_line(0)
     factor = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
     coef = LeastTrimmedSquares().fit(X, y).coef_
     torch.testing.assert_close(LeastTrimmedSquares().fit(X * factor, y).coef_ * factor, coef, rtol=1e-8, atol=1e-9)
 
 
-def test_one_design_serves_many_targets():
+def test_a_shared_design_equals_a_loop_over_targets():
     X, y = contaminated_line(0)
     Y = torch.stack([y, y.flip(0), 3.0 * y])
     fit = LeastTrimmedSquares().fit(X, Y)
@@ -226,7 +226,7 @@ def test_one_design_serves_many_targets():
 # breakdown and exact fits
 
 
-def test_many_samples_are_screened_on_a_part_and_finished_on_all():
+def test_a_fit_of_many_samples_is_a_fixed_point_on_all_samples():
     X = torch.cat([torch.ones(4000, 1).double(), sample(0, 4000, 2)], 1)
     y = X.sum(-1) + 0.1 * sample(1, 4000)
     y[:1600] = 30.0 + 5.0 * sample(2, 1600)
@@ -262,7 +262,7 @@ def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-def test_the_unit_of_a_channel_does_not_matter(factor):
+def test_the_fit_is_equivariant_to_the_unit_of_a_channel(factor):
     reference, other = (
         LeastTrimmedSquares().fit(*two_channels(0, 1.0)),
         LeastTrimmedSquares().fit(*two_channels(0, factor)),
@@ -273,7 +273,7 @@ def test_the_unit_of_a_channel_does_not_matter(factor):
     torch.testing.assert_close(reference.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
 
 
-def test_each_channel_keeps_its_own_samples():
+def test_each_channel_is_trimmed_separately():
     fit = LeastTrimmedSquares().fit(*two_channels(0, 1.0))
     h = int(fit.weights_[:, 0].sum())
     assert h == (60 + 1 + 1) // 2
@@ -299,12 +299,12 @@ def test_a_coverage_out_of_range_is_refused(h):
         LeastTrimmedSquares(h=h).fit(*contaminated_line(0))
 
 
-def test_no_starts_are_refused():
+def test_zero_starts_are_refused():
     with pytest.raises(ValueError, match="`starts`"):
         LeastTrimmedSquares(starts=0)
 
 
-def test_one_seed_gives_one_result():
+def test_equal_seeds_give_equal_results():
     X, y = sample(0, 30, 4), sample(1, 30)
     state = torch.random.get_rng_state()
     reference, other = LeastTrimmedSquares(starts=3, seed=5).fit(X, y), LeastTrimmedSquares(starts=3, seed=5).fit(X, y)
@@ -313,7 +313,7 @@ def test_one_seed_gives_one_result():
 
 
 def test_the_seed_chooses_the_starts():
-    X, y, _ = clustered(0, 1)
+    X, y, _ = clustered_outliers(0, 1)
     # with weights no exchange improves the result of the starts
     found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X[0], y[0], torch.ones(300)).objective_) for s in range(8)}
     assert len(found) > 1
@@ -321,7 +321,7 @@ def test_the_seed_chooses_the_starts():
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_order_statistic_is_that_of_torch_in_any_layout_and_under_any_transform(channels, dtype):
+def test_an_order_statistic_equals_that_of_torch_in_any_layout_and_under_any_transform(channels, dtype):
     values = torch.randn(channels, 9, 4, generator=torch.Generator().manual_seed(5)).to(dtype).movedim(0, -1)
     expected = values.kthvalue(3, dim=-2).values
     assert torch.equal(order_statistic(values, None, 3), expected)

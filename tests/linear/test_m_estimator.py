@@ -63,7 +63,7 @@ def test_the_equations_hold_and_no_search_lowers_the_objective(name, psi):
     assert found.fun >= objective(at) * (1 - 1e-4)
 
 
-def test_huber_at_its_scale_is_the_convex_optimum():
+def test_huber_at_its_scale_reaches_the_convex_optimum():
     X, y = contaminated_line(0)
     fit = MEstimator().fit(X, y)
     s, k = float(fit.scale_), 1.345
@@ -95,7 +95,7 @@ def test_proposal_2_solves_its_two_equations(psi):
     np.testing.assert_allclose(root(equations, at + 0.01, tol=1e-12).x, at, atol=1e-7)
 
 
-def test_huber_with_a_wide_constant_is_least_squares():
+def test_huber_with_a_wide_constant_equals_least_squares():
     X, y = contaminated_line(2)
     torch.testing.assert_close(MEstimator(tuning=1e6).fit(X, y).coef_, LeastSquares().fit(X, y).coef_)
 
@@ -117,7 +117,7 @@ def test_a_redescending_psi_finds_the_solution_next_to_its_start():
     assert int(again.n_iter_) <= 2
 
 
-def test_channels_have_scales_of_their_own():
+def test_each_channel_has_its_own_scale():
     X, Y = sample(0, 60, 2, 3), torch.zeros(60, 2).double()
     noise = sample(1, 60, 2) * torch.tensor([0.1, 100.0]).double()
     Y = X @ torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64) + noise
@@ -128,7 +128,7 @@ def test_channels_have_scales_of_their_own():
     torch.testing.assert_close(fit.coef_, MEstimator().fit(X[:, 0], Y[:, 0]).coef_, rtol=0, atol=0.02)
 
 
-def test_too_few_iterations_are_not_called_converged():
+def test_too_few_iterations_are_reported_as_not_converged():
     assert not bool(MEstimator(max_iter=1).fit(*DATA_SETS["telef"]()).converged_)
 
 

@@ -40,7 +40,7 @@ def entropy(r: Tensor, h: Tensor, kind: str, location: str, w: Tensor | None = N
 
 @pytest.mark.parametrize("pairs", [1 << 18, 60])
 @pytest.mark.parametrize(("kind", "location"), KINDS)
-def test_derivatives_are_those_of_automatic_differentiation(kind, location, pairs, monkeypatch):
+def test_derivatives_equal_automatic_differentiation(kind, location, pairs, monkeypatch):
     monkeypatch.setattr(module, "_PAIRS", pairs)
     X, Y, w = sample(0, 3, 20, 2, 3), sample(1, 3, 20, 2), sample(2, 3, 20, 2).abs() + 0.1
     p, h, beta = linear_problem(X, Y, w), sample(3, 3, 2).abs() + 0.3, sample(4, 3, 3)
@@ -89,7 +89,7 @@ def test_scipy_finds_the_same_minimum(kind, location):
     np.testing.assert_allclose(found.x[first:], fit.coef_.numpy()[first:], rtol=0, atol=1e-5)
 
 
-def test_weights_count_by_their_share_and_samples_of_weight_zero_not_at_all():
+def test_the_scale_of_weights_is_irrelevant_and_weight_zero_equals_removal():
     X, Y = sample(1, 40, 2, 3), sample(2, 40, 2)
     X[..., 0] = 1.0
     kept = MinimumEntropy(bandwidth=0.5).fit(X[:30], Y[:30])
@@ -100,7 +100,7 @@ def test_weights_count_by_their_share_and_samples_of_weight_zero_not_at_all():
 
 
 @pytest.mark.parametrize(("kind", "location"), KINDS)
-def test_outliers_lose_their_influence(kind, location):
+def test_outliers_have_small_weights_and_influence(kind, location):
     X, y = line(7)
     truth = torch.tensor([1.0, 2.0, -1.0]).double()
     fit = MinimumEntropy(kind, location=location).fit(X, y)
@@ -113,7 +113,7 @@ def test_outliers_lose_their_influence(kind, location):
     assert float(fit.weights_.max()) == 1.0
 
 
-def test_residuals_have_median_zero_whatever_columns_hold_the_constant():
+def test_residuals_have_median_zero_for_any_columns_that_span_the_constant():
     X, y = line(8)
     fit = MinimumEntropy().fit(X, y)
     assert float((y - X @ fit.coef_).quantile(0.5).abs()) < 1e-12
@@ -137,7 +137,7 @@ def test_without_a_constant_column_the_location_is_free_and_symmetry_fixes_it():
     assert float(fit.coef_) == pytest.approx(3.0, abs=0.05)
 
 
-def test_gaussian_noise_costs_little_compared_to_least_squares():
+def test_efficiency_on_gaussian_data_is_at_least_one_half():
     X = torch.cat([torch.ones(100, 1).double(), sample(14, 100, 1)], 1)
     Y = sample(15, 30, 100)
     fit, ls = MinimumEntropy(location="symmetric").fit(X, Y), LeastSquares().fit(X, Y)
@@ -160,7 +160,7 @@ def test_regression_scale_and_affine_equivariance(kind, location):
     torch.testing.assert_close(A @ turned.coef_, fit.coef_, rtol=1e-5, atol=1e-5)
 
 
-def test_a_weight_is_a_number_of_repetitions():
+def test_integer_weights_equal_repetition():
     X, y = line(17)
     counts = torch.randint(0, 4, (80,), generator=torch.Generator().manual_seed(0))
     start, h = torch.tensor([1.0, 2.0, -1.0]).double(), 0.1
@@ -170,7 +170,7 @@ def test_a_weight_is_a_number_of_repetitions():
     torch.testing.assert_close(fit.entropy_, again.entropy_, rtol=1e-9, atol=1e-9)
 
 
-def test_a_batch_is_a_loop_and_samples_have_no_order():
+def test_batch_equals_loop_and_the_order_of_samples_is_irrelevant():
     pairs = [line(s) for s in range(3)]
     X, Y = torch.stack([p[0] for p in pairs]).unsqueeze(-2), torch.stack([p[1] for p in pairs]).unsqueeze(-1)
     start = torch.tensor([1.0, 2.0, -1.0]).double()
@@ -192,7 +192,7 @@ def test_channels_share_their_coefficients():
     assert fit.bandwidth_.shape == (2,)
 
 
-def test_float32_gives_the_fit_of_float64():
+def test_float32_agrees_with_float64():
     X, y = line(20)
     single = MinimumEntropy().fit(X.float(), y.float())
     assert single.coef_.dtype == single.entropy_.dtype == torch.float32
@@ -210,7 +210,7 @@ def test_an_exact_fit_keeps_the_robust_start():
     assert bool(torch.isfinite(fit.weights_).all())
 
 
-def test_input_without_an_answer_is_refused():
+def test_dependent_columns_few_samples_and_bad_options_are_refused():
     X, y = line(22)
     with pytest.raises(RankDeficientError):
         MinimumEntropy().fit(torch.cat([X, X[:, :1]], 1), y)

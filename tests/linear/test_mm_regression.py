@@ -12,7 +12,7 @@ from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
 
 
-def clustered(seed: int, draws: int, spread: float = 0.3) -> tuple[Tensor, Tensor, Tensor]:
+def clustered_outliers(seed: int, draws: int, spread: float = 0.3) -> tuple[Tensor, Tensor, Tensor]:
     """300 samples of 6 regressors, 45 % of them in a cluster 8 deviations away in every regressor, y near 40."""
     X, truth = sample(seed, draws, 300, 6), sample(seed + 1, draws, 6)
     y = (X @ truth.unsqueeze(-1)).squeeze(-1) + 0.1 * sample(seed + 2, draws, 300)
@@ -59,7 +59,7 @@ def test_no_search_lowers_the_objective_at_the_scale_of_the_s_estimate(name):
 
 @pytest.mark.parametrize("spread", [0.3, 1.0])
 def test_forty_five_per_cent_clustered_outliers_move_no_estimator_of_breakdown_one_half(spread):
-    X, y, truth = clustered(7, 6, spread)
+    X, y, truth = clustered_outliers(7, 6, spread)
     for estimator in (LeastTrimmedSquares(), SRegression(), MMRegression()):
         fit = estimator.fit(X, y)
         assert float((fit.coef_ - truth).abs().max()) < 0.15
@@ -73,8 +73,8 @@ def test_efficiency_at_gaussian_errors():
     assert relative_efficiency(SRegression(starts=20), 50, seed=0) < 0.6
 
 
-def test_a_lower_breakdown_point_lets_the_scale_follow_more_outliers():
-    X, y, truth = clustered(0, 1)
+def test_a_breakdown_point_of_a_fifth_fails_at_45_per_cent_outliers_and_holds_at_fewer():
+    X, y, truth = clustered_outliers(0, 1)
     fit = MMRegression(breakdown=0.2).fit(X, y)
     assert float((fit.coef_ - truth).abs().max()) > 0.3
     X, y = X[:, 100:], y[:, 100:]  # 35 of 200 remain

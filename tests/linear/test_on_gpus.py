@@ -1,4 +1,4 @@
-"""What a GPU needs of a fit: no batched factorisation of cuSOLVER, in the path that is forced here on the CPU."""
+"""The GPU path of fits, forced on the CPU: no batched factorisation, few host reads, the results of the CPU path."""
 
 import contextlib
 import copy
@@ -61,14 +61,14 @@ class Factorisations(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
-def test_no_batched_factorisation(estimator: LinearEstimator):
+def test_fits_use_no_batched_factorisation(estimator: LinearEstimator):
     X, y = sample(4)
     with forced(), Factorisations() as recorded:
         estimator.fit(X, y)
     assert recorded.found == set()
 
 
-def test_the_mode_sees_a_batched_factorisation():
+def test_the_recorder_detects_a_batched_factorisation():
     with Factorisations() as recorded:
         LeastSquares().fit(*sample(4))
         LeastTrimmedSquares().fit(*sample(4))
@@ -77,7 +77,7 @@ def test_the_mode_sees_a_batched_factorisation():
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
-def test_both_paths_agree(estimator: LinearEstimator, weighted):
+def test_the_gpu_path_agrees_with_the_cpu_path(estimator: LinearEstimator, weighted):
     X, y = sample(6, 40, 3)
     weight = 0.5 + torch.rand(6, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
     weight[0, :3] = 0.0
@@ -122,8 +122,8 @@ def test_many_float32_rows_keep_their_rank():
 READS = ("local_scalar_dense", "nonzero", "is_nonzero", "unique", "unique2", "masked_select", "equal")
 
 
-class Reads(TorchDispatchMode):
-    """Counts the operations in which the host waits for values of the device."""
+class HostReads(TorchDispatchMode):
+    """Counts operations that make the host wait for values of the device."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -136,15 +136,15 @@ class Reads(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def reads_of(estimator: LinearEstimator, X: Tensor, y: Tensor) -> int:
-    with forced(), Reads() as reads:
+def host_reads_of(estimator: LinearEstimator, X: Tensor, y: Tensor) -> int:
+    with forced(), HostReads() as reads:
         estimator.fit(X, y)
     return reads.count
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
-def test_the_host_reads_every_fourth_step_and_no_more_for_more_problems(estimator: LinearEstimator):
-    few, many = reads_of(estimator, *sample(2)), reads_of(estimator, *sample(60))
+def test_host_reads_are_few_and_do_not_grow_with_the_number_of_problems(estimator: LinearEstimator):
+    few, many = host_reads_of(estimator, *sample(2)), host_reads_of(estimator, *sample(60))
     steps = int(torch.as_tensor(getattr(estimator, "n_iter_", 0)).max())
     # each pseudo-inverse reads whether Cholesky's factor is enough, in place of hundreds of operations;
     # least median of squares counts its refits, each with exchanges of its own
@@ -163,9 +163,9 @@ def points_on_ellipsoids(problems: int, N: int = 150) -> Tensor:
 
 def test_ellipsoids_need_no_batched_factorisation_and_no_read_for_each():
     expected = EllipsoidFit().fit(points_on_ellipsoids(4))
-    with forced(), Factorisations() as recorded, Reads() as reads:
+    with forced(), Factorisations() as recorded, HostReads() as reads:
         fit = EllipsoidFit().fit(points_on_ellipsoids(4))
-    with forced(), Reads() as more:
+    with forced(), HostReads() as more:
         EllipsoidFit().fit(points_on_ellipsoids(40))
     assert recorded.found == set()
     assert more.count <= reads.count + 10
@@ -190,7 +190,7 @@ def test_an_ellipsoid_of_too_few_directions_is_refused_by_its_number():
 
 
 @pytest.mark.parametrize("estimator", [LeastSquares(), MKCRegression()], ids=repr)
-def test_derivatives_of_an_ellipsoid_are_those_of_the_cpu(estimator):
+def test_derivatives_of_an_ellipsoid_equal_those_of_the_cpu_path(estimator):
     def matrix(points: Tensor) -> Tensor:
         return EllipsoidFit(estimator).fit(points).calibration_matrix_.flatten()
 

@@ -1,4 +1,4 @@
-"""Parts of a fit of many rows: a step within limits, the Gaussian of the sums, the triangle of the rows in use."""
+"""Parts of a fit of many rows: a step within limits, the Gaussian fit from sums, the triangular factor of the rows."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ def double(*values: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
-def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
+def test_a_step_is_newtons_in_the_unknowns_within_their_limits(gradient):
     """κ = 0.5 may fall to 0, log d = 0 may fall to -1 and rise to 2."""
     point = Unknowns(double(3.0), double(0.5), double(0.0))
     fit_state = FitState(
@@ -53,7 +53,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_the_more_likely_gaussian_is_weighted_least_squares_of_all_channels(channels):
+def test_the_more_likely_gaussian_equals_weighted_least_squares_of_all_channels(channels):
     generator = torch.Generator().manual_seed(0)
     X = torch.randn(300, channels, 3, generator=generator, dtype=torch.float64)
     scales = torch.tensor([0.5, 3.0]).double()[:channels]
@@ -90,7 +90,7 @@ def test_the_more_likely_gaussian_is_weighted_least_squares_of_all_channels(chan
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_the_triangle_is_that_of_the_rows_of_a_weight(channels):
+def test_the_triangular_factor_is_that_of_the_rows_with_weight(channels):
     rows = torch.randn(40, channels, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weight = 0.5 * torch.ones(40, channels, dtype=torch.float64)
     weight[::3, -1] = 0.0

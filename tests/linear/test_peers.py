@@ -57,7 +57,7 @@ def test_there_are_a_hundred_tables_nearly_all_with_standard_errors():
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_robustbase(name):
+def test_results_equal_robustbase(name):
     table = TABLES[name]
     X, y = table["X"], table["y"]
     fit, start = MMRegression(seed=2).fit(X, y), SRegression(seed=2).fit(X, y)
@@ -82,7 +82,7 @@ def test_robustbase(name):
 
 
 @pytest.mark.parametrize("name", list(TABLES)[::2])
-def test_statsmodels(name):
+def test_results_equal_statsmodels(name):
     statsmodels = pytest.importorskip("statsmodels.robust.resistant_linear_model")
     regression = pytest.importorskip("statsmodels.robust.robust_linear_model")
     X, y = TABLES[name]["X"], TABLES[name]["y"]

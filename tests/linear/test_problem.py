@@ -27,7 +27,7 @@ def gram_of_basis(problem: LinearProblem) -> Tensor:
         ((1, 30, 2), (5, 30), True, (5, 30, 1)),
     ],
 )
-def test_both_forms_are_read(x_shape, y_shape, single, canonical):
+def test_data_with_and_without_a_channel_dimension_are_accepted(x_shape, y_shape, single, canonical):
     values = canonical_shapes(sample(0, *x_shape), sample(1, *y_shape))
     assert values.single_channel is single
     assert values.Y.shape == canonical
@@ -50,7 +50,7 @@ def test_ambiguous_shapes_are_read_by_the_documented_rule(A, B, n, single):
     assert canonical_shapes(sample(0, A, B, n), sample(1, A, B)).single_channel is single
 
 
-def test_channel_dimension_settles_an_ambiguous_shape():
+def test_a_channel_dimension_resolves_an_ambiguous_shape():
     values = canonical_shapes(sample(0, 100, 3, 2).unsqueeze(-2), sample(1, 100, 3).unsqueeze(-1))
     assert values.batch == (100,)
     assert values.Y.shape == (100, 3, 1)
@@ -87,14 +87,14 @@ def test_coefficients_and_in_basis_are_inverse():
     torch.testing.assert_close(problem.coefficients(problem.in_basis(coef)), coef)
 
 
-def test_shared_design_is_kept_once():
+def test_a_shared_design_is_stored_once():
     problem = linear_problem(sample(0, 40, 2), sample(1, 5, 40))
     assert problem.basis.shape == (1, 40, 1, 2)
     assert problem.Y.shape == (5, 40, 1)
     assert problem.residual(sample(2, 5, 2)).shape == (5, 40, 1)
 
 
-def test_stack_of_candidates_equals_one_at_a_time():
+def test_a_stack_of_candidates_equals_a_loop():
     problem = linear_problem(sample(0, 3, 20, 2, 4), sample(1, 3, 20, 2), sample(2, 3, 20).exp())
     weights, betas = sample(3, 3, 6, 20, 2).exp(), sample(4, 3, 6, 4)
     fits, residuals = problem.weighted_fit(weights), problem.residual(betas)
@@ -165,28 +165,28 @@ def test_solve_gram_equals_solve_and_falls_back_to_the_least_norm():
     assert abs(float(solution[1, 3])) < 1e-12
 
 
-def test_dependent_columns_are_named():
+def test_dependent_columns_raise_naming_them():
     X = sample(0, 20, 4)
     X[:, 3] = 2 * X[:, 1]
     with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] are linearly dependent .* remove a column"):
         linear_problem(X, sample(1, 20))
 
 
-def test_dependent_columns_are_named_whatever_their_size():
+def test_dependent_columns_of_any_size_raise_naming_them():
     X = sample(0, 20, 4)
     X[:, 3] = 1e10 * X[:, 1]
     with pytest.raises(RankDeficientError, match=r"columns \[1, 3\]"):
         linear_problem(X, sample(1, 20))
 
 
-def test_dependent_columns_of_one_problem_of_a_batch_are_named():
+def test_dependent_columns_of_a_problem_in_a_batch_raise_naming_it():
     X = sample(0, 3, 20, 1, 3)
     X[1, ..., 2] = X[1, ..., 0] + X[1, ..., 1]
     with pytest.raises(RankDeficientError, match=r"columns \[0, 1, 2\]"):
         linear_problem(X, sample(1, 3, 20, 1))
 
 
-def test_columns_dependent_on_the_samples_in_use_are_named():
+def test_columns_dependent_on_the_samples_in_use_raise_naming_them():
     X, weight = torch.ones(20, 2).double(), torch.ones(20).double()
     X[:5, 1] = 3.0
     linear_problem(X, sample(1, 20), weight)
@@ -195,14 +195,14 @@ def test_columns_dependent_on_the_samples_in_use_are_named():
         linear_problem(X, sample(1, 20), weight)
 
 
-def test_zero_column_is_named():
+def test_a_zero_column_raises_naming_it():
     X = sample(0, 20, 3)
     X[:, 1] = 0.0
     with pytest.raises(RankDeficientError, match=r"Column 1 of `X` .*zero.*; remove"):
         linear_problem(X, sample(1, 20))
 
 
-def test_column_that_is_zero_on_the_samples_in_use_is_named():
+def test_a_column_that_is_zero_on_the_samples_in_use_raises_naming_it():
     X = sample(0, 20, 3)
     X[5:, 2] = 0.0
     weight = (torch.arange(20) >= 5).double()
@@ -221,12 +221,12 @@ def test_fewer_values_than_coefficients_raise():
         linear_problem(sample(0, 3, 4), sample(1, 3))
 
 
-def test_channels_count_as_values():
+def test_values_of_all_channels_determine_the_coefficients():
     assert linear_problem(sample(0, 2, 2, 4), sample(1, 2, 2)).num_coefficients == 4
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
-def test_values_that_are_not_finite_are_named_with_their_index(value):
+def test_values_that_are_not_finite_raise_naming_their_index(value):
     X, Y, weight = sample(0, 20, 3), sample(1, 20), torch.ones(20).double()
     bad_X, bad_Y, bad_weight = X.clone(), Y.clone(), weight.clone()
     bad_X[4, 0, ...] = bad_Y[7] = bad_weight[9] = value
@@ -247,7 +247,7 @@ def test_integer_dtype_raises(name):
         linear_problem(**values)
 
 
-def test_other_types_raise():
+def test_data_of_another_type_raise():
     with pytest.raises(TypeError, match=r"`Y` .*tensor.* got list"):
         linear_problem(sample(0, 2, 1), [1.0, 2.0])
 
@@ -272,7 +272,7 @@ def test_half_precision_raises(dtype):
         ((20, 2, 3), (20, 4), r"\(20, 2, 3\) and \(20, 4\)"),
     ],
 )
-def test_shapes_that_do_not_fit_are_shown(x_shape, y_shape, shown):
+def test_mismatched_shapes_raise_naming_both_shapes(x_shape, y_shape, shown):
     with pytest.raises(ValueError, match=rf"`X` of shape \(\*, N, m, n\) .* but got {shown}"):
         linear_problem(sample(0, *x_shape), sample(1, *y_shape))
 

@@ -1,4 +1,4 @@
-"""Properties of all linear estimators, one test a property: equivariance, weights, order, batches, exact fits.
+"""Properties of all linear estimators, a test for each property: equivariance, weights, order, batches, exact fits.
 
 A new estimator is one line of ``CASES``; a property that it lacks is named there with the reason.
 """
@@ -100,7 +100,7 @@ CASES = [
 ]
 
 
-def cases(prop: str, *, robust: bool = False) -> list[object]:
+def cases_with_property(prop: str, *, robust: bool = False) -> list[object]:
     return [pytest.param(c, id=c.name) for c in CASES if prop not in c.without and (c.robust or not robust)]
 
 
@@ -130,7 +130,7 @@ def scale_of(fit: LinearEstimator) -> Tensor | None:
     return fit.scale_ if hasattr(fit, "scale_") else None
 
 
-@pytest.mark.parametrize("case", cases("regression"))
+@pytest.mark.parametrize("case", cases_with_property("regression"))
 def test_regression_equivariance(case, dtype, device):
     X, y = data(dtype=dtype, device=device)
     shift = sample(5, n).to(device, dtype)
@@ -138,7 +138,7 @@ def test_regression_equivariance(case, dtype, device):
 
 
 @pytest.mark.parametrize("factor", [-2.5, 1e3])
-@pytest.mark.parametrize("case", cases("scale"))
+@pytest.mark.parametrize("case", cases_with_property("scale"))
 def test_scale_equivariance(case, factor, dtype, device):
     X, y = data(dtype=dtype, device=device)
     fit, scaled = fitted(case, X, y), fitted(case, X, factor * y)
@@ -148,15 +148,15 @@ def test_scale_equivariance(case, factor, dtype, device):
         close(scaled.scale_, abs(factor) * fit.scale_)
 
 
-@pytest.mark.parametrize("case", cases("affine"))
+@pytest.mark.parametrize("case", cases_with_property("affine"))
 def test_affine_equivariance(case, dtype, device):
     X, y = data(dtype=dtype, device=device)
     A = (sample(6, n, n) * torch.tensor([1e-2, 1.0, 1e2])).to(device, dtype)
     close(A @ fitted(case, X @ A, y).coef_, fitted(case, X, y).coef_)
 
 
-@pytest.mark.parametrize("case", cases("repetition"))
-def test_weight_is_repetition(case, dtype, device):
+@pytest.mark.parametrize("case", cases_with_property("repetition"))
+def test_integer_weights_equal_repetition(case, dtype, device):
     X, y = data(30, dtype, device)  # d above its least, which depends on the coverage of the start
     count = 1 + torch.arange(N, device=device) % 2
     weighted = fitted(case, X, y, count.to(device, dtype))
@@ -166,8 +166,8 @@ def test_weight_is_repetition(case, dtype, device):
         close(weighted.scale_, repeated.scale_)
 
 
-@pytest.mark.parametrize("case", cases("order"))
-def test_the_order_of_the_samples_does_not_matter(case, dtype, device):
+@pytest.mark.parametrize("case", cases_with_property("order"))
+def test_the_fit_does_not_depend_on_the_order_of_samples(case, dtype, device):
     X, y = data(dtype=dtype, device=device)
     order = torch.randperm(N, generator=torch.Generator().manual_seed(5)).to(device)
     fit, moved = fitted(case, X, y), fitted(case, X[order], y[order])
@@ -175,7 +175,7 @@ def test_the_order_of_the_samples_does_not_matter(case, dtype, device):
     close(moved.weights_, fit.weights_[order])
 
 
-@pytest.mark.parametrize("case", cases("batch"))
+@pytest.mark.parametrize("case", cases_with_property("batch"))
 def test_batch_equals_loop(case, dtype, device):
     problems = [data(10 * s, dtype, device) for s in range(4)]
     X = torch.stack([p[0] for p in problems]).reshape(2, 2, N, 1, n)
@@ -187,7 +187,7 @@ def test_batch_equals_loop(case, dtype, device):
         close(together.coef_[i // 2, i % 2], fitted(case, X_i, y_i).coef_)
 
 
-@pytest.mark.parametrize("case", cases("exact"))
+@pytest.mark.parametrize("case", cases_with_property("exact"))
 def test_an_exact_fit_is_found(case, dtype, device):
     X, _ = data(dtype=dtype, device=device)
     coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype, device=device)
@@ -198,8 +198,8 @@ def test_an_exact_fit_is_found(case, dtype, device):
         assert float(fit.scale_) < 1e5 * torch.finfo(dtype).eps
 
 
-@pytest.mark.parametrize("case", cases("exact", robust=True))
-def test_the_exact_fit_of_seventy_per_cent_is_found(case, dtype, device):
+@pytest.mark.parametrize("case", cases_with_property("exact", robust=True))
+def test_an_exact_fit_of_seventy_per_cent_is_found(case, dtype, device):
     X, _ = data(dtype=dtype, device=device)
     coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype, device=device)
     y = X @ coef
@@ -209,14 +209,14 @@ def test_the_exact_fit_of_seventy_per_cent_is_found(case, dtype, device):
     assert bool(torch.isfinite(fit.weights_).all())
 
 
-@pytest.mark.parametrize("case", cases("zero"))
+@pytest.mark.parametrize("case", cases_with_property("zero"))
 def test_targets_of_zero_give_coefficients_of_zero(case, dtype, device):
     fit = fitted(case, data(dtype=dtype, device=device)[0], torch.zeros(N, dtype=dtype, device=device))
     assert fit.coef_.tolist() == [0.0] * n
     assert bool(torch.isfinite(fit.weights_).all())
 
 
-@pytest.mark.parametrize("case", cases("channels"))
+@pytest.mark.parametrize("case", cases_with_property("channels"))
 def test_channels_share_the_coefficients(case, device):
     X = torch.stack([data(0, device=device)[0], 2.0 * data(20, device=device)[0]], -2)
     Y = X.sum(-1) + 0.1 * sample(30, N, 2).to(device)
@@ -228,7 +228,7 @@ def test_channels_share_the_coefficients(case, device):
     assert float((fit.coef_ - 1.0).abs().max()) < limit
 
 
-@pytest.mark.parametrize("case", cases("dtype"))
+@pytest.mark.parametrize("case", cases_with_property("dtype"))
 def test_float32_stays_float32_and_agrees_with_float64(case, device):
     X, y = data(device=device)
     fit = fitted(case, X.float(), y.float())
@@ -236,8 +236,8 @@ def test_float32_stays_float32_and_agrees_with_float64(case, device):
     torch.testing.assert_close(fit.coef_.double(), fitted(case, X, y).coef_, rtol=5e-3, atol=5e-3)
 
 
-@pytest.mark.parametrize("case", cases("rank"))
-def test_what_cannot_be_fitted_is_refused(case, device):
+@pytest.mark.parametrize("case", cases_with_property("rank"))
+def test_nan_dependent_columns_and_too_few_samples_are_refused(case, device):
     X, y = data(device=device)
     estimator = case.make(N)
     bad = y.clone()

@@ -49,7 +49,7 @@ KINKS = {"huber": 1, "hampel": 3, "tukey": 1, "andrews": 1, "welsch": 0}
 
 
 @pytest.mark.parametrize("name", PSI)
-def test_weights_times_residuals_are_the_printed_formulas(name):
+def test_weights_times_residuals_equal_the_published_formulas(name):
     tuning = TUNING_95[name]
     z = torch.cat([torch.linspace(-12, 12, 241), torch.tensor([*tuning, 1e-9, 1e9])]).double()
     weight = Psi(name, tuning).weight(z)
@@ -77,7 +77,7 @@ def test_default_tuning_has_ninety_five_per_cent_efficiency(name):
     assert gaussian_efficiency(name, tuning) == pytest.approx(0.95, abs=5e-5)
 
 
-def test_bisquare_constants_are_the_published_ones():
+def test_bisquare_constants_equal_the_published_constants():
     # robustbase for the first two; Rousseeuw & Yohai (1984), table of breakdown points, constants and efficiencies
     assert bisquare_for_breakdown(0.5) == pytest.approx(1.547645, abs=1e-6)
     assert bisquare_for_efficiency(0.95) == pytest.approx(4.685061, abs=1e-5)
@@ -122,7 +122,7 @@ def test_an_unknown_psi_is_refused():
 
 
 @pytest.mark.parametrize("name", PSI)
-def test_the_slope_is_the_derivative_of_the_value(name):
+def test_the_slope_equals_the_derivative_of_the_value(name):
     psi = Psi(name, TUNING_95[name])
     z = torch.linspace(-9.97, 9.97, 400, dtype=torch.float64)  # no kink within a difference
     differences = (psi.value(z + 1e-6) - psi.value(z - 1e-6)) / 2e-6

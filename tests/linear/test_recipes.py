@@ -11,7 +11,7 @@ from torch import distributed as dist
 from mkc_torch.linear.streaming import StreamedMKCRegression, from_memmap
 from tests.docs.pages import ROOT, blocks
 from tests.linear.test_streaming import problem
-from tests.linear.test_streaming_ranks import run
+from tests.linear.test_streaming_ranks import run_ranks
 
 PAGE = ROOT / "docs" / "large_data.md"
 
@@ -33,7 +33,7 @@ def test_recipes_for_other_packages_compile():
             compile(block.text, str(PAGE), "exec")
 
 
-def _fits(rank: int, folder: str) -> None:
+def _fit_part_on_rank(rank: int, folder: str) -> None:
     sys.path.insert(0, folder)
     from fit_part import fit_part
 
@@ -42,10 +42,10 @@ def _fits(rank: int, folder: str) -> None:
 
 
 @pytest.mark.process
-def test_the_fit_function_of_the_recipes_is_that_of_all_rows(tmp_path: Path):
+def test_the_recipe_on_two_ranks_equals_a_fit_of_all_rows(tmp_path: Path):
     (tmp_path / "fit_part.py").write_text(fit_part_text(), encoding="utf-8")
     np.save(tmp_path / "table.npy", table())
-    assert run(_fits, tmp_path) == [0, 0]
+    assert run_ranks(_fit_part_on_rank, tmp_path) == [0, 0]
     mine, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     assert mine == other
     alone = StreamedMKCRegression().fit(from_memmap(table()[:, :3], table()[:, 3]))
@@ -53,7 +53,7 @@ def test_the_fit_function_of_the_recipes_is_that_of_all_rows(tmp_path: Path):
     assert mine["coef"] == pytest.approx(alone.coef_.tolist(), abs=1e-8)
 
 
-def test_a_function_is_called_in_every_pass():
+def test_a_function_that_yields_batches_is_called_in_every_pass():
     rows, calls = table(), []
 
     def batches():

@@ -8,11 +8,11 @@ from mkc_torch.linear import LeastAbsoluteDeviations, LeastSquares, LeastTrimmed
 from tests.draws import normal as sample
 from tests.literature import DATA_SETS, REFERENCE
 
-WITH_ROWS = [n for n in REFERENCE if REFERENCE[n].lts is not None]
+WITH_REJECTED_ROWS = [n for n in REFERENCE if REFERENCE[n].lts is not None]
 
 
-@pytest.mark.parametrize("name", WITH_ROWS)
-def test_the_rows_that_r_rejects_are_rejected(name):
+@pytest.mark.parametrize("name", WITH_REJECTED_ROWS)
+def test_rejected_rows_equal_those_of_r(name):
     X, y = DATA_SETS[name]()
     fit = ReweightedLeastSquares().fit(X, y)
     rejected = (fit.weights_[:, 0] == 0).nonzero().flatten() + 1
@@ -30,7 +30,7 @@ def test_stackloss_has_the_coefficients_of_daniel_and_wood(start):
 
 @pytest.mark.parametrize("name", DATA_SETS)
 @pytest.mark.parametrize("threshold", [2.0, 2.5])
-def test_the_four_equations_hold(name, threshold):
+def test_scales_weights_and_coefficients_satisfy_the_four_equations(name, threshold):
     X, y = (v.numpy() for v in DATA_SETS[name]())
     N, p = X.shape
     fit = ReweightedLeastSquares(threshold=threshold).fit(torch.from_numpy(X), torch.from_numpy(y))
@@ -47,7 +47,7 @@ def test_the_four_equations_hold(name, threshold):
     assert float(fit.scale_) == pytest.approx(np.sqrt((left**2).sum() / (final.sum() - p)), rel=1e-7)
 
 
-def test_an_estimator_may_be_the_start():
+def test_an_estimator_is_accepted_as_start():
     X, y = sample(0, 50, 3), sample(1, 50)
     y[:5] += 20.0
     start = LeastAbsoluteDeviations()
@@ -58,12 +58,12 @@ def test_an_estimator_may_be_the_start():
     torch.testing.assert_close(fit.coef_, LeastSquares().fit(X[keep], y[keep]).coef_)
 
 
-def test_a_wide_threshold_is_least_squares():
+def test_a_wide_threshold_equals_least_squares():
     X, y = sample(0, 50, 3), sample(1, 50)
     torch.testing.assert_close(ReweightedLeastSquares(threshold=1e3).fit(X, y).coef_, LeastSquares().fit(X, y).coef_)
 
 
-def test_it_is_more_precise_than_its_start():
+def test_reweighting_is_more_precise_than_its_start():
     X = sample(0, 60, 60, 3)
     y = sample(1, 60, 60)
     y[:, :15] += 30.0
@@ -75,7 +75,7 @@ def test_it_is_more_precise_than_its_start():
     assert then < 0.6 * first
 
 
-def test_the_gradient_is_that_of_least_squares_on_the_values_kept():
+def test_the_gradient_equals_that_of_least_squares_on_the_values_kept():
     X, y = sample(0, 20, 2), sample(1, 20)
     y[:3] += 30.0
     keep = ReweightedLeastSquares().fit(X, y).weights_[:, 0]

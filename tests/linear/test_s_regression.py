@@ -65,7 +65,7 @@ def test_the_scale_solves_its_equation_and_no_simplex_search_lowers_it(name):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_optimum_is_that_of_descents_from_all_elemental_sets(seed):
+def test_the_optimum_equals_that_of_descents_from_all_elemental_sets(seed):
     X, y = sample(seed, 12, 2), sample(seed + 100, 12) * torch.exp(sample(seed + 200, 12))
     best = np.inf
     starts = []
@@ -126,7 +126,7 @@ def test_the_m_scale_of_any_residuals_solves_its_equation(share):
 # weights
 
 
-def test_weight_is_repetition_up_to_the_degrees_of_freedom():
+def test_integer_weights_equal_repetition_up_to_the_degrees_of_freedom():
     X, y = contaminated_line(0)
     count = 1 + (torch.arange(40) % 2)
     fit = SRegression().fit(X, y, count.double())
@@ -135,7 +135,7 @@ def test_weight_is_repetition_up_to_the_degrees_of_freedom():
     torch.testing.assert_close(fit.scale_, repeated.scale_, rtol=1e-8, atol=0)
 
 
-def test_weight_zero_is_removal():
+def test_weight_zero_equals_removal():
     X, y = contaminated_line(0, 30)
     junk_X, junk_y = 5.0 + sample(9, 20, 3), torch.full((20,), 1e3, dtype=torch.float64)
     weight = torch.cat([torch.ones(30), torch.zeros(20)]).double()
@@ -148,7 +148,7 @@ def test_weight_zero_is_removal():
 # equivariance
 
 
-def test_columns_of_very_different_size_do_no_harm():
+def test_the_fit_is_equivariant_to_column_scales():
     X, y = contaminated_line(0)
     factor = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
     coef = SRegression().fit(X, y).coef_
@@ -181,7 +181,7 @@ def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-def test_the_unit_of_a_channel_does_not_matter(factor):
+def test_the_fit_is_equivariant_to_the_unit_of_a_channel(factor):
     reference, other = SRegression().fit(*two_channels(0, 1.0)), SRegression().fit(*two_channels(0, factor))
     torch.testing.assert_close(other.coef_, reference.coef_, rtol=1e-6, atol=1e-7)
     torch.testing.assert_close(other.scale_, reference.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-6, atol=0)
@@ -226,7 +226,7 @@ def test_a_lower_breakdown_point_solves_its_equation_at_gaussian_scale(breakdown
     assert float(rho.sum()) == pytest.approx(breakdown * 37, rel=1e-9)
 
 
-def test_the_scale_is_zero_only_where_the_exact_fit_holds_for_enough():
+def test_the_scale_is_zero_only_if_enough_samples_are_fitted_exactly():
     X = sample(0, 40, 2)
     y = X.sum(-1)
     y[:12] += 5.0
@@ -241,19 +241,19 @@ def test_a_breakdown_point_out_of_range_is_refused(breakdown):
         SRegression(breakdown=breakdown)
 
 
-def test_no_starts_are_refused():
+def test_zero_starts_are_refused():
     with pytest.raises(ValueError, match="`starts`"):
         SRegression(starts=0)
 
 
-def test_one_seed_gives_one_result():
+def test_equal_seeds_give_equal_results():
     X, y = sample(0, 30, 4), sample(1, 30)
     reference, other = SRegression(starts=3, seed=5).fit(X, y), SRegression(starts=3, seed=5).fit(X, y)
     assert torch.equal(reference.coef_, other.coef_)
 
 
 @pytest.mark.parametrize(("n", "drawn"), [(1, 30), (2, 73), (3, 156), (4, 322), (5, 500), (6, 500), (12, 500)])
-def test_no_more_starts_are_drawn_than_are_worth_it(n, drawn):
+def test_no_more_starts_are_drawn_than_the_breakdown_point_requires(n, drawn):
     """Where fewer starts than requested are drawn, all miss with probability at most 1e-9 at 50 % outliers."""
     assert starts_worth_drawing(500, n) == drawn
     assert drawn == 500 or (1 - 0.5**n) ** drawn <= 1e-9 < (1 - 0.5**n) ** (drawn - 1)
@@ -262,7 +262,7 @@ def test_no_more_starts_are_drawn_than_are_worth_it(n, drawn):
 
 @pytest.mark.parametrize("off", [1e-9, 0.3, 1.0, 1.1, 1e9])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_scale_does_not_depend_on_where_it_begins(off, dtype):
+def test_the_scale_does_not_depend_on_its_start(off, dtype):
     X, y = sample(50, 40, 2).to(dtype), sample(51, 3, 40).to(dtype)
     problem = linear_problem(X, y)
     residual = problem.Y.unsqueeze(1)
@@ -275,7 +275,7 @@ def test_the_scale_does_not_depend_on_where_it_begins(off, dtype):
     torch.testing.assert_close(weight, expected, rtol=0.0, atol=100 * tolerance)
 
 
-def test_many_problems_in_one_call_are_fitted_as_separately():
+def test_many_problems_in_one_call_equal_separate_fits():
     """More problems than are processed at once; some converge long before others."""
     X, y = sample(52, 150, 40, 2), sample(53, 150, 40)
     y[::3, :15] = 50.0 + X[::3, :15, 0]
@@ -287,7 +287,7 @@ def test_many_problems_in_one_call_are_fitted_as_separately():
         torch.testing.assert_close(together.scale_[i], alone.scale_, rtol=1e-12, atol=0.0)
 
 
-def test_derivatives_of_several_channels_are_those_of_refitting():
+def test_derivatives_of_several_channels_equal_differences_of_refits():
     """Channels whose derivatives cancel in the sum: each of them enters the derivative of the fit."""
     X, Y = sample(3, 12, 2, 2), sample(4, 12, 2)
     Y[:, 0] += 2.0 * X[:, 0, 0]

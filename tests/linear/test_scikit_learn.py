@@ -25,7 +25,7 @@ from mkc_torch.linear import (
     Ridge,
 )
 from mkc_torch.linear.scikit_learn import ScikitLearnRegressor
-from tests.linear.test_arguments import ESTIMATORS, each_estimator, made
+from tests.linear.test_arguments import ESTIMATORS, each_estimator, make_estimator
 
 CHECKED = [
     MMRegression(starts=50),
@@ -38,15 +38,15 @@ CHECKED = [
 each_checked = pytest.mark.parametrize("estimator", CHECKED, ids=lambda estimator: type(estimator).__name__)
 
 
-def undetermined(_):
+def expected_failures(_):
     return {
         "check_sample_weight_equivalence_on_dense_data": "has 30 features of 15 samples, which do not determine the "
-        "coefficients; test_a_weight_is_a_repetition does the same with enough samples"
+        "coefficients; test_integer_weights_equal_repetition does the same with enough samples"
     }
 
 
-@parametrize_with_checks([ScikitLearnRegressor(inner) for inner in CHECKED], expected_failed_checks=undetermined)
-def test_scikit_learn_finds_nothing_to_object_to(estimator, check):
+@parametrize_with_checks([ScikitLearnRegressor(inner) for inner in CHECKED], expected_failed_checks=expected_failures)
+def test_the_estimator_checks_of_scikit_learn_pass(estimator, check):
     check(estimator)
 
 
@@ -63,10 +63,10 @@ def with_intercept(X):
 
 
 @each_estimator
-def test_the_numbers_are_those_of_the_estimator(kind):
+def test_results_equal_those_of_the_wrapped_estimator(kind):
     X, y = data()
-    fit = ScikitLearnRegressor(made(kind)).fit(X, y)
-    inner = made(kind).fit(with_intercept(X), torch.from_numpy(y).unsqueeze(-1))
+    fit = ScikitLearnRegressor(make_estimator(kind)).fit(X, y)
+    inner = make_estimator(kind).fit(with_intercept(X), torch.from_numpy(y).unsqueeze(-1))
     np.testing.assert_array_equal(fit.coef_, inner.coef_[:-1].numpy())
     assert fit.intercept_ == inner.coef_[-1].item()
     np.testing.assert_array_equal(fit.weights_, inner.weights_[:, 0].numpy())
@@ -76,7 +76,7 @@ def test_the_numbers_are_those_of_the_estimator(kind):
     np.testing.assert_allclose(fit.predict(X), inner.predict(with_intercept(X)).squeeze(-1).numpy(), rtol=0, atol=1e-12)
 
 
-def test_without_an_intercept_least_squares_is_that_of_scikit_learn():
+def test_without_an_intercept_least_squares_equals_that_of_scikit_learn():
     X, y = data(outliers=0)
     for fit_intercept in (True, False):
         ours = ScikitLearnRegressor(LeastSquares(), fit_intercept=fit_intercept).fit(X, y)
@@ -101,7 +101,7 @@ def test_float32_stays_float32():
 
 
 @each_checked
-def test_a_weight_is_a_repetition(estimator):
+def test_integer_weights_equal_repetition(estimator):
     X, y = data()
     # total weight as large as the number of samples, by which least trimmed squares chooses its share
     weight = np.arange(len(y)) % 3
@@ -110,7 +110,7 @@ def test_a_weight_is_a_repetition(estimator):
     np.testing.assert_allclose(weighted.predict(X), repeated.predict(X), rtol=1e-5, atol=1e-6)
 
 
-def test_a_pipeline_a_search_and_cross_validation_take_it():
+def test_the_regressor_works_in_a_pipeline_a_grid_search_and_cross_validation():
     X, y = data(outliers=0)
     pipeline = make_pipeline(StandardScaler(), ScikitLearnRegressor(MMRegression(starts=20)))
     assert cross_val_score(pipeline, X, y, cv=3).min() > 0.99
@@ -123,8 +123,8 @@ def test_a_pipeline_a_search_and_cross_validation_take_it():
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)
-def test_parameters_are_cloned_and_reached(kind):
-    regressor = ScikitLearnRegressor(made(kind), fit_intercept=False)
+def test_nested_parameters_are_cloned_and_set(kind):
+    regressor = ScikitLearnRegressor(make_estimator(kind), fit_intercept=False)
     copy = clone(regressor)
     assert copy.estimator is not regressor.estimator
     assert repr(copy) == repr(regressor)
@@ -133,7 +133,7 @@ def test_parameters_are_cloned_and_reached(kind):
     assert isinstance(regressor._repr_html_(), str)
 
 
-def test_a_parameter_inside_is_checked_when_it_is_set():
+def test_a_nested_parameter_is_checked_when_it_is_set():
     regressor = ScikitLearnRegressor(MMRegression())
     regressor.set_params(estimator__efficiency=0.85)
     assert regressor.estimator.efficiency == 0.85
@@ -141,7 +141,7 @@ def test_a_parameter_inside_is_checked_when_it_is_set():
         regressor.set_params(estimator__efficiency=2.0)
 
 
-def test_names_of_features_are_kept_and_checked():
+def test_feature_names_are_stored_and_checked():
     X, y = data()
     frame = pytest.importorskip("pandas").DataFrame(X, columns=["a", "b", "c"])
     fit = ScikitLearnRegressor().fit(frame, y)
@@ -157,7 +157,7 @@ def test_a_fit_with_another_estimator_removes_earlier_results():
     assert not hasattr(fit.set_params(estimator=LeastSquares()).fit(X, y), "scale_")
 
 
-def test_what_cannot_be_fitted_is_refused():
+def test_unfitted_wrong_or_underdetermined_estimators_are_refused():
     X, y = data()
     with pytest.raises(NotFittedError):
         ScikitLearnRegressor().predict(X)

@@ -26,7 +26,7 @@ def free_port():
         return s.getsockname()[1]
 
 
-def run(work, folder, ranks=2):
+def run_ranks(work, folder, ranks=2):
     """Run ``work(rank, folder)`` in a process for each rank; return their exit codes once all have ended."""
     context, port = multiprocessing.get_context("spawn"), free_port()
     processes = [context.Process(target=_process, args=(work, rank, ranks, port, str(folder))) for rank in range(ranks)]
@@ -59,7 +59,7 @@ def fitted(fit):
     return {name: getattr(fit, name) for name in FIELDS}
 
 
-class Plain:
+class UncountedBatches:
     """Batches of an unknown number of rows."""
 
     def __init__(self, batches):
@@ -69,7 +69,7 @@ class Plain:
         return iter(self.batches)
 
 
-def _fits(rank, folder):
+def _fit_on_rank(rank, folder):
     X, Y = table()
     arguments = {"pilot": 300}
     results = {
@@ -77,7 +77,7 @@ def _fits(rank, folder):
         "uneven": StreamedMKCRegression(**arguments).fit(from_memmap(*((X[:7], Y[:7]), (X[7:], Y[7:]))[rank])),
         "empty": StreamedMKCRegression(**arguments).fit(from_memmap(*((X, Y), (X[:0], Y[:0]))[rank])),
         "uncounted": StreamedMKCRegression(bound=30.0, **arguments).fit(
-            Plain([(X[rank::2][i : i + 100], Y[rank::2][i : i + 100]) for i in range(0, ROWS // 2, 100)])
+            UncountedBatches([(X[rank::2][i : i + 100], Y[rank::2][i : i + 100]) for i in range(0, ROWS // 2, 100)])
         ),
         "group": StreamedMKCRegression(**arguments).fit(
             from_memmap(X, Y, shard=(rank, 2)), group=dist.new_group([0, 1])
@@ -91,11 +91,11 @@ def _fits(rank, folder):
     again = StreamedMKCRegression(**arguments).fit(from_memmap(X, Y, shard=(rank, 2)), checkpoint=f"{folder}/fit.pt")
     assert torch.equal(again.coef_, results["checkpoint"].coef_)
     assert again.n_iter_ == results["checkpoint"].n_iter_
-    _errors(rank)
+    _check_errors_of_fits(rank)
 
 
-def _errors(rank):
-    """An error on rank 1 is an error on both ranks, which can be used afterwards."""
+def _check_errors_of_fits(rank):
+    """An error on a rank raises on both ranks, which can be used afterwards."""
     X, Y = table()
     bad = Y.copy()
     bad[-3] = float("nan")
@@ -109,7 +109,7 @@ def _errors(rank):
         fit.fit(iter([(X, Y)]) if rank == 1 else [(X, Y)])
 
 
-def _errors_of_ranks(rank, folder):
+def _check_errors_of_ranks(rank, folder):
     ranks = Ranks()
 
     def work():
@@ -134,8 +134,8 @@ def _errors_of_ranks(rank, folder):
 
 
 @pytest.mark.process
-def test_two_ranks_are_one(tmp_path):
-    assert run(_fits, tmp_path) == [0, 0]
+def test_fits_on_two_ranks_equal_a_fit_on_one(tmp_path):
+    assert run_ranks(_fit_on_rank, tmp_path) == [0, 0]
     reference, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     for name, fields in reference.items():
         assert all(torch.equal(value, other[name][field]) for field, value in fields.items()), name
@@ -152,11 +152,11 @@ def test_two_ranks_are_one(tmp_path):
 
 
 @pytest.mark.process
-def test_results_and_errors_of_a_group(tmp_path):
-    assert run(_errors_of_ranks, tmp_path) == [0, 0]
+def test_an_error_on_a_rank_is_raised_on_all_ranks_of_its_group(tmp_path):
+    assert run_ranks(_check_errors_of_ranks, tmp_path) == [0, 0]
 
 
-class Killed:
+class KilledBatches:
     """Batches whose process is killed in the third pass."""
 
     def __init__(self, batches):
@@ -170,13 +170,13 @@ class Killed:
             yield batch
 
 
-def _killed(rank, folder):
+def _fit_killed_batches(rank, folder):
     X, Y = table()
     batches = from_memmap(X, Y, rows=100, shard=(rank, dist.get_world_size()))
     last = dist.get_world_size() - 1
     begin = time.monotonic()
     try:
-        StreamedMKCRegression(pilot=300).fit(Killed(batches) if rank == last else batches)
+        StreamedMKCRegression(pilot=300).fit(KilledBatches(batches) if rank == last else batches)
     except RanksError as error:
         Path(folder, str(rank)).write_text(f"{time.monotonic() - begin} {error}", encoding="utf-8")
         os._exit(7)
@@ -184,15 +184,15 @@ def _killed(rank, folder):
 
 @pytest.mark.process
 @pytest.mark.parametrize("ranks", [2, 3])
-def test_a_rank_that_is_killed_is_an_error_on_all(ranks, tmp_path):
-    assert run(_killed, tmp_path, ranks) == [7] * (ranks - 1) + [-signal.SIGKILL]
+def test_a_killed_rank_raises_an_error_on_all_ranks(ranks, tmp_path):
+    assert run_ranks(_fit_killed_batches, tmp_path, ranks) == [7] * (ranks - 1) + [-signal.SIGKILL]
     for rank in range(ranks - 1):
         seconds, _, message = (tmp_path / str(rank)).read_text(encoding="utf-8").partition(" ")
         assert float(seconds) < 30
         assert message.startswith("Another process of the group is gone")
 
 
-def test_a_group_that_this_process_is_no_member_of(monkeypatch):
+def test_a_group_without_this_process_is_refused(monkeypatch):
     monkeypatch.setattr(dist, "get_world_size", lambda _: 2)
     monkeypatch.setattr(dist, "get_rank", lambda _: -1)
     with pytest.raises(ValueError, match="`group` to contain this process"):

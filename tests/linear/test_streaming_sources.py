@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mkc_torch.linear.streaming import StreamedMKCRegression, from_memmap, from_parquet
-from tests.linear.test_streaming import cut, problem
+from tests.linear.test_streaming import problem, split_into_batches
 
 ROWS = 1000
 
@@ -38,9 +38,9 @@ def coefficients(batches, **arguments):
     return StreamedMKCRegression(pilot=100, **arguments).fit(batches).coef_
 
 
-def test_the_same_numbers_from_disk_and_from_memory(table, parquet):
+def test_fits_from_disk_equal_fits_in_memory(table, parquet):
     rows = torch.from_numpy(table.copy())
-    tensors = coefficients(cut(rows[:, :3], rows[:, 3]))
+    tensors = coefficients(split_into_batches(rows[:, :3], rows[:, 3]))
     memmap = coefficients(from_memmap(table[:, :3], table[:, 3], rows=333))
     files = from_parquet(parquet, ["a", "b", "c"], "y", rows=100)
     torch.testing.assert_close(memmap, tensors, rtol=1e-10, atol=0)
@@ -48,10 +48,10 @@ def test_the_same_numbers_from_disk_and_from_memory(table, parquet):
     assert files.rows == ROWS
 
 
-def test_weights_and_channels_from_disk(table, parquet):
+def test_weights_and_channels_are_read_from_disk(table, parquet):
     rows = torch.from_numpy(table.copy()).double()
     weight = torch.linspace(0.5, 1.5, ROWS).double()
-    tensors = coefficients(cut(rows[:, :3], rows[:, 3], weight))
+    tensors = coefficients(split_into_batches(rows[:, :3], rows[:, 3], weight))
     memmap = coefficients(from_memmap(table[:, :3], table[:, 3], np.linspace(0.5, 1.5, ROWS)))
     files = coefficients(from_parquet(parquet, ["a", "b", "c"], "y", weight="w"))
     torch.testing.assert_close(memmap, tensors, rtol=1e-6, atol=0)
@@ -70,7 +70,7 @@ def test_columns_have_the_names_of_the_file(parquet):
 
 
 @pytest.mark.parametrize("ranks", [1, 3, 7])
-def test_shards_are_all_rows_in_a_row(ranks, table, parquet):
+def test_shards_partition_the_rows_in_order(ranks, table, parquet):
     for make in (
         lambda shard: from_memmap(table[:, :3], table[:, 3], rows=70, shard=shard),
         lambda shard: from_parquet(parquet, ["a", "b", "c"], "y", shard=shard),
@@ -82,7 +82,7 @@ def test_shards_are_all_rows_in_a_row(ranks, table, parquet):
         assert (found == table[:, :3]).all()
 
 
-def test_a_missing_value_is_named(tmp_path):
+def test_missing_values_and_bad_columns_of_parquet_are_refused(tmp_path):
     pa = pytest.importorskip("pyarrow")
     from pyarrow.parquet import write_table
 
@@ -96,7 +96,7 @@ def test_a_missing_value_is_named(tmp_path):
         from_parquet(tmp_path / "gap.parquet", ["b"], "y")
 
 
-def test_files_that_are_missing_or_damaged(tmp_path):
+def test_missing_and_damaged_files_are_refused(tmp_path):
     pytest.importorskip("pyarrow")
     (tmp_path / "text.parquet").write_text("no table")
     with pytest.raises(ValueError, match="is not a Parquet file"):
@@ -105,7 +105,7 @@ def test_files_that_are_missing_or_damaged(tmp_path):
         from_parquet(tmp_path / "absent.parquet", ["a"], "y")
 
 
-def test_columns_that_do_not_fit(tmp_path):
+def test_bad_column_arguments_are_refused(tmp_path):
     path = tmp_path / "table.parquet"
     with pytest.raises(TypeError, match=r"write \('a',\)"):
         from_parquet(path, "a", "y")
@@ -132,7 +132,7 @@ def test_without_pyarrow_the_extra_is_named(tmp_path, monkeypatch):
         from_parquet(tmp_path / "table.parquet", ["a"], "y")
 
 
-def test_arrays_that_do_not_fit(table):
+def test_bad_array_arguments_are_refused(table):
     with pytest.raises(TypeError, match=r"`Y` .*NumPy array.*memmap"):
         from_memmap(table, torch.ones(3))
     with pytest.raises(ValueError, match=r"`Y` .*rows.*`X`, 1000, .*got 999"):

@@ -22,7 +22,7 @@ def randn(*size, seed=0):
     return torch.randn(*size, generator=generator(seed), dtype=torch.float64)
 
 
-def followed(residual, prediction=None):
+def scale_after(residual, prediction=None):
     """A running scale after one batch."""
     scale = ResidualScale(residual.shape[-1]).double()
     prediction = torch.zeros_like(residual) if prediction is None else prediction
@@ -30,7 +30,7 @@ def followed(residual, prediction=None):
     return scale
 
 
-def selecting(monkeypatch, bandwidth, better):
+def fix_selection(monkeypatch, bandwidth, better):
     """Replace the selection by a constant; ``better`` may be changed in place."""
     bandwidth, better = torch.tensor(bandwidth, dtype=torch.float64), torch.tensor(better)
 
@@ -43,7 +43,7 @@ def selecting(monkeypatch, bandwidth, better):
 
 
 @pytest.fixture(params=["NumPy", "torch"])
-def arrays(request, monkeypatch):
+def array_library(request, monkeypatch):
     if request.param == "torch":
         monkeypatch.setattr(module, "SMALL_STATE", 0)
     return request.param
@@ -52,10 +52,10 @@ def arrays(request, monkeypatch):
 # --- the share
 
 
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("array_library")
 def test_the_share_is_0_in_the_warm_up_and_then_grows_at_every_fourth_batch(monkeypatch):
-    selecting(monkeypatch, [2.0], [True])
-    scale, schedule = followed(randn(20, 1)), BandwidthSchedule(1).double()
+    fix_selection(monkeypatch, [2.0], [True])
+    scale, schedule = scale_after(randn(20, 1)), BandwidthSchedule(1).double()
     for batch in range(3 * WARMUP_STEPS):
         schedule.update(scale)
         assert schedule.steps.tolist() == [batch + 1]
@@ -65,10 +65,10 @@ def test_the_share_is_0_in_the_warm_up_and_then_grows_at_every_fourth_batch(monk
     assert (WARMUP_STEPS, ANNEAL_STEP, SELECTION_INTERVAL) == (100, 0.005, 4)
 
 
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("array_library")
 def test_the_share_falls_if_the_initial_loss_has_the_smaller_risk_and_stays_in_0_and_1(monkeypatch):
-    better = selecting(monkeypatch, [2.0, 2.0], [True, False])
-    scale, schedule = followed(randn(20, 2)), BandwidthSchedule(2, warmup_steps=0, anneal_step=0.1).double()
+    better = fix_selection(monkeypatch, [2.0, 2.0], [True, False])
+    scale, schedule = scale_after(randn(20, 2)), BandwidthSchedule(2, warmup_steps=0, anneal_step=0.1).double()
     shares = []
     for batch in range(32):
         if batch == 16:
@@ -83,8 +83,8 @@ def test_the_share_falls_if_the_initial_loss_has_the_smaller_risk_and_stays_in_0
 
 @pytest.mark.parametrize("warmup_steps", [0, 1, 2, 7, 8])
 def test_the_length_of_the_warm_up_is_an_argument(warmup_steps, monkeypatch):
-    selecting(monkeypatch, [2.0], [True])
-    scale, schedule = followed(randn(20, 1)), BandwidthSchedule(1, warmup_steps=warmup_steps)
+    fix_selection(monkeypatch, [2.0], [True])
+    scale, schedule = scale_after(randn(20, 1)), BandwidthSchedule(1, warmup_steps=warmup_steps)
     batches = 0
     while float(schedule.share) == 0.0:
         schedule.update(scale)
@@ -92,9 +92,9 @@ def test_the_length_of_the_warm_up_is_an_argument(warmup_steps, monkeypatch):
     assert batches == -(-warmup_steps // SELECTION_INTERVAL) * SELECTION_INTERVAL + 1
 
 
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("array_library")
 def test_a_channel_without_residuals_is_not_annealed(monkeypatch):
-    selecting(monkeypatch, [2.0, 2.0], [True, True])
+    fix_selection(monkeypatch, [2.0, 2.0], [True, True])
     scale, schedule = ResidualScale(2).double(), BandwidthSchedule(2, warmup_steps=0).double()
     scale.update(randn(20, 2), torch.zeros(20, 2), torch.tensor([True, False]).expand(20, 2))
     schedule.update(scale)
@@ -104,13 +104,13 @@ def test_a_channel_without_residuals_is_not_annealed(monkeypatch):
 # --- the bandwidth
 
 
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("array_library")
 def test_the_log_bandwidth_is_a_running_mean_over_every_fourth_batch(monkeypatch):
-    scale, schedule, mean = followed(randn(20, 1)), BandwidthSchedule(1).double(), 0.0
+    scale, schedule, mean = scale_after(randn(20, 1)), BandwidthSchedule(1).double(), 0.0
     widths = [64.0, 2.0, 2.0, 8.0, 0.5, 1.0] * 3
     for batch in range(SELECTION_INTERVAL * len(widths)):
         width = widths[batch // SELECTION_INTERVAL]
-        selecting(monkeypatch, [width if batch % SELECTION_INTERVAL == 0 else math.nan], [True])
+        fix_selection(monkeypatch, [width if batch % SELECTION_INTERVAL == 0 else math.nan], [True])
         schedule.update(scale)
         if batch % SELECTION_INTERVAL == 0:
             # the same number of single updates of a tenth
@@ -125,7 +125,7 @@ def test_clean_residuals_lead_to_a_wide_bandwidth_and_permuted_targets_of_a_shru
     noise, permuted = 0.2 * randn(512, seed=1), truth.clone()
     permuted[::2] = truth[::2].roll(7)
     prediction = torch.stack([truth, 0.5 * truth], -1)
-    scale = followed(prediction - torch.stack([truth + noise, permuted + noise], -1), prediction)
+    scale = scale_after(prediction - torch.stack([truth + noise, permuted + noise], -1), prediction)
     schedule = BandwidthSchedule(2, warmup_steps=20, anneal_step=0.05).double()
     for _ in range(60):
         schedule.update(scale)
@@ -178,14 +178,14 @@ def test_channels_are_independent():
     residual = randn(100, 3) ** 3 * torch.tensor([1.0, 10.0, 1e-3])
     schedules = [BandwidthSchedule(m, warmup_steps=0).double() for m in (3, 1)]
     for _ in range(9):
-        schedules[0].update(followed(residual))
-        schedules[1].update(followed(residual[:, 1:2]))
+        schedules[0].update(scale_after(residual))
+        schedules[1].update(scale_after(residual[:, 1:2]))
     for name, value in schedules[1].state_dict().items():
         assert value.item() == pytest.approx(schedules[0].state_dict()[name][1].item(), rel=1e-12)
 
 
 def test_an_update_does_not_change_the_scale_and_has_no_gradient():
-    scale, schedule = followed(randn(100, 2)), BandwidthSchedule(2, warmup_steps=0).double()
+    scale, schedule = scale_after(randn(100, 2)), BandwidthSchedule(2, warmup_steps=0).double()
     before = copy.deepcopy(scale.state_dict())
     schedule.update(scale)
     torch.testing.assert_close(scale.state_dict(), before, rtol=0.0, atol=0.0)
@@ -195,7 +195,7 @@ def test_an_update_does_not_change_the_scale_and_has_no_gradient():
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 121])
 def test_a_schedule_resumed_from_a_state_dict_is_bitwise_equal(at):
-    scales = [followed(randn(100, 1, seed=seed) ** 3) for seed in range(6)]
+    scales = [scale_after(randn(100, 1, seed=seed) ** 3) for seed in range(6)]
     schedule, resumed = (BandwidthSchedule(1, warmup_steps=3) for _ in range(2))
     for batch in range(at):
         schedule.update(scales[batch % 6])

@@ -28,7 +28,7 @@ def selection(z, prediction, weight):
     return found
 
 
-def fitted(share, shrunk, seed=0, noise=0.2):
+def simulated_fit(share, shrunk, seed=0, noise=0.2):
     """Standardised residuals and predictions of a fit with the given shrinkage; a share of targets is permuted."""
     g = generator(seed)
     truth = torch.randn(N, generator=g)
@@ -43,7 +43,7 @@ def fitted(share, shrunk, seed=0, noise=0.2):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_least_squares_on_permuted_targets_is_detected_by_its_shrunk_predictions(seed):
-    z, prediction, weight = fitted(0.5, 0.5, seed)
+    z, prediction, weight = simulated_fit(0.5, 0.5, seed)
     found = selection(z, prediction, weight)
     assert found.bandwidth <= 1.4 or not found.better
     blind = selection(z, torch.zeros_like(z), weight)
@@ -53,14 +53,14 @@ def test_least_squares_on_permuted_targets_is_detected_by_its_shrunk_predictions
 
 @pytest.mark.parametrize("seed", range(5))
 def test_at_the_truth_permuted_targets_support_a_narrow_bandwidth(seed):
-    found = selection(*fitted(0.5, 1.0, seed))
+    found = selection(*simulated_fit(0.5, 1.0, seed))
     assert 0.5 <= found.bandwidth <= 2.0
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("shrunk", [1.0, 0.98])
 def test_right_targets_support_a_wide_bandwidth(seed, shrunk):
-    found = selection(*fitted(0.0, shrunk, seed))
+    found = selection(*simulated_fit(0.0, shrunk, seed))
     assert found.better
     assert found.bandwidth >= 2.8
 
@@ -90,14 +90,14 @@ def test_without_shrinkage_the_widest_bandwidth_of_nearly_the_smallest_variance_
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_selection_does_not_depend_on_unit_and_offset_of_predictions(dtype):
-    z, prediction, weight = (values.to(dtype) for values in fitted(0.5, 0.5))
+    z, prediction, weight = (values.to(dtype) for values in simulated_fit(0.5, 0.5))
     units = [(1.0, 0.0), (1e-6, 1e-6), (1e6, -3e6)]
     found = [selection(z, unit * prediction + shift, weight) for unit, shift in units]
     assert {(float(f.bandwidth), bool(f.better)) for f in found} == {(float(found[0].bandwidth), bool(found[0].better))}
 
 
 def test_residuals_of_weight_0_are_ignored():
-    z, prediction, weight = fitted(0.5, 0.5)
+    z, prediction, weight = simulated_fit(0.5, 0.5)
     weight[:, ::2] = 0.0
     expected = selection(z[:, 1::2], prediction[:, 1::2], weight[:, 1::2])
     z[:, ::2], prediction[:, ::2] = 50.0, -3.0
@@ -106,7 +106,7 @@ def test_residuals_of_weight_0_are_ignored():
 
 
 def test_a_weight_equals_repetition_except_for_chance():
-    z, _, weight = (values.double() for values in fitted(0.5, 1.0))
+    z, _, weight = (values.double() for values in simulated_fit(0.5, 1.0))
     times = torch.randint(1, 4, (N,), generator=generator(2))
     repeated = [values.repeat_interleave(times, 1) for values in (z, torch.zeros_like(z), weight)]
     found, expected = selection(z, torch.zeros_like(z), weight * times), selection(*repeated)
@@ -114,14 +114,14 @@ def test_a_weight_equals_repetition_except_for_chance():
 
 
 def test_channels_are_selected_independently():
-    parts = [fitted(0.5, 0.5), fitted(0.0, 1.0)]
+    parts = [simulated_fit(0.5, 0.5), simulated_fit(0.0, 1.0)]
     both = selection(*(torch.cat(values) for values in zip(*parts, strict=True)))
     assert both.better.tolist() == [False, True]
     assert both.bandwidth.tolist() == [float(selection(*part).bandwidth) for part in parts]
 
 
 def test_a_constant_prediction_gives_a_finite_selection():
-    z, _, weight = fitted(0.0, 1.0)
+    z, _, weight = simulated_fit(0.0, 1.0)
     assert selection(z, torch.full_like(z, 7.0), weight).better
 
 

@@ -11,12 +11,12 @@ from mkc_torch.losses import entropy_like
 LOSS = MKCLoss(2, sigma=torch.tensor([1.5, 4.0]), d=torch.tensor([0.5, 2.0]), bound=30.0).double()
 
 
-def errors():
+def error_grid():
     return torch.linspace(-20.0, 20.0, 81, dtype=torch.float64).unsqueeze(-1).expand(81, 2).clone()
 
 
 def test_influence_is_the_derivative_of_the_value_and_weight_its_ratio_to_least_squares():
-    error = errors().requires_grad_()
+    error = error_grid().requires_grad_()
     (slope,) = torch.autograd.grad(LOSS.rho(error).sum(), error)
     torch.testing.assert_close(LOSS.influence(error), slope)
     inside = error.detach().abs() > 0
@@ -31,14 +31,14 @@ def test_far_away_the_value_is_the_squared_bandwidth_and_influence_is_0():
     assert LOSS.weight(far).max().item() == 0.0
 
 
-def drawn(axes) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def drawn_lines(axes) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     lines = [line for line in axes.lines if not line.get_label().startswith("_")]
     return {line.get_label(): tuple(torch.as_tensor(v).double() for v in line.get_data()) for line in lines}
 
 
-def test_a_picture_shows_the_three_curves_of_a_channel():
+def test_a_plot_shows_the_three_curves_of_a_channel():
     pytest.importorskip("matplotlib")
-    curves = drawn(LOSS.plot(1))
+    curves = drawn_lines(LOSS.plot(1))
     assert set(curves) == {"value / σ²", "influence · d", "weight"}
     for name, of, factor in (
         ("value / σ²", LOSS.rho, 1.0 / 16.0),
@@ -54,12 +54,12 @@ def test_a_picture_shows_the_three_curves_of_a_channel():
             LOSS.plot(channel)
 
 
-def test_a_gaussian_is_drawn_undivided_on_given_axes():
+def test_a_gaussian_is_drawn_unscaled_on_given_axes():
     figure = pytest.importorskip("matplotlib.figure")
     axes = figure.Figure().add_subplot()
     gaussian = MKCLoss(1, sigma=math.inf, d=1.0, learn_sigma=False)
     assert gaussian.plot(axes=axes) is axes
-    x, y = drawn(axes)["value"]
+    x, y = drawn_lines(axes)["value"]
     torch.testing.assert_close(y, 0.5 * x.square())
 
 
@@ -97,9 +97,9 @@ def test_the_value_of_a_sample_is_the_loss_without_its_normaliser():
     torch.testing.assert_close(change, loss.rho(error, sigma, d))
 
 
-def test_the_picture_of_a_sample():
+def test_the_plot_of_a_sample_shows_its_scaled_curves():
     pytest.importorskip("matplotlib")
-    curves = drawn(SAMPLES.plot(sigma=1.0, d=0.5))
+    curves = drawn_lines(SAMPLES.plot(sigma=1.0, d=0.5))
     x, y = curves["influence · d"]
     torch.testing.assert_close(y, 0.5 * SAMPLES.influence(x, 1.0, 0.5))
     assert float(x.max()) == 3.0
@@ -121,7 +121,7 @@ def test_the_curves_of_a_label_are_functions_of_its_probability(sigma):
     torch.testing.assert_close(loss.weight_at(p), loss.inlier_weight(logits, labels))
 
 
-def test_curves_of_a_label_at_probability_0_and_1():
+def test_curves_of_a_label_at_probabilities_0_and_1_are_their_limits():
     ends = torch.tensor([0.0, 1.0])
     loss = GeneralizedCrossEntropyLoss(sigma=2.0)
     assert loss.rho(ends).tolist() == [4.0, 0.0]
@@ -134,10 +134,10 @@ def test_curves_of_a_label_at_probability_0_and_1():
 
 
 @pytest.mark.parametrize("sigma", [1.2, math.inf])
-def test_the_picture_of_a_label(sigma):
+def test_the_plot_of_a_label_shows_value_influence_and_weight(sigma):
     pytest.importorskip("matplotlib")
     loss = GeneralizedCrossEntropyLoss(sigma=sigma).double()
-    curves = drawn(loss.plot())
+    curves = drawn_lines(loss.plot())
     assert set(curves) == {"value", "influence on the logit", "influence of cross-entropy", "weight"}
     p, influence = curves["influence on the logit"]
     # by autograd through two logits
@@ -147,7 +147,7 @@ def test_the_picture_of_a_label(sigma):
     assert all(bool(torch.isfinite(y).all()) for _, y in curves.values())
 
 
-def test_curves_of_the_entropy_for_an_error_added_to_a_batch():
+def test_curves_of_the_entropy_equal_its_change_by_an_added_error():
     generator = torch.Generator().manual_seed(0)
     batch = torch.randn(60, generator=generator, dtype=torch.float64)
     error = torch.linspace(-30.0, 30.0, 40, dtype=torch.float64)
@@ -161,16 +161,16 @@ def test_curves_of_the_entropy_for_an_error_added_to_a_batch():
     assert ENTROPY.weight(torch.zeros(1), batch).tolist() == [math.inf]
 
 
-def test_the_picture_of_an_error_added_to_a_batch():
+def test_the_plot_of_the_entropy_shows_its_change_by_an_added_error():
     pytest.importorskip("matplotlib")
     batch = torch.linspace(-2.0, 3.0, 50, dtype=torch.float64)
-    curves = drawn(ENTROPY.plot(batch))
+    curves = drawn_lines(ENTROPY.plot(batch))
     x, y = curves["change of value · 51"]
     torch.testing.assert_close(y, 51.0 * (ENTROPY.rho(x, batch) - ENTROPY.rho(torch.zeros(1), batch)))
     scale = 1.4826 * float(batch.abs().quantile(0.5))
     assert [float(x.min()), float(x.max())] == pytest.approx([-6.0 * scale, 6.0 * scale], rel=0.05)
     assert all(bool(torch.isfinite(values).all()) for _, values in curves.values())
-    assert "201" in next(iter(drawn(ENTROPY.plot())))
+    assert "201" in next(iter(drawn_lines(ENTROPY.plot())))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_batch_without_errors_is_refused(batch, error, message):
             call()
 
 
-def test_a_batch_of_mostly_zeros_has_no_picture():
+def test_a_plot_for_a_batch_of_mostly_zeros_is_refused():
     pytest.importorskip("matplotlib")
     with pytest.raises(ValueError, match="more than half are 0"):
         ENTROPY.plot(torch.tensor([0.0, 0.0, 0.0, 1.0]))

@@ -20,16 +20,16 @@ def sample(seed: int, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).to(dtype)
 
 
-def by_definition(r: np.ndarray) -> float:
-    """(40)-(42), a residual at a time."""
+def entropy_by_definition(r: np.ndarray) -> float:
+    """(40)-(42) of the paper, summed over single residuals."""
     D = float((r**2).sum())
     if D == 0:
         return 0.0
     return -sum(v**2 / D * math.log(v**2 / D) for v in r.ravel().tolist() if v != 0) / math.log(r.size)
 
 
-def slope(r: np.ndarray) -> np.ndarray:
-    """(52) for the residuals themselves."""
+def gradient_by_formula(r: np.ndarray) -> np.ndarray:
+    """(52) of the paper, by the residuals."""
     D = (r**2).sum()
     q = r**2 / D
     jacobian = np.diag(2 * r / D) - np.outer(r**2, 2 * r) / D**2
@@ -42,9 +42,12 @@ def slope(r: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_value_follows_the_definition(seed):
     r = sample(seed, 5, 7)
-    assert float(entropy_like(r)) == pytest.approx(by_definition(r.numpy()), rel=1e-13)
+    assert float(entropy_like(r)) == pytest.approx(entropy_by_definition(r.numpy()), rel=1e-13)
     torch.testing.assert_close(
-        entropy_like(r, 0), torch.tensor([by_definition(c) for c in r.numpy().T], dtype=r.dtype), rtol=1e-13, atol=0
+        entropy_like(r, 0),
+        torch.tensor([entropy_by_definition(c) for c in r.numpy().T], dtype=r.dtype),
+        rtol=1e-13,
+        atol=0,
     )
     torch.testing.assert_close(entropy_like(r, (0, 1)), entropy_like(r), rtol=1e-14, atol=0)
     torch.testing.assert_close(entropy_like(r, -1), entropy_like(r.T, 0), rtol=1e-14, atol=0)
@@ -90,7 +93,7 @@ def test_float32_is_accurate_over_a_million_residuals():
 def test_the_gradient_equals_the_papers_formula(seed):
     r = sample(seed, 12).requires_grad_()
     (gradient,) = torch.autograd.grad(entropy_like(r), r)
-    np.testing.assert_allclose(gradient.numpy(), slope(r.detach().numpy()), rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(gradient.numpy(), gradient_by_formula(r.detach().numpy()), rtol=1e-10, atol=1e-13)
 
 
 @FORWARD_MODE
@@ -101,11 +104,11 @@ def test_gradcheck_to_second_order_and_in_forward_mode():
     torch.autograd.gradgradcheck(entropy_like, (r,), atol=1e-5)
 
 
-def test_derivatives_where_residuals_are_zero():
+def test_derivatives_at_zero_residuals_are_limits_of_nearby_derivatives():
     r = torch.tensor([0.0, 1.0, -2.0, 0.0], dtype=torch.float64, requires_grad=True)
     (g,) = torch.autograd.grad(entropy_like(r), r, create_graph=True)
     assert g[0] == 0 == g[3]
-    near = slope(np.array([1e-12, 1.0, -2.0, 1e-12]))
+    near = gradient_by_formula(np.array([1e-12, 1.0, -2.0, 1e-12]))
     np.testing.assert_allclose(g.detach().numpy(), near, rtol=0, atol=1e-9)
     second = torch.autograd.functional.hessian(entropy_like, r.detach())
     assert bool(torch.isfinite(second).all())
@@ -114,7 +117,7 @@ def test_derivatives_where_residuals_are_zero():
     torch.testing.assert_close(second[1:3, 1:3], nearby[1:3, 1:3], rtol=1e-6, atol=1e-6)
 
 
-def test_gradient_is_zero_for_all_zero_residuals_and_for_a_single_residual():
+def test_the_gradient_of_all_zero_residuals_and_of_a_single_residual_is_zero():
     for r in (torch.zeros(5, 2), torch.tensor([[3.0, 0.0]]), torch.tensor([4.0])):
         r = r.double().requires_grad_()
         assert entropy_like(r) == 0.0
@@ -122,7 +125,7 @@ def test_gradient_is_zero_for_all_zero_residuals_and_for_a_single_residual():
 
 
 @FORWARD_MODE
-def test_vmap_and_jvp():
+def test_vmap_equals_a_loop_and_jvp_equals_the_gradient():
     r, t = sample(5, 6, 9), sample(6, 6, 9)
     torch.testing.assert_close(torch.func.vmap(entropy_like)(r), entropy_like(r, 1), rtol=1e-14, atol=0)
     w = sample(7, 6, 9).abs()
@@ -176,7 +179,7 @@ def test_masked_residuals_have_no_influence():
     assert float(entropy_like(bad.detach(), weight=torch.arange(9) == 3)) == 0.0
 
 
-def test_weights_that_total_one_are_refused():
+def test_weights_that_sum_to_one_are_refused():
     with pytest.raises(ValueError, match="multiply the weights"):
         entropy_like(sample(0, 4), weight=torch.full((4,), 0.25))
 
@@ -194,7 +197,7 @@ def test_unmasked_residuals_that_are_not_finite_are_refused():
 # the loss
 
 
-def test_the_loss_of_channels_in_their_own_units():
+def test_the_loss_does_not_depend_on_the_units_of_channels():
     x, y = sample(10, 40, 3), sample(11, 40, 3)
     each = LELoss(dim=0, reduction="none")(x, y)
     torch.testing.assert_close(each, entropy_like(x - y, 0), rtol=1e-14, atol=0)
@@ -318,7 +321,7 @@ def decay(t: Tensor, x: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_curve_with_outliers_and_the_minimum_of_scipy(dtype):
+def test_a_curve_fitted_to_outliers_is_at_the_minimum_of_scipy(dtype):
     x = torch.linspace(0, 4, 120, dtype=dtype)
     truth = torch.tensor([3.0, 1.2, 0.5], dtype=dtype)
     y = decay(truth, x) + 0.02 * sample(20, 120, dtype=dtype)
@@ -328,7 +331,7 @@ def test_a_curve_with_outliers_and_the_minimum_of_scipy(dtype):
     torch.testing.assert_close(found.best, truth, rtol=0, atol=0.1)
     xn, yn = x.double().numpy(), y.double().numpy()
     best = minimize(
-        lambda t: by_definition(yn - t[0] * np.exp(-t[1] * xn) - t[2]),
+        lambda t: entropy_by_definition(yn - t[0] * np.exp(-t[1] * xn) - t[2]),
         found.best.double().numpy(),
         method="Nelder-Mead",
         options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 2000},
@@ -340,7 +343,7 @@ def test_a_curve_with_outliers_and_the_minimum_of_scipy(dtype):
 
 
 @pytest.mark.e2e
-def test_a_torch_model_by_its_parameters():
+def test_a_network_is_fitted_as_a_function_of_its_parameters():
     torch.manual_seed(0)
     model = nn.Sequential(nn.Linear(1, 3), nn.Tanh(), nn.Linear(3, 1)).double()
     x = torch.linspace(-2, 2, 150, dtype=torch.float64).unsqueeze(1)
@@ -380,7 +383,7 @@ def test_an_exact_fit_has_entropy_zero():
     assert bool(found.converged)
 
 
-def test_weights_apply_to_any_residual():
+def test_weight_zero_equals_removal_for_any_residual():
     X, y = hbk()
     mask = torch.arange(75) >= 14
     found = least_entropy_like(lambda t: y - X @ t, torch.linalg.lstsq(X, y).solution, weight=mask)

@@ -40,7 +40,7 @@ def reduced(t, reduction):
 
 @each_sigma
 @each_shape
-def test_the_loss_is_the_mkc_energy_of_the_deviance_residual(sigma, shape):
+def test_the_loss_equals_the_mkc_energy_of_the_deviance_residual(sigma, shape):
     logits, labels, _ = data(*shape)
     deviance = cross_entropy(logits, labels, reduction="none")
     residual = torch.sqrt(2.0 * deviance)
@@ -52,7 +52,7 @@ def test_the_loss_is_the_mkc_energy_of_the_deviance_residual(sigma, shape):
 
 @each_sigma
 @each_reduction
-def test_the_loss_is_generalized_cross_entropy_with_q_the_inverse_square_of_sigma(sigma, reduction):
+def test_the_loss_equals_generalized_cross_entropy_with_q_the_inverse_square_of_sigma(sigma, reduction):
     logits, labels, _ = data(7, 4)
     q = sigma**-2
     probability = logits.softmax(1).gather(1, labels.unsqueeze(1)).squeeze(1)
@@ -67,7 +67,7 @@ def test_the_loss_is_generalized_cross_entropy_with_q_the_inverse_square_of_sigm
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_infinite_sigma_is_cross_entropy_in_value_and_gradient(reduction, shape, soft, weighted, dtype):
+def test_infinite_sigma_equals_cross_entropy_in_value_and_gradient(reduction, shape, soft, weighted, dtype):
     logits, labels, probabilities = data(*shape, dtype=dtype)
     target = probabilities if soft else labels
     weight = torch.tensor([0.5, 0.0, 2.0, 1.0], dtype=dtype) if weighted else None
@@ -81,7 +81,7 @@ def test_infinite_sigma_is_cross_entropy_in_value_and_gradient(reduction, shape,
     torch.testing.assert_close(gradient(found, logits), gradient(expected, logits))
 
 
-def test_sigma_one_is_half_the_absolute_error_of_the_probabilities():
+def test_sigma_one_equals_half_the_absolute_error_of_the_probabilities():
     logits, labels, _ = data(6, 4)
     expected = 0.5 * (one_hot(labels, 4) - logits.softmax(1)).abs().sum(1).mean()
     torch.testing.assert_close(generalized_cross_entropy(logits, labels, sigma=1.0), expected)
@@ -134,12 +134,12 @@ def test_single_precision_equals_double_for_any_size_of_logits(sigma, size, righ
 @pytest.mark.parametrize("size", [0.0, 3.0, 1e4])
 def test_the_gradient_is_bounded_and_fades_with_the_probability(sigma, size):
     logits = torch.tensor([[size, 0.0, -size]], requires_grad=True)
-    pull = [
+    norms = [
         float(gradient(generalized_cross_entropy(logits, torch.tensor([c]), sigma=sigma), logits).norm())
         for c in range(3)
     ]
-    assert max(pull) <= math.sqrt(2.0)
-    assert size < 1e4 or sigma == 100.0 or max(pull) < 1e-12
+    assert max(norms) <= math.sqrt(2.0)
+    assert size < 1e4 or sigma == 100.0 or max(norms) < 1e-12
 
 
 @pytest.mark.parametrize("sigma", [1.2, INF])
@@ -293,7 +293,7 @@ def clusters(classes, seed):
     return centres[labels] + 0.7 * torch.randn(len(labels), 16, generator=generator), labels
 
 
-def error(loss, share, *, graduated=False, classes=20, epochs=40, seed=0):
+def training_error(loss, share, *, graduated=False, classes=20, epochs=40, seed=0):
     """Error on right labels of a network trained with wrong labels; and the weights of its labels."""
     x, y = clusters(classes, seed)
     count = len(y) // 2
@@ -319,9 +319,9 @@ def error(loss, share, *, graduated=False, classes=20, epochs=40, seed=0):
 
 @pytest.mark.e2e
 def test_with_two_in_five_labels_wrong_the_error_is_a_fraction_of_that_of_cross_entropy():
-    reference, *_ = error(nn.CrossEntropyLoss(), 0.4)
-    fixed, *_ = error(GeneralizedCrossEntropyLoss(), 0.4)
-    graduated, low, wrong = error(GeneralizedCrossEntropyLoss(), 0.4, graduated=True)
+    reference, *_ = training_error(nn.CrossEntropyLoss(), 0.4)
+    fixed, *_ = training_error(GeneralizedCrossEntropyLoss(), 0.4)
+    graduated, low, wrong = training_error(GeneralizedCrossEntropyLoss(), 0.4, graduated=True)
     assert reference > 0.3
     assert fixed < 0.4 * reference
     assert graduated < 0.3 * reference
@@ -332,9 +332,9 @@ def test_with_two_in_five_labels_wrong_the_error_is_a_fraction_of_that_of_cross_
 
 @pytest.mark.e2e
 def test_right_labels_are_learned_as_well_as_with_cross_entropy():
-    reference, *_ = error(nn.CrossEntropyLoss(), 0.0)
-    assert error(GeneralizedCrossEntropyLoss(), 0.0)[0] < reference + 0.01
-    assert error(GeneralizedCrossEntropyLoss(), 0.0, graduated=True)[0] < reference + 0.01
+    reference, *_ = training_error(nn.CrossEntropyLoss(), 0.0)
+    assert training_error(GeneralizedCrossEntropyLoss(), 0.0)[0] < reference + 0.01
+    assert training_error(GeneralizedCrossEntropyLoss(), 0.0, graduated=True)[0] < reference + 0.01
 
 
 # --- bad arguments
@@ -391,7 +391,7 @@ def test_another_reduction_is_refused():
         GeneralizedCrossEntropyLoss(reduction="avg")
 
 
-def refused(logits, target, message, kind=ValueError, **options):
+def assert_refused(logits, target, message, kind=ValueError, **options):
     loss = GeneralizedCrossEntropyLoss(**options)
     with pytest.raises(kind, match=message):
         loss(logits, target)
@@ -404,19 +404,23 @@ def refused(logits, target, message, kind=ValueError, **options):
 
 @pytest.mark.parametrize("shape", [(4,), (5, 1), (5, 4), (1, 5), ()])
 def test_labels_of_another_shape_are_refused_with_the_class_dimension(shape):
-    refused(torch.zeros(5, 4), torch.zeros(shape, dtype=torch.int64), r"labels `target` of shape \(5,\) for `input`")
+    assert_refused(
+        torch.zeros(5, 4), torch.zeros(shape, dtype=torch.int64), r"labels `target` of shape \(5,\) for `input`"
+    )
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 3), (4, 5), (5, 1)])
 def test_probabilities_of_another_shape_are_refused_with_a_hint_for_labels(shape):
-    refused(torch.zeros(5, 4), torch.ones(shape), r"`target` of the shape of `input`, \(5, 4\).*target.long\(\)")
+    assert_refused(torch.zeros(5, 4), torch.ones(shape), r"`target` of the shape of `input`, \(5, 4\).*target.long\(\)")
 
 
 @pytest.mark.parametrize("label", [4, -1, 255])
 def test_a_label_out_of_range_is_refused_with_its_index(label):
     target = torch.zeros(2, 3, dtype=torch.int64)
     target[1, 2] = label
-    refused(torch.zeros(2, 4, 3), target, rf"`target` in \[0, 4\).* but got {label} at index \(1, 2\) and 0 more")
+    assert_refused(
+        torch.zeros(2, 4, 3), target, rf"`target` in \[0, 4\).* but got {label} at index \(1, 2\) and 0 more"
+    )
 
 
 @pytest.mark.parametrize("value", [NAN, INF])
@@ -424,41 +428,45 @@ def test_a_label_out_of_range_is_refused_with_its_index(label):
 def test_a_nan_or_infinite_logit_is_refused_with_its_index(value, soft):
     logits, labels, probabilities = data(5, 4)
     logits[3, 1] = value
-    refused(logits, probabilities if soft else labels, rf"`input` without NaN.* but got {value} at index \(3, 1\)")
+    assert_refused(
+        logits, probabilities if soft else labels, rf"`input` without NaN.* but got {value} at index \(3, 1\)"
+    )
 
 
 def test_a_sample_without_any_possible_class_is_refused():
     logits, labels, _ = data(5, 4)
     logits[2] = -INF
-    refused(logits, labels, r"or only -inf but got -inf at index \(2, 0\)")
+    assert_refused(logits, labels, r"or only -inf but got -inf at index \(2, 0\)")
 
 
 @pytest.mark.parametrize("row", [[0.5, 0.6, 0.0, 0.0], [1.5, -0.5, 0.0, 0.0], [NAN, 1.0, 0.0, 0.0], [0.0] * 4])
 def test_targets_that_are_not_probabilities_are_refused_with_their_index(row):
     target = torch.full((5, 4), 0.25)
     target[3] = torch.tensor(row)
-    refused(torch.zeros(5, 4), target, r"`target` to be non-negative with the sum 1 .* at index \(3,\); divide")
+    assert_refused(torch.zeros(5, 4), target, r"`target` to be non-negative with the sum 1 .* at index \(3,\); divide")
 
 
 @pytest.mark.parametrize("shape", [(0, 4), (5, 0), (2, 4, 0), ()])
 def test_an_empty_batch_is_refused(shape):
     target = torch.zeros(shape[:1] + shape[2:], dtype=torch.int64)
-    refused(torch.zeros(shape), target, r"`input` of shape \(N, C, \*\) or \(C,\) with elements .*skip empty batches")
+    assert_refused(
+        torch.zeros(shape), target, r"`input` of shape \(N, C, \*\) or \(C,\) with elements .*skip empty batches"
+    )
 
 
 def test_weights_of_another_number_of_classes_are_refused():
     logits, labels, _ = data(5, 4)
-    refused(logits, labels, r"`weight` of the 4 classes of `input` but got shape \(3,\)", weight=torch.ones(3))
+    assert_refused(logits, labels, r"`weight` of the 4 classes of `input` but got shape \(3,\)", weight=torch.ones(3))
 
 
 def test_arguments_of_another_type_are_refused():
     logits, labels, _ = data(5, 4)
-    refused(logits.long(), labels, "`input` to be floating-point logits but got torch.int64", TypeError)
-    refused(logits, labels.bool(), "`target` to be integer labels or .* but got torch.bool", TypeError)
-    refused(
+    assert_refused(logits.long(), labels, "`input` to be floating-point logits but got torch.int64", TypeError)
+    assert_refused(logits, labels.bool(), "`target` to be integer labels or .* but got torch.bool", TypeError)
+    assert_refused(
         logits, labels.tolist(), r"`target` to be a tensor of .* but got list; .*torch\.as_tensor\(target\)", TypeError
     )
-    refused(
+    assert_refused(
         logits.tolist(),
         labels,
         r"`input` to be floating-point logits but got list; .*torch\.as_tensor\(input\)",

@@ -12,9 +12,9 @@ from mkc_torch.losses._terms import loss_value
 
 FIXED = {"learn_sigma": False, "learn_d": False}
 MODES = {
-    "as it comes": {},
+    "default": {},
     "given d, robust": {"d": 50.0, "objective": "robust"},
-    "likelihood, d follows": {"objective": "likelihood"},
+    "likelihood, auto d": {"objective": "likelihood"},
     "learned": {"d": 50.0},
     "fixed": {"d": 50.0, **FIXED},
 }
@@ -31,7 +31,7 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def halves(count, channels, size, dtype=torch.float16):
+def half_precision_batch(count, channels, size, dtype=torch.float16):
     """Predictions and targets in half precision, whose residuals have that size."""
     g = generator()
     x = torch.randn(count, channels, generator=g).mul_(size).to(dtype)
@@ -39,7 +39,7 @@ def halves(count, channels, size, dtype=torch.float16):
     return x, y
 
 
-def exact(loss, x, y, rows):
+def exact_gradient(loss, x, y, rows):
     """The gradient by some rows in float64, the mean being over all rows, at the state of the loss."""
     own = copy.deepcopy(loss).double()
     own.reduction = "sum"
@@ -61,7 +61,7 @@ def assert_rounded(found, expected):
 def test_a_mean_over_a_million_elements_has_the_gradients_of_float32_rounded_once(options, channel_dim):
     """1 / (N d) is 1e-8, below the smallest number of float16, until the scaler's factor is in."""
     loss = MKCLoss(2, channel_dim=channel_dim, **options)
-    x, y = halves(500_000, 2, 50.0)
+    x, y = half_precision_batch(500_000, 2, 50.0)
     if channel_dim == 1:
         x, y = (values.view(50, 2, 10_000) for values in (x, y))
     assert torch.tensor(1.0 / (x.numel() * 50.0)).half() == 0.0
@@ -70,26 +70,26 @@ def test_a_mean_over_a_million_elements_has_the_gradients_of_float32_rounded_onc
     assert value.dtype == torch.float32
     (found,) = torch.autograd.grad(UPSTREAM * value, leaf)
     assert found.dtype == torch.float16
-    expected = UPSTREAM / x.numel() * exact(loss, x.detach(), y, slice(0, 10_000 if channel_dim == -1 else 1))
+    expected = UPSTREAM / x.numel() * exact_gradient(loss, x.detach(), y, slice(0, 10_000 if channel_dim == -1 else 1))
     assert_rounded(found[: len(expected)], expected)
     assert bool((found != 0).float().mean() > 0.9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"d": 1.0}], ids=["as it comes", "learned"])
+@pytest.mark.parametrize("options", [{}, {"d": 1.0}], ids=["default", "learned"])
 def test_a_mean_over_a_hundred_million_elements_has_the_gradients_of_float32_rounded_once(options):
     loss = MKCLoss(4, **options)
-    x, y = halves(25_000_000, 4, 1.0)
+    x, y = half_precision_batch(25_000_000, 4, 1.0)
     leaf = x.requires_grad_()
     (found,) = torch.autograd.grad(UPSTREAM * loss(leaf, y), leaf)
     for rows in (slice(0, 10_000), slice(24_990_000, None)):
-        assert_rounded(found[rows], UPSTREAM / x.numel() * exact(loss, x.detach(), y, rows))
+        assert_rounded(found[rows], UPSTREAM / x.numel() * exact_gradient(loss, x.detach(), y, rows))
 
 
 @each_mode
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
-def test_half_precision_is_computed_in_single(options, dtype, reduction):
+def test_half_precision_is_computed_in_float32(options, dtype, reduction):
     losses = [MKCLoss(2, reduction=reduction, **options) for _ in range(2)]
     for seed in range(3):
         x, y = (values.to(dtype) for values in torch.randn(2, 40, 2, generator=generator(seed)))

@@ -15,7 +15,7 @@ each_reduction = pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
 SIGMA, D, BOUND = [0.7, 3.0, 20.0], [0.5, 1.0, 2.0], [9.0, 40.0, 1e3]
 
 
-def values(*shape, low, high, seed=0, dtype=torch.float64):
+def uniform_values(*shape, low, high, seed=0, dtype=torch.float64):
     generator = torch.Generator().manual_seed(seed)
     return (low + (high - low) * torch.rand(*shape, dtype=torch.float64, generator=generator)).to(dtype)
 
@@ -23,7 +23,7 @@ def values(*shape, low, high, seed=0, dtype=torch.float64):
 def data(*shape, dtype=torch.float64):
     """Input, target, sigma and d of the same shape."""
     ranges = ((-6, 6), (-6, 6), (0.3, 5), (0.2, 2))
-    return [values(*shape, low=a, high=b, seed=i, dtype=dtype) for i, (a, b) in enumerate(ranges)]
+    return [uniform_values(*shape, low=a, high=b, seed=i, dtype=dtype) for i, (a, b) in enumerate(ranges)]
 
 
 def gradients(value, *leaves):
@@ -49,7 +49,7 @@ def test_constant_sigma_and_d_equal_the_mkc_loss(shape, channel_dim, reduction, 
     thin = [3 if i == channel_dim % len(shape) else 1 for i in range(len(shape))]
     wide = shape if full else thin
     s, e = (v.reshape(thin).expand(wide) for v in (reference.sigma, reference.d))
-    weight = values(*shape, low=-0.5, high=1).clamp(min=0)
+    weight = uniform_values(*shape, low=-0.5, high=1).clamp(min=0)
     for w in (None, weight, weight > 0.3, weight.select(channel_dim, 0)):
         found, expected = loss(x, y, s, e, w), reference(x, y, w)
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
@@ -69,13 +69,13 @@ def test_each_element_has_its_own_density(reduction):
 @pytest.mark.parametrize("d_shape", [(5, 3, 4), (5, 1, 1), (1, 1, 1)])
 def test_dimensions_of_size_one_are_shared(sigma_shape, d_shape):
     x, y, *_ = data(5, 3, 4)
-    sigma, d = values(*sigma_shape, low=0.3, high=5), values(*d_shape, low=0.2, high=2)
+    sigma, d = uniform_values(*sigma_shape, low=0.3, high=5), uniform_values(*d_shape, low=0.2, high=2)
     loss = HeteroscedasticMKCLoss(torch.tensor([9.0, 40.0, 90.0]), channel_dim=1)
     whole = loss(x, y, sigma.expand(5, 3, 4), d.expand(5, 3, 4))
     torch.testing.assert_close(loss(x, y, sigma, d), whole, rtol=1e-13, atol=0)
 
 
-def test_infinite_sigma_is_the_gaussian_nll_of_each_element():
+def test_infinite_sigma_equals_the_gaussian_nll_of_each_element():
     x, y, _, d = data(6, 3)
     loss = HeteroscedasticMKCLoss(1e3)
     d.requires_grad_()
@@ -112,16 +112,16 @@ def test_masked_elements_affect_neither_value_nor_gradient(reduction, poison, wh
     mask[1, 2] = mask[4, 0] = False
     weight = mask if kind == "mask" else mask.double()
 
-    def all_of(tensors):
+    def value_and_gradients(tensors):
         leaves = [t.clone().requires_grad_() for t in tensors]
         value = loss(*leaves, weight)
         return [value.detach(), *gradients(value, *leaves)]
 
     tensors = data(5, 3)
-    expected = all_of(tensors)
+    expected = value_and_gradients(tensors)
     for i in where:
         tensors[i][~mask] = poison
-    found = all_of(tensors)
+    found = value_and_gradients(tensors)
     assert all(map(torch.equal, found, expected))
     assert all(t.isfinite().all() for t in found)
     assert all((t[~mask] == 0).all() for t in found[1:])
@@ -202,7 +202,7 @@ def test_traced_loss_equals_eager_over_two_batch_sizes():
     compiled = torch.compile(loss, fullgraph=True, dynamic=True, backend="aot_eager")
     for count in (5, 8):
         leaves = [t.requires_grad_() for t in data(count, 3)]
-        weight = values(count, 3, low=-0.5, high=1).clamp(min=0)
+        weight = uniform_values(count, 3, low=-0.5, high=1).clamp(min=0)
         torch.testing.assert_close(compiled(*leaves, weight), loss(*leaves, weight), rtol=1e-10, atol=1e-12)
         found = torch.autograd.grad(compiled(*leaves, weight), leaves)
         torch.testing.assert_close(found, gradients(loss(*leaves, weight), *leaves), rtol=1e-9, atol=1e-12)

@@ -15,13 +15,13 @@ from mkc_torch.losses._bandwidth_selection import BandwidthSelection
 
 FIXED = {"learn_sigma": False, "learn_d": False}
 MODES = {
-    "as it comes": {},
+    "default": {},
     "given d, robust": {"d": 1.0, "objective": "robust"},
-    "likelihood, d follows": {"objective": "likelihood"},
+    "likelihood, auto d": {"objective": "likelihood"},
     "learned": {"d": 1.0},
     "fixed": {"d": 1.0, **FIXED},
     "fixed, normalised": {"d": 1.0, "normalize": True, **FIXED},
-    "follows, nothing learned": FIXED,
+    "auto d, nothing learned": FIXED,
 }
 each_mode = pytest.mark.parametrize("options", MODES.values(), ids=MODES)
 compiler = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
@@ -37,14 +37,14 @@ def batch(step, *shape):
     return x, y
 
 
-def made(options, warmup_steps=20):
+def make_loss(options, warmup_steps=20):
     loss = MKCLoss(2, **options).double()
     if loss.schedule is not None:
         loss.schedule.warmup_steps = warmup_steps
     return loss
 
 
-def stepped(loss, call, x, y, *weight):
+def value_and_gradients(loss, call, x, y, *weight):
     """Value and gradients of one batch."""
     x = x.clone().requires_grad_()
     value = call(x, y, *weight)
@@ -57,9 +57,9 @@ def assert_same_steps(reference, other, call, steps, *, rtol, shape=(64, 2), pre
     for step in range(steps):
         x, y = batch(step, *shape)
         prepare(0)
-        expected = stepped(reference, reference, x, y)
+        expected = value_and_gradients(reference, reference, x, y)
         prepare(1)
-        found = stepped(other, call, x, y)
+        found = value_and_gradients(other, call, x, y)
         for a, b in zip(found, expected, strict=True):
             torch.testing.assert_close(a, b, rtol=rtol, atol=rtol * float(b.abs().max()))
         for name, value in reference.state_dict().items():
@@ -78,26 +78,26 @@ def assert_same_steps(reference, other, call, steps, *, rtol, shape=(64, 2), pre
 # --- the compiler
 
 
-def compiled(options, backend):
-    """A loss, its copy, and the copy compiled."""
+def loss_and_compiled_copy(options, backend):
+    """A loss, an equal copy, and the compiled copy."""
     torch.compiler.reset()
-    loss = made(options)
+    loss = make_loss(options)
     own = copy.deepcopy(loss)
     return loss, own, torch.compile(own, fullgraph=True, backend=backend)
 
 
 @pytest.mark.e2e
 @compiler
-def test_a_traced_loss_is_the_same_algorithm_over_300_batches():
-    """The graph that the compiler takes, computed as it is."""
-    assert_same_steps(*compiled({}, "aot_eager"), 300, rtol=1e-10)
+def test_a_traced_loss_equals_eager_over_300_batches():
+    """The graph that the compiler receives, executed without compilation."""
+    assert_same_steps(*loss_and_compiled_copy({}, "aot_eager"), 300, rtol=1e-10)
 
 
 @compiler
 @pytest.mark.slow
 @each_mode
-def test_a_compiled_loss_is_the_same_algorithm_over_300_batches(options):
-    loss, own, call = compiled(options, "inductor")
+def test_a_compiled_loss_equals_eager_over_300_batches(options):
+    loss, own, call = loss_and_compiled_copy(options, "inductor")
     assert_same_steps(loss, own, call, 300, rtol=1e-10)
     # eight forward passes, each of which changes the state, before a backward pass
     batches = [batch(step, 64, 2) for step in range(8)]
@@ -122,7 +122,7 @@ def test_a_compiled_backward_pass_uses_the_state_of_its_forward_pass(monkeypatch
 
     monkeypatch.setattr(bandwidth_schedule, "select_bandwidth", selected)
     monkeypatch.setattr(residual_scale.ResidualScale, "update", lambda *_: None)
-    loss, own, call = compiled({"d": 1.0, "objective": "robust", **FIXED}, "inductor")
+    loss, own, call = loss_and_compiled_copy({"d": 1.0, "objective": "robust", **FIXED}, "inductor")
     for value in (loss, own):
         value.schedule.warmup_steps = 0
         value.residual_scale.recent.fill_(1.0)
@@ -136,14 +136,17 @@ def test_a_compiled_backward_pass_uses_the_state_of_its_forward_pass(monkeypatch
 @pytest.mark.parametrize("weighted", [False, True])
 def test_a_compiled_loss_takes_weights_and_batches_of_any_size(options, weighted):
     torch.compiler.reset()
-    loss = made(options, warmup_steps=0)
+    loss = make_loss(options, warmup_steps=0)
     own = copy.deepcopy(loss)
     compiled = torch.compile(own, fullgraph=True)
     for step, rows in enumerate([64, 64, 40, 700, 3, 1, 20_000, 64]):
         x, y = batch(step, rows, *((2, 5) if options.get("channel_dim") else (2,)))
         weight = [torch.rand(x.shape, generator=torch.Generator().manual_seed(step)).double()] if weighted else []
         torch.testing.assert_close(
-            stepped(own, compiled, x, y, *weight), stepped(loss, loss, x, y, *weight), rtol=1e-9, atol=1e-11
+            value_and_gradients(own, compiled, x, y, *weight),
+            value_and_gradients(loss, loss, x, y, *weight),
+            rtol=1e-9,
+            atol=1e-11,
         )
     torch.testing.assert_close(own.state_dict(), loss.state_dict(), rtol=1e-10, atol=1e-10)
 
@@ -155,7 +158,7 @@ def test_impl_compile_equals_impl_eager(monkeypatch):
     compiled = torch.compile(mkc.MKCLoss._computed, backend="aot_eager")
     calls = []
     monkeypatch.setattr(mkc, "_compiled", lambda: lambda *args: calls.append(1) or compiled(*args))
-    reference, other = made({"impl": "eager"}, 0), made({"impl": "compile"}, 0)
+    reference, other = make_loss({"impl": "eager"}, 0), make_loss({"impl": "compile"}, 0)
     assert_same_steps(reference, other, other, 12, rtol=1e-10)
     assert len(calls) == 12
 
@@ -170,18 +173,18 @@ def test_an_unknown_implementation_is_refused():
 
 @pytest.mark.e2e
 @each_mode
-def test_torch_is_the_same_algorithm_as_numpy_over_300_batches(options, monkeypatch):
+def test_torch_equals_numpy_over_300_batches(options, monkeypatch):
     def choose(which):
         for module in (residual_scale, bandwidth_schedule, _fused):
             monkeypatch.setattr(module, "SMALL_STATE", 0 if which else 64)
 
-    loss = made(options)
+    loss = make_loss(options)
     other = copy.deepcopy(loss)
     assert_same_steps(loss, other, other, 300, rtol=1e-10, prepare=choose)
 
 
-def test_single_precision_is_the_same_algorithm_in_numpy_and_torch(monkeypatch):
-    loss = made({}).float()
+def test_torch_equals_numpy_in_single_precision(monkeypatch):
+    loss = make_loss({}).float()
     other = copy.deepcopy(loss)
     for step in range(120):
         x, y = (values.float() for values in batch(step, 64, 2))
@@ -189,7 +192,7 @@ def test_single_precision_is_the_same_algorithm_in_numpy_and_torch(monkeypatch):
         for which, own in enumerate((loss, other)):
             for module in (residual_scale, bandwidth_schedule, _fused):
                 monkeypatch.setattr(module, "SMALL_STATE", 0 if which else 64)
-            found.append(stepped(own, own, x, y))
+            found.append(value_and_gradients(own, own, x, y))
         torch.testing.assert_close(*found, rtol=1e-4, atol=1e-6)
         assert torch.equal(loss.schedule.share, other.schedule.share)
         torch.testing.assert_close(loss.residual_scale.scale, other.residual_scale.scale, rtol=1e-5, atol=0.0)
@@ -218,13 +221,13 @@ class OneDevice(TorchDispatchMode):
 class NoHostCopy(TorchFunctionMode):
     """Fails if a tensor is made of Python's or NumPy's numbers, or read into them: a hidden copy of torch."""
 
-    made = (torch.tensor, torch.as_tensor, torch.asarray, torch.from_numpy, torch.Tensor.new_tensor)
-    read = (torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu, torch.Tensor.__bool__)
+    made_from_numbers = (torch.tensor, torch.as_tensor, torch.asarray, torch.from_numpy, torch.Tensor.new_tensor)
+    reads = (torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu, torch.Tensor.__bool__)
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        assert func not in self.read, f"{func} reads a value"
+        assert func not in self.reads, f"{func} reads a value"
         source = args[0] if func is not torch.Tensor.new_tensor else args[1]
-        assert func not in self.made or isinstance(source, torch.Tensor), f"{func} copies from the host"
+        assert func not in self.made_from_numbers or isinstance(source, torch.Tensor), f"{func} copies from the host"
         return func(*args, **(kwargs or {}))
 
 

@@ -19,7 +19,7 @@ from mkc_torch import MKCLoss
 from mkc_torch.losses.residual_scale import MOST_RECENT, ResidualScale
 
 FIXED = {"learn_sigma": False, "learn_d": False}
-ROBUST = {"as it comes": {}, "given d": {"d": 1.5, "objective": "robust"}}
+ROBUST = {"default": {}, "given d": {"d": 1.5, "objective": "robust"}}
 each_robust = pytest.mark.parametrize("options", ROBUST.values(), ids=ROBUST)
 
 
@@ -40,7 +40,7 @@ def assert_same(left, other):
     torch.testing.assert_close(left, other, rtol=0.0, atol=0.0)
 
 
-def after(*sizes, **options):
+def loss_after(*sizes, **options):
     """A loss after batches."""
     loss = MKCLoss(2, **options)
     for n, size in enumerate(sizes):
@@ -63,7 +63,7 @@ def test_the_state_dict_is_small():
 
 
 def test_half_precision_keeps_the_state_in_float32_and_its_counters_integer():
-    loss = after(1.0, 2.0)
+    loss = loss_after(1.0, 2.0)
     before = state(loss)
     for half in (loss.half(), loss.bfloat16(), loss.float()):
         assert_same(state(half), before)
@@ -81,13 +81,13 @@ def test_scale_bound_and_gradient_have_the_unit_of_the_target(exponent, seed):
     for unit in (1.0, scale):
         loss, leaf = MKCLoss(1).double(), (unit * x).requires_grad_()
         value = loss(leaf, unit * y)
-        (pull,) = torch.autograd.grad(value, leaf)
-        found.append((value - math.log(unit), loss.d / unit, loss.bound / unit, loss.d_min / unit, pull * unit))
+        (gradient,) = torch.autograd.grad(value, leaf)
+        found.append((value - math.log(unit), loss.d / unit, loss.bound / unit, loss.d_min / unit, gradient * unit))
     for entry, other in zip(*found, strict=True):
         torch.testing.assert_close(entry, other, rtol=1e-6, atol=1e-9)
 
 
-def test_given_numbers_are_kept():
+def test_a_given_bound_and_lower_limit_of_d_are_kept():
     loss = MKCLoss(1, bound=50.0, d_min=0.25)
     for size in (1e-3, 1e4):
         loss(size * torch.randn(50, 1, generator=generator()), torch.zeros(50, 1))
@@ -101,7 +101,7 @@ def test_given_numbers_are_kept():
 
 
 def test_d_follows_the_residuals_and_learns_a_factor_on_them():
-    loss = after(1.0, 1.0)
+    loss = loss_after(1.0, 1.0)
     torch.testing.assert_close(loss.d.detach(), loss.residual_scale.scale)
     with torch.no_grad():
         loss.raw_d.fill_(2.0 * math.atanh(0.5 * math.log(1.5)))
@@ -168,7 +168,7 @@ def test_training_without_a_gradient_is_a_batch():
 
 
 def test_a_fully_masked_batch_changes_no_scale():
-    loss = after(1.0, 3.0)
+    loss = loss_after(1.0, 3.0)
     before = loss.d.detach(), loss.bound, loss.d_min, loss.residual_scale.batches.clone()
     assert loss(*data(50), torch.zeros(50, 2)).item() == 0.0
     for value, other in zip(
@@ -201,7 +201,7 @@ def test_activation_checkpointing_counts_a_batch_once(options, use_reentrant):
 
 @each_robust
 def test_function_transforms_do_not_change_the_state(options):
-    loss = after(1.0, 3.0, **options)
+    loss = loss_after(1.0, 3.0, **options)
     x, y = data(20, seed=9)
     before = state(loss)
     slopes = vmap(grad(lambda a, b: loss(a, b)))(x, y)
@@ -238,7 +238,7 @@ def test_a_fresh_loss_under_a_transform_takes_its_scale_from_the_data(unit, opti
 
 @each_robust
 def test_a_functional_call_uses_and_updates_the_given_state(options):
-    loss, other = after(1.0, 3.0, **options), MKCLoss(2, **options)
+    loss, other = loss_after(1.0, 3.0, **options), MKCLoss(2, **options)
     given = state(loss)
     untouched = state(other)
     x, y = data(20, seed=9)
@@ -251,7 +251,7 @@ def test_a_functional_call_uses_and_updates_the_given_state(options):
 @each_robust
 @pytest.mark.parametrize("fresh", [False, True])
 def test_an_ensemble_under_vmap_equals_a_loop(options, fresh):
-    losses = [MKCLoss(2, **options) if fresh else after(size, 2.0 * size, **options) for size in (0.5, 1.0, 30.0)]
+    losses = [MKCLoss(2, **options) if fresh else loss_after(size, 2.0 * size, **options) for size in (0.5, 1.0, 30.0)]
     parameters, buffers = stack_module_state(losses)
     kept = copy.deepcopy(buffers)
     x, y = torch.randn(2, 3, 20, 2, generator=generator(7))
@@ -276,7 +276,7 @@ def test_an_ensemble_under_vmap_equals_a_loop(options, fresh):
 # --- saved and loaded
 
 
-def saved(*parts):
+def saved_and_loaded(*parts):
     buffer = io.BytesIO()
     torch.save([part.state_dict() for part in parts], buffer)
     buffer.seek(0)
@@ -305,7 +305,7 @@ def test_resumed_training_is_bitwise_equal(options, at):
         optimiser = torch.optim.Adam([*model.parameters(), *loss.parameters()], lr=0.01)
         trained(model, loss, optimiser, range(at), found)
         if resumed:
-            parts = saved(model, loss, optimiser)
+            parts = saved_and_loaded(model, loss, optimiser)
             torch.manual_seed(1)
             model, loss = nn.Linear(3, 2), MKCLoss(2, **options)
             optimiser = torch.optim.Adam([*model.parameters(), *loss.parameters()], lr=0.01)
@@ -321,8 +321,8 @@ def test_resumed_training_is_bitwise_equal(options, at):
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_sigma": False}, {"learn_d": False}], ids=str)
 @pytest.mark.parametrize("kind", [*ROBUST.values(), {"objective": "likelihood"}], ids=[*ROBUST, "likelihood"])
 def test_a_state_dict_restores_everything_in_an_equal_loss(options, kind):
-    loss, other = after(1.0, 7.0, 3.0, **options, **kind), MKCLoss(2, **options, **kind)
-    (stored,) = saved(loss)
+    loss, other = loss_after(1.0, 7.0, 3.0, **options, **kind), MKCLoss(2, **options, **kind)
+    (stored,) = saved_and_loaded(loss)
     other.load_state_dict(stored)
     assert_same(state(other), state(loss))
     assert repr(other) == repr(loss)
@@ -338,7 +338,7 @@ def test_a_state_dict_restores_everything_in_an_equal_loss(options, kind):
     ids=str,
 )
 def test_a_loss_with_auto_d_loads_into_a_loss_with_given_d(options, kind, objective):
-    loss = after(1.0, 7.0, **kind)
+    loss = loss_after(1.0, 7.0, **kind)
     other = MKCLoss(2, sigma=1.0, d=1.0, bound=9.0, objective=objective, **options)
     other.load_state_dict(state(loss))
     for name in ("sigma", "d", "bound", "d_min"):
@@ -350,10 +350,10 @@ def test_a_loss_with_auto_d_loads_into_a_loss_with_given_d(options, kind, object
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=str)
 @pytest.mark.parametrize("kind", [{}, {"objective": "likelihood"}], ids=str)
 def test_a_frozen_loss_loads_into_a_loss_with_auto_d_and_freezes_it(options, kind):
-    loss = after(1.0, 7.0, **options, **kind)
+    loss = loss_after(1.0, 7.0, **options, **kind)
     loss.freeze_scale()
     other = MKCLoss(2, **options, **kind)
-    other.load_state_dict(saved(loss)[0])
+    other.load_state_dict(saved_and_loaded(loss)[0])
     assert other.objective == "likelihood"
     assert_same(state(other), state(loss))
     x, y = data(50)
@@ -363,7 +363,7 @@ def test_a_frozen_loss_loads_into_a_loss_with_auto_d_and_freezes_it(options, kin
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=str)
 def test_a_robust_loss_with_given_d_loads_into_a_likelihood_loss(options):
     given = {"d": torch.tensor([0.7, 1.5]), "bound": 60.0, **options}
-    loss = after(1.0, 7.0, **given, objective="robust")
+    loss = loss_after(1.0, 7.0, **given, objective="robust")
     other = MKCLoss(2, d=1.0, **options)
     other.load_state_dict(state(loss))
     for name in ("sigma", "d", "bound", "d_min"):
@@ -373,7 +373,7 @@ def test_a_robust_loss_with_given_d_loads_into_a_likelihood_loss(options):
 
 
 def test_a_copy_is_equal_and_independent():
-    loss = after(1.0, 7.0)
+    loss = loss_after(1.0, 7.0)
     twin = copy.deepcopy(loss)
     x, y = data(50, seed=9)
     assert twin(x, y).item() == loss(x, y).item()
@@ -385,8 +385,8 @@ def test_a_copy_is_equal_and_independent():
 # --- processes
 
 
-class Training(nn.Module):
-    """A network with its loss in a module, so that wrapping it averages sigma and d too."""
+class NetworkWithLoss(nn.Module):
+    """A network and its loss in a single module, so that a wrapper averages sigma and d too."""
 
     def __init__(self, loss):
         super().__init__()
@@ -396,7 +396,7 @@ class Training(nn.Module):
         return self.loss(self.net(x), y)
 
 
-def _stepped(rank, call, parameters, steps=25):
+def _train_on_rank(rank, call, parameters, steps=25):
     """Train on data of another unit in each process."""
     optimiser = torch.optim.SGD(list(parameters), lr=0.05)
     for step in range(steps):
@@ -416,16 +416,18 @@ def _process(rank, port, queue):
     found["scale"] = scale.state_dict()
     for name, options in ROBUST.items():
         torch.manual_seed(0)
-        inside = Training(MKCLoss(2, **options))
+        inside = NetworkWithLoss(MKCLoss(2, **options))
         inside.loss.schedule.warmup_steps = 8
-        _stepped(rank, DistributedDataParallel(inside), inside.parameters())
+        _train_on_rank(rank, DistributedDataParallel(inside), inside.parameters())
         found[f"{name}, inside"] = inside.loss.state_dict()
         found[f"{name}, network"] = inside.net.state_dict()
         torch.manual_seed(0)
         network, loss = nn.Linear(3, 2), MKCLoss(2, **options)
         loss.schedule.warmup_steps = 8
         wrapped = DistributedDataParallel(network)
-        _stepped(rank, lambda x, y, net=wrapped, own=loss: own(net(x), y), [*network.parameters(), *loss.parameters()])
+        _train_on_rank(
+            rank, lambda x, y, net=wrapped, own=loss: own(net(x), y), [*network.parameters(), *loss.parameters()]
+        )
         found[f"{name}, outside"] = loss.state_dict()
         found[f"{name}, network outside"] = network.state_dict()
     queue.put(

@@ -26,7 +26,7 @@ def data(*shape, dtype=torch.float64, seed=0):
     return [(3 * torch.randn(*shape, dtype=torch.float64, generator=generator)).to(dtype) for _ in range(2)]
 
 
-def made(num_channels=3, *, dtype=torch.float64, **options):
+def make_loss(num_channels=3, *, dtype=torch.float64, **options):
     """A learned loss of three different channels, in float64 from the start."""
     m = num_channels
     settings = {"sigma": SIGMA[:m], "d": D[:m], "bound": BOUND[:m], **options}
@@ -49,8 +49,8 @@ def gradients(value, *leaves):
 
 
 @each_reduction
-def test_fixed_infinite_sigma_is_weighted_squared_error(reduction):
-    loss = made(sigma=INF, reduction=reduction, **FIXED)
+def test_fixed_infinite_sigma_equals_weighted_squared_error(reduction):
+    loss = make_loss(sigma=INF, reduction=reduction, **FIXED)
     x, y = data(5, 3)
     x.requires_grad_()
     found = loss(x, y)
@@ -60,8 +60,8 @@ def test_fixed_infinite_sigma_is_weighted_squared_error(reduction):
 
 
 @each_reduction
-def test_infinite_sigma_with_learned_d_is_the_gaussian_nll_in_value_and_gradient(reduction):
-    loss = made(sigma=INF, bound=1e3, learn_sigma=False, reduction=reduction)
+def test_infinite_sigma_with_learned_d_equals_the_gaussian_nll_in_value_and_gradient(reduction):
+    loss = make_loss(sigma=INF, bound=1e3, learn_sigma=False, reduction=reduction)
     x, y = data(6, 3)
     x.requires_grad_()
     d = loss.d.detach().clone().requires_grad_()
@@ -75,7 +75,7 @@ def test_infinite_sigma_with_learned_d_is_the_gaussian_nll_in_value_and_gradient
 
 
 def test_fixed_sigma_and_d_give_the_papers_energy_over_the_channels():
-    loss = made(**FIXED)
+    loss = make_loss(**FIXED)
     assert not loss.normalize
     x, y = data(7, 3)
     kernel = torch.exp(-((x - y) ** 2) / (2 * loss.d**2 * loss.sigma**2))
@@ -86,8 +86,8 @@ def test_fixed_sigma_and_d_give_the_papers_energy_over_the_channels():
 
 @each_reduction
 @pytest.mark.parametrize("learned", [(True, True), (True, False), (False, True)])
-def test_learned_loss_is_the_nll(reduction, learned):
-    loss = made(reduction=reduction, learn_sigma=learned[0], learn_d=learned[1])
+def test_the_learned_loss_equals_the_nll(reduction, learned):
+    loss = make_loss(reduction=reduction, learn_sigma=learned[0], learn_d=learned[1])
     x, y = data(8, 3)
     x.requires_grad_()
     expected = reduced(expected_nll(loss, x - y), reduction)
@@ -99,7 +99,7 @@ def test_learned_loss_is_the_nll(reduction, learned):
 
 
 def test_normalize_adds_the_normalizer_to_a_fixed_loss_and_leaves_its_gradient():
-    plain, normalized = made(**FIXED), made(normalize=True, **FIXED)
+    plain, normalized = make_loss(**FIXED), make_loss(normalize=True, **FIXED)
     x, y = data(8, 3)
     x.requires_grad_()
     torch.testing.assert_close(normalized(x, y), plain(x, y) + plain.log_normalizer().mean())
@@ -108,7 +108,7 @@ def test_normalize_adds_the_normalizer_to_a_fixed_loss_and_leaves_its_gradient()
 
 @each_reduction
 def test_the_gradient_of_an_outlier_is_scaled_by_its_weight(reduction):
-    loss = made(reduction=reduction, **FIXED)
+    loss = make_loss(reduction=reduction, **FIXED)
     x, y = data(4, 3)
     y[2, 1] += 1e6
     x.requires_grad_()
@@ -128,7 +128,7 @@ def test_the_gradient_of_an_outlier_is_scaled_by_its_weight(reduction):
 )
 @each_reduction
 def test_channels_may_lie_in_any_dimension_of_any_rank(shape, channel_dim, reduction):
-    loss = made(channel_dim=channel_dim, reduction=reduction)
+    loss = make_loss(channel_dim=channel_dim, reduction=reduction)
     x, y = data(*shape)
     last = expected_nll(loss, (x - y).movedim(channel_dim, -1)).movedim(-1, channel_dim)
     torch.testing.assert_close(loss(x, y), reduced(last, reduction))
@@ -144,8 +144,8 @@ def test_channels_may_lie_in_any_dimension_of_any_rank(shape, channel_dim, reduc
 
 
 @each_reduction
-def test_weights_per_element_and_per_sample(reduction):
-    loss = made(channel_dim=1, reduction=reduction)
+def test_weights_per_sample_equal_weights_per_element(reduction):
+    loss = make_loss(channel_dim=1, reduction=reduction)
     x, y = data(5, 3, 4)
     values = expected_nll(loss, (x - y).movedim(1, -1)).movedim(-1, 1)
     per_sample = torch.linspace(0, 2, 20, dtype=torch.float64).reshape(5, 4)
@@ -158,8 +158,8 @@ def test_weights_per_element_and_per_sample(reduction):
 
 
 @each_reduction
-def test_weight_of_a_single_sample_of_rank_one(reduction):
-    loss = made(reduction=reduction)
+def test_the_weight_of_a_sample_of_rank_one_applies_to_all_channels(reduction):
+    loss = make_loss(reduction=reduction)
     x, y = data(3)
     values = expected_nll(loss, x - y)
     expected = {"none": 2 * values, "sum": 2 * values.sum(), "mean": values.mean()}[reduction]
@@ -167,8 +167,8 @@ def test_weight_of_a_single_sample_of_rank_one(reduction):
 
 
 @each_reduction
-def test_equal_weights_change_nothing_but_the_sum(reduction):
-    loss = made(reduction=reduction)
+def test_equal_weights_leave_the_mean_and_scale_the_sum(reduction):
+    loss = make_loss(reduction=reduction)
     x, y = data(5, 3)
     factor = 1 if reduction == "mean" else 2
     torch.testing.assert_close(loss(x, y, torch.full((5,), 2.0)), factor * loss(x, y))
@@ -179,7 +179,7 @@ def test_equal_weights_change_nothing_but_the_sum(reduction):
 @pytest.mark.parametrize("where", ["input", "target", "both"])
 @pytest.mark.parametrize("kind", ["mask", "zero weight"])
 def test_masked_elements_affect_neither_value_nor_gradient(reduction, poison, where, kind):
-    loss = made(reduction=reduction)
+    loss = make_loss(reduction=reduction)
     x, y = data(5, 3)
     mask = torch.ones(5, 3, dtype=torch.bool)
     mask[1, 2] = mask[4, 0] = False
@@ -204,7 +204,7 @@ def test_masked_elements_affect_neither_value_nor_gradient(reduction, poison, wh
 
 
 def test_masked_mean_is_the_mean_over_unmasked_elements():
-    loss = made()
+    loss = make_loss()
     x, y = data(6, 3)
     mask = torch.tensor([True, False, True, True, False, True])
     torch.testing.assert_close(loss(x, y, mask), loss(x[mask], y[mask]))
@@ -212,7 +212,7 @@ def test_masked_mean_is_the_mean_over_unmasked_elements():
 
 @each_reduction
 def test_all_weights_zero_give_zero_with_zero_gradients(reduction):
-    loss = made(reduction=reduction)
+    loss = make_loss(reduction=reduction)
     x = torch.full((4, 3), NAN, dtype=torch.float64, requires_grad=True)
     for weight in (torch.zeros(4, 3), torch.zeros(4), torch.zeros(4, dtype=torch.bool)):
         value = loss(x, data(4, 3)[1], weight)
@@ -238,7 +238,7 @@ def test_one_extreme_outlier_leaves_a_finite_loss_and_finite_gradients(reduction
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @each_reduction
 def test_half_precision_inputs_give_a_float32_loss(dtype, reduction):
-    loss = made(dtype=torch.float32, reduction=reduction)
+    loss = make_loss(dtype=torch.float32, reduction=reduction)
     x, y = data(5, 3, dtype=dtype)
     x.requires_grad_()
     value = loss(x, y)
@@ -256,7 +256,7 @@ def test_sums_of_half_precision_do_not_overflow():
 
 @each_reduction
 def test_autocast_changes_nothing(reduction):
-    loss = made(dtype=torch.float32, reduction=reduction)
+    loss = make_loss(dtype=torch.float32, reduction=reduction)
     x, y = data(5, 3, dtype=torch.float32)
     x.requires_grad_()
     expected = loss(x, y)
@@ -278,19 +278,19 @@ def test_loss_of_a_layer_under_autocast_is_float32():
 
 
 def test_double_inputs_are_computed_in_double_by_a_float32_module():
-    loss = made(sigma=2.0, d=1.0, bound=32.0, dtype=torch.float32)
+    loss = make_loss(sigma=2.0, d=1.0, bound=32.0, dtype=torch.float32)
     x, y = data(5, 3)
     value = loss(x, y)
     assert value.dtype == torch.float64
     exact = mkc_energy(x - y, loss.sigma.double(), loss.d.double()).mean() + loss.log_normalizer().double().mean()
     torch.testing.assert_close(value, exact, rtol=1e-6, atol=0)
-    fixed = made(sigma=2.0, d=1.0, bound=32.0, dtype=torch.float32, **FIXED)
+    fixed = make_loss(sigma=2.0, d=1.0, bound=32.0, dtype=torch.float32, **FIXED)
     torch.testing.assert_close(fixed(x, y), mkc_energy(x - y, 2.0, 1.0).mean(), rtol=1e-13, atol=0)
     gradients(value, loss.raw_kappa)
 
 
 def test_to_float64_converts_everything_and_keeps_the_values():
-    loss = made(dtype=torch.float32)
+    loss = make_loss(dtype=torch.float32)
     before = loss.sigma.double(), loss.d.double()
     loss = loss.to(torch.float64)
     assert {t.dtype for t in loss.state_dict().values()} == {torch.float64}
@@ -307,7 +307,7 @@ def test_to_float64_converts_everything_and_keeps_the_values():
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_d": False}], ids=["learned", "fixed", "half"])
 def test_copies_and_pickles_are_equal_and_independent(options):
-    loss = made(**options)
+    loss = make_loss(**options)
     x, y = data(5, 3)
     for twin in (copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
         assert torch.equal(twin(x, y), loss(x, y))
@@ -318,8 +318,8 @@ def test_copies_and_pickles_are_equal_and_independent(options):
 
 @pytest.mark.parametrize("options", [{}, FIXED, {"learn_sigma": False}], ids=["learned", "fixed", "half"])
 def test_state_dict_carries_bound_and_d_min_into_a_loss_made_with_others(options):
-    loss = made(d_min=[0.01] * 3, **options)
-    other = made(sigma=[1.0] * 3, d=[5.0] * 3, bound=[6.0] * 3, d_min=[0.3] * 3, **options)
+    loss = make_loss(d_min=[0.01] * 3, **options)
+    other = make_loss(sigma=[1.0] * 3, d=[5.0] * 3, bound=[6.0] * 3, d_min=[0.3] * 3, **options)
     buffer = io.BytesIO()
     torch.save(loss.state_dict(), buffer)
     buffer.seek(0)
@@ -333,14 +333,18 @@ def test_state_dict_carries_bound_and_d_min_into_a_loss_made_with_others(options
 
 def test_state_dict_of_another_number_of_channels_is_refused():
     with pytest.raises(RuntimeError, match="size mismatch"):
-        made(3).load_state_dict(made(2).state_dict())
+        make_loss(3).load_state_dict(make_loss(2).state_dict())
     with pytest.raises(RuntimeError, match="size mismatch"):
         MKCLoss(3).load_state_dict(MKCLoss(1).state_dict())
 
 
 @pytest.mark.parametrize("learned", [{}, {"learn_d": False}, {"learn_sigma": False}], ids=["both", "sigma", "d"])
 def test_a_learned_loss_loads_into_a_fixed_loss_and_back(learned):
-    loss, fixed, again = made(**learned), made(sigma=9.0, d=0.3, **FIXED), made(sigma=9.0, d=0.3, **learned)
+    loss, fixed, again = (
+        make_loss(**learned),
+        make_loss(sigma=9.0, d=0.3, **FIXED),
+        make_loss(sigma=9.0, d=0.3, **learned),
+    )
     fixed.load_state_dict(loss.state_dict())
     again.load_state_dict(fixed.state_dict())
     for other in (fixed, again):
@@ -351,7 +355,7 @@ def test_a_learned_loss_loads_into_a_fixed_loss_and_back(learned):
 
 def test_a_fixed_gaussian_does_not_load_into_a_learned_loss():
     with pytest.raises(RuntimeError, match="raw_kappa"):
-        made().load_state_dict(made(sigma=INF, **FIXED).state_dict())
+        make_loss().load_state_dict(make_loss(sigma=INF, **FIXED).state_dict())
 
 
 # --- sigma, d and their bounds
@@ -360,7 +364,7 @@ def test_a_fixed_gaussian_does_not_load_into_a_learned_loss():
 @pytest.mark.parametrize("options", [{}, FIXED], ids=["learned", "fixed"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sigma_and_d_are_the_given_and_the_assigned_values(options, dtype):
-    loss = made(dtype=dtype, **options)
+    loss = make_loss(dtype=dtype, **options)
     tolerance = {"rtol": 2e-6 if dtype == torch.float32 else 1e-12, "atol": 0}
     torch.testing.assert_close(loss.sigma, torch.tensor(SIGMA, dtype=dtype), **tolerance)
     torch.testing.assert_close(loss.d, torch.tensor(D, dtype=dtype), **tolerance)
@@ -384,7 +388,7 @@ def test_sigma_survives_its_parametrisation_over_its_range_in_float32(sigma):
 
 
 def test_a_fixed_sigma_can_be_set_to_infinity_and_back():
-    loss = made(**FIXED)
+    loss = make_loss(**FIXED)
     loss.sigma = torch.tensor([INF, 2.0, INF])
     assert loss.sigma.tolist() == pytest.approx([INF, 2.0, INF])
     x, y = data(4, 3)
@@ -394,14 +398,14 @@ def test_a_fixed_sigma_can_be_set_to_infinity_and_back():
 
 
 def test_a_learned_sigma_cannot_be_set_to_infinity():
-    loss = made()
+    loss = make_loss()
     with pytest.raises(ValueError, match="finite `sigma`"):
         loss.sigma = INF
     assert all(p.isfinite().all() for p in loss.parameters())
 
 
 def test_setters_keep_the_parameter_objects_of_an_optimiser():
-    loss = made()
+    loss = make_loss()
     before = list(loss.parameters())
     loss.sigma, loss.d = 1.0, 1.0
     assert all(a is b for a, b in zip(before, loss.parameters(), strict=True))
@@ -410,7 +414,7 @@ def test_setters_keep_the_parameter_objects_of_an_optimiser():
 
 @pytest.mark.parametrize("value", [0.049, 0.0, -1.0, NAN])
 def test_sigma_setter_refuses_values_out_of_range(value):
-    for loss in (made(), made(**FIXED)):
+    for loss in (make_loss(), make_loss(**FIXED)):
         with pytest.raises(ValueError, match="`sigma` in"):
             loss.sigma = value
         with pytest.raises(ValueError, match=r"shape \(3,\).*got \(2,\)"):
@@ -419,7 +423,7 @@ def test_sigma_setter_refuses_values_out_of_range(value):
 
 @pytest.mark.parametrize("value", [0.0, -1.0, NAN, INF])
 def test_d_setter_refuses_values_that_are_not_positive_and_finite(value):
-    for loss in (made(), made(**FIXED)):
+    for loss in (make_loss(), make_loss(**FIXED)):
         with pytest.raises(ValueError, match=r"`d`.*positive and finite"):
             loss.d = value
         with pytest.raises(ValueError, match=r"shape \(3,\).*got \(2,\)"):
@@ -428,7 +432,7 @@ def test_d_setter_refuses_values_that_are_not_positive_and_finite(value):
 
 @pytest.mark.parametrize("value", [0.01, 0.005, 40.0, 50.0])
 def test_d_setter_refuses_values_not_between_its_bounds(value):
-    loss = made(bound=40.0, d_min=0.01)
+    loss = make_loss(bound=40.0, d_min=0.01)
     with pytest.raises(ValueError, match="`d` between `d_min`"):
         loss.d = value
     torch.testing.assert_close(loss.d, torch.tensor(D, dtype=torch.float64))
@@ -436,7 +440,7 @@ def test_d_setter_refuses_values_not_between_its_bounds(value):
 
 def test_bounds_hold_after_violent_steps():
     for seed in range(3):
-        loss = made(dtype=torch.float32, d_min=0.01)
+        loss = make_loss(dtype=torch.float32, d_min=0.01)
         optimiser = torch.optim.SGD(loss.param_groups(), lr=1e3)
         x, y = data(16, 3, dtype=torch.float32, seed=seed)
         for step in range(200):
@@ -463,7 +467,7 @@ def test_getters_return_the_optimised_values():
     torch.testing.assert_close(loss.sigma, loss.kappa.rsqrt())
 
 
-def test_no_bound_means_a_hundred_times_the_initial_d_and_stays_there():
+def test_the_default_bound_is_a_hundred_times_the_initial_d_and_constant():
     loss = MKCLoss(2, d=torch.tensor([0.5, 3.0]))
     assert loss.bound.tolist() == [50.0, 300.0]
     torch.testing.assert_close(loss.d_min, torch.tensor([0.5e-3, 3e-3]))
@@ -479,13 +483,13 @@ def test_no_bound_means_a_hundred_times_the_initial_d_and_stays_there():
 
 
 def test_param_groups_are_free_of_weight_decay_and_take_options():
-    loss = made()
+    loss = make_loss()
     (group,) = loss.param_groups(lr=0.5)
     assert set(map(id, group["params"])) == set(map(id, loss.parameters()))
     assert group["weight_decay"] == 0
     assert group["lr"] == 0.5
-    assert made(**FIXED).param_groups() == []
-    assert len(made(learn_d=False).param_groups()[0]["params"]) == 1
+    assert make_loss(**FIXED).param_groups() == []
+    assert len(make_loss(learn_d=False).param_groups()[0]["params"]) == 1
     model = nn.Linear(2, 3)
     optimiser = torch.optim.AdamW([{"params": model.parameters()}, *loss.param_groups()], lr=0.1, weight_decay=0.5)
     before, weights = loss.raw_kappa.detach().clone(), model.weight.detach().clone()
@@ -502,7 +506,7 @@ def test_param_groups_are_free_of_weight_decay_and_take_options():
 @pytest.mark.parametrize("weighted", [False, True])
 @each_reduction
 def test_gradcheck_in_input_target_and_both_parameters(reduction, weighted):
-    loss = made(2, reduction=reduction)
+    loss = make_loss(2, reduction=reduction)
     x, y = data(3, 2)
     weight = torch.tensor([[1.0, 0.5], [0.0, 2.0], [1.5, 0.2]], dtype=torch.float64) if weighted else None
 
@@ -514,8 +518,8 @@ def test_gradcheck_in_input_target_and_both_parameters(reduction, weighted):
     assert gradgradcheck(f, leaves)
 
 
-def test_gradient_with_respect_to_the_weights():
-    loss = made()
+def test_the_gradient_by_the_weights_passes_gradcheck():
+    loss = make_loss()
     x, y = data(4, 3)
     weight = torch.rand(4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).add(0.1).requires_grad_()
     assert gradcheck(lambda w: loss(x, y, w), (weight,))
@@ -629,8 +633,8 @@ def test_weights_of_another_shape_are_refused(shape):
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 4, 5), (1, 1, 4, 5), (2, 3, 1, 1), (2, 4, 5)])
-def test_weights_of_an_image_are_those_of_all_its_elements(shape):
-    loss = made(channel_dim=1)
+def test_weights_of_images_broadcast_to_all_their_elements(shape):
+    loss = make_loss(channel_dim=1)
     x, y = data(2, 3, 4, 5)
     weight = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = (weight.unsqueeze(1) if weight.dim() == 3 else weight).expand(2, 3, 4, 5)
@@ -649,8 +653,8 @@ def test_ambiguous_channel_dimension_is_refused():
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.int32])
-def test_integer_weights_count(dtype):
-    loss = made()
+def test_integer_weights_equal_repetition(dtype):
+    loss = make_loss()
     x, y = data(3, 3)
     repeated = torch.tensor([0, 1, 1, 2])
     count = torch.tensor([1, 2, 1])
@@ -671,7 +675,7 @@ def test_repr_names_the_learned_parameters(options, learned):
 
 
 def test_repr_shows_the_numbers_of_each_channel_and_marks_auto_values():
-    assert "sigma=[0.7, 3, 20], d=[0.5, 1, 2], bound=[9, 40, 1000]" in repr(made())
+    assert "sigma=[0.7, 3, 20], d=[0.5, 1, 2], bound=[9, 40, 1000]" in repr(make_loss())
     assert "d=auto: 1, bound=auto: 10, objective='robust'" in repr(MKCLoss(2))
     assert "d=auto: 1, bound=50, objective='likelihood'" in repr(MKCLoss(2, bound=50.0, objective="likelihood"))
     assert "d=[1, 2, 3, 4, 5, 6, …]" in repr(MKCLoss(9, d=torch.arange(1.0, 10.0)))
@@ -683,7 +687,7 @@ def test_repr_shows_the_numbers_of_each_channel_and_marks_auto_values():
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_compiled_loss_equals_eager_over_two_batch_sizes():
-    loss = made(sigma=[0.7, 3.0, 100.0])
+    loss = make_loss(sigma=[0.7, 3.0, 100.0])
     compiled = torch.compile(loss, fullgraph=True, dynamic=True)
     for count in (5, 8):
         x, y = data(count, 3)
@@ -695,7 +699,7 @@ def test_compiled_loss_equals_eager_over_two_batch_sizes():
 
 
 def test_an_ensemble_of_losses_under_vmap_equals_a_loop():
-    losses = [made(sigma=s, d=d) for s, d in ((0.5, 0.4), (2.0, 1.0), (9.0, 3.0))]
+    losses = [make_loss(sigma=s, d=d) for s, d in ((0.5, 0.4), (2.0, 1.0), (9.0, 3.0))]
     parameters, buffers = stack_module_state(losses)
     x, y = data(3, 6, 3)
 
@@ -712,7 +716,7 @@ def test_an_ensemble_of_losses_under_vmap_equals_a_loop():
 
 
 def test_per_sample_gradients_under_vmap_with_masks():
-    loss = made(reduction="sum")
+    loss = make_loss(reduction="sum")
     x, y = data(6, 3)
     mask = torch.tensor([True, False, True, True, False, True])
     y[1] = NAN
@@ -727,7 +731,7 @@ def test_half_keeps_the_parameters_and_bounds_in_float32():
     assert math.isfinite(loss(torch.ones(3, 1).half(), torch.zeros(3, 1).half()).item())
 
 
-def test_a_bandwidth_at_the_end_of_its_range_can_still_move():
+def test_a_bandwidth_at_the_end_of_its_range_has_a_gradient():
     loss = MKCLoss(1, sigma=0.05)
     assert float(torch.autograd.grad(loss.kappa.sum(), loss.raw_kappa)[0]) > 1e-4
 
@@ -762,7 +766,7 @@ def test_per_sample_gradients_work_with_the_check_of_targets():
     assert slopes["raw_d"].shape == (4, 1)
 
 
-def test_d_learns_the_size_of_the_noise():
+def test_d_learns_the_scale_of_the_noise():
     loss = MKCLoss(1)
     target = torch.randn(256, 1, generator=torch.Generator().manual_seed(0))
     optimiser = torch.optim.Adam(loss.parameters(), lr=0.1)
@@ -818,7 +822,7 @@ def test_infinite_prediction_and_target_do_not_cancel():
 
 
 def test_values_are_not_checked_under_vmap():
-    loss, x = made(reduction="sum"), data(4, 3)[0]
+    loss, x = make_loss(reduction="sum"), data(4, 3)[0]
     bad = x.clone()
     bad[1] = NAN
     found = vmap(loss)(bad, x)
@@ -831,7 +835,7 @@ def test_values_are_not_checked_under_vmap():
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_values_are_not_checked_in_a_compiled_loss():
-    loss = made(reduction="none", **FIXED)
+    loss = make_loss(reduction="none", **FIXED)
     compiled = torch.compile(loss, fullgraph=True)
     x, y = data(5, 3)
     weight = torch.tensor([1.0, 0.5, 0.0, 2.0, 1.0], dtype=torch.float64)
@@ -891,7 +895,7 @@ class Criterion(nn.Module):
     tuple(map(int, torch.__version__.split(".")[:2])) < (2, 7),
     reason="torch 2.6 loses the size of the batch in an autograd function",
 )
-@pytest.mark.parametrize("options", [{"d": 1.0}, {"d": 1.0, **FIXED}, {}], ids=["learned", "fixed", "as it comes"])
+@pytest.mark.parametrize("options", [{"d": 1.0}, {"d": 1.0, **FIXED}, {}], ids=["learned", "fixed", "default"])
 def test_an_exported_loss_takes_batches_of_any_size(options):
     module = Criterion(MKCLoss(2, **options))
     x, y = data(8, 2, dtype=torch.float32)

@@ -15,8 +15,8 @@ from mkc_torch.losses._initial_loss import initial_influence, initial_loss
 from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
 from mkc_torch.losses.residual_scale import ResidualScale
 
-ROBUST = {"as it comes": {}, "given d": {"d": 1.5, "objective": "robust"}}
-LIKELIHOOD = {"d follows": {"objective": "likelihood"}, "given d": {"d": 1.5}}
+ROBUST = {"default": {}, "given d": {"d": 1.5, "objective": "robust"}}
+LIKELIHOOD = {"auto d": {"objective": "likelihood"}, "given d": {"d": 1.5}}
 NOT_LEARNED = {"learn_sigma": False, "learn_d": False}
 each_robust = pytest.mark.parametrize("options", ROBUST.values(), ids=ROBUST)
 each_reduction = pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
@@ -33,7 +33,7 @@ def data(*shape, seed=0, dtype=torch.float64):
     return x, y
 
 
-def annealing(m=2, share=0.4, **options):
+def annealing_loss(m=2, share=0.4, **options):
     """A loss with a history, halfway through its schedule, in float64."""
     loss = MKCLoss(m, sigma=2.0, **options).double()
     for seed in range(3):
@@ -66,7 +66,7 @@ def test_the_objective_is_robust_if_d_is_auto():
 @each_reduction
 @pytest.mark.parametrize("options", [*ROBUST.values(), *LIKELIHOOD.values()])
 def test_in_evaluation_the_value_is_the_likelihood_of_sigma_d_and_bound(reduction, options):
-    loss = annealing(reduction=reduction, **options).eval()
+    loss = annealing_loss(reduction=reduction, **options).eval()
     x, y = data(30, 2, seed=7)
     expected = mkc_nll(x - y, loss.sigma, loss.d, loss.bound)
     expected = {"none": expected, "mean": expected.mean(), "sum": expected.sum()}[reduction]
@@ -85,7 +85,7 @@ def test_in_evaluation_the_value_is_the_likelihood_of_sigma_d_and_bound(reductio
 @each_robust
 @pytest.mark.parametrize("weighted", [False, True])
 def test_in_training_the_value_is_the_sum_of_the_terms_and_so_are_its_gradients(reduction, options, weighted):
-    loss = annealing(reduction=reduction, **options)
+    loss = annealing_loss(reduction=reduction, **options)
     x, y = (leaf(entry) for entry in data(30, 2, seed=7))
     weight = torch.rand(30, 2, generator=generator(), dtype=torch.float64) if weighted else None
     value = loss(x, y, weight)
@@ -99,7 +99,7 @@ def test_in_training_the_value_is_the_sum_of_the_terms_and_so_are_its_gradients(
 
 @each_robust
 def test_the_network_term_has_no_gradient_by_parameters_and_the_density_term_none_by_predictions(options):
-    loss, (x, y) = annealing(**options), (leaf(value) for value in data(30, 2, seed=7))
+    loss, (x, y) = annealing_loss(**options), (leaf(value) for value in data(30, 2, seed=7))
     network, density = loss.terms(x, y)
     assert torch.autograd.grad(network, list(loss.parameters()), allow_unused=True, retain_graph=True) == (None, None)
     assert torch.autograd.grad(density, (x, y), allow_unused=True, retain_graph=True) == (None, None)
@@ -110,7 +110,7 @@ def test_the_network_term_has_no_gradient_by_parameters_and_the_density_term_non
 @each_robust
 @each_reduction
 def test_each_term_has_its_own_gradient_at_a_frozen_state(options, reduction):
-    loss, (x, y) = annealing(reduction=reduction, **options), data(4, 2, seed=7)
+    loss, (x, y) = annealing_loss(reduction=reduction, **options), data(4, 2, seed=7)
 
     def network(x, y):
         return loss.terms(x, y).network
@@ -136,7 +136,7 @@ def test_each_term_has_its_own_gradient_at_a_frozen_state(options, reduction):
 
 
 def test_the_network_term_is_the_energy_of_the_schedule_in_scales():
-    loss, (x, y) = annealing(), data(30, 2, seed=7)
+    loss, (x, y) = annealing_loss(), data(30, 2, seed=7)
     z = (x - y) / loss.residual_scale.scale
     torch.testing.assert_close(loss.terms(x, y).network, loss.schedule.energy(z).mean(), rtol=1e-12, atol=0.0)
     welsch = mkc_energy(z, loss.schedule.bandwidth, 1.0)
@@ -144,13 +144,13 @@ def test_the_network_term_is_the_energy_of_the_schedule_in_scales():
 
 
 def test_the_density_term_is_the_likelihood():
-    loss, (x, y) = annealing(), data(30, 2, seed=7)
+    loss, (x, y) = annealing_loss(), data(30, 2, seed=7)
     expected = mkc_nll(x - y, loss.sigma, loss.d, loss.bound).mean()
     torch.testing.assert_close(loss.terms(x, y).density, expected, rtol=1e-10, atol=0.0)
 
 
 def test_with_a_given_d_the_annealed_bandwidth_is_no_wider_than_the_selected():
-    loss, (x, y) = annealing(share=1.0, **ROBUST["given d"]), data(30, 2, seed=7)
+    loss, (x, y) = annealing_loss(share=1.0, **ROBUST["given d"]), data(30, 2, seed=7)
     with torch.no_grad():
         loss.d = torch.tensor([2.0, 0.4])
     selected = loss.schedule.bandwidth * loss.residual_scale.scale / loss.d
@@ -177,7 +177,7 @@ def test_a_bandwidth_near_the_widest_does_not_limit_a_gaussian():
 
 @pytest.mark.parametrize("options", LIKELIHOOD.values(), ids=LIKELIHOOD)
 def test_under_the_likelihood_the_network_term_is_0_and_the_density_term_has_all_gradients(options):
-    loss, (x, y) = annealing(**options), (leaf(value) for value in data(30, 2, seed=7))
+    loss, (x, y) = annealing_loss(**options), (leaf(value) for value in data(30, 2, seed=7))
     network, density = loss.terms(x, y)
     assert network.item() == 0.0
     wanted = [x, y, *loss.parameters()]
@@ -190,7 +190,7 @@ def test_under_the_likelihood_the_network_term_is_0_and_the_density_term_has_all
 @each_reduction
 @pytest.mark.parametrize("weighted", [False, True])
 def test_the_likelihood_is_differentiated_as_a_whole(options, reduction, weighted):
-    loss = annealing(reduction=reduction, **options).eval()
+    loss = annealing_loss(reduction=reduction, **options).eval()
     x, y = data(4, 2, seed=7)
     weight = [leaf(torch.rand(4, 2, generator=generator(), dtype=torch.float64) + 0.1)] if weighted else []
 
@@ -204,7 +204,7 @@ def test_the_likelihood_is_differentiated_as_a_whole(options, reduction, weighte
 
 @pytest.mark.parametrize("options", LIKELIHOOD.values(), ids=LIKELIHOOD)
 def test_under_the_likelihood_value_and_gradients_are_the_same_in_training_and_evaluation(options):
-    loss = annealing(**options)
+    loss = annealing_loss(**options)
     found = []
     for mode in (True, False):
         x, y = (leaf(entry) for entry in data(30, 2, seed=7))
@@ -213,23 +213,23 @@ def test_under_the_likelihood_value_and_gradients_are_the_same_in_training_and_e
     torch.testing.assert_close(*found, rtol=0.0, atol=0.0)
 
 
-# --- what the gradients are
+# --- gradients of the terms
 
 
 @pytest.mark.parametrize("options", [{}, {"d": 1.5, "objective": "robust"}, {"objective": "likelihood"}, {"d": 1.5}])
 def test_the_network_gradient_does_not_depend_on_which_parameters_are_learned(options):
-    """At errors of half a scale and of twenty scales, where it once differed by a factor of 1e7."""
+    """At errors of half a scale and of twenty scales."""
     error = torch.randn(200, 1, generator=generator(), dtype=torch.float64)
     error[0], error[1] = 0.5, 20.0
-    pulls = []
+    gradients = []
     for learned in ((True, True), (False, True), (True, False), (False, False)):
         loss = MKCLoss(1, learn_sigma=learned[0], learn_d=learned[1], **options).double()
         for _ in range(2):
             x = leaf(error)
             loss(x, torch.zeros_like(x)).backward()
-        pulls.append(x.grad[:2])
-    for pull in pulls[1:]:
-        torch.testing.assert_close(pull, pulls[0], rtol=1e-5, atol=1e-12)  # sigma and d are stored in float32
+        gradients.append(x.grad[:2])
+    for gradient in gradients[1:]:
+        torch.testing.assert_close(gradient, gradients[0], rtol=1e-5, atol=1e-12)  # sigma and d are stored in float32
 
 
 def test_the_gradient_of_the_initial_loss_is_its_influence():
@@ -248,7 +248,7 @@ def test_gradients_of_elements_and_sums_equal_the_mean_times_the_weight(reductio
     slopes = []
     for kind in (reduction, "mean"):
         inputs = leaf(x)
-        value = annealing(reduction=kind, **options)(inputs, y, weight)
+        value = annealing_loss(reduction=kind, **options)(inputs, y, weight)
         slopes.append(torch.autograd.grad(value.sum() * (1.0 if kind != "mean" else weight.sum()), inputs)[0])
     torch.testing.assert_close(*slopes, rtol=1e-10, atol=1e-12)
 
@@ -256,7 +256,7 @@ def test_gradients_of_elements_and_sums_equal_the_mean_times_the_weight(reductio
 @each_reduction
 @each_robust
 def test_the_gradient_by_the_target_is_the_negative_gradient_by_the_prediction(reduction, options):
-    loss, (x, y) = annealing(reduction=reduction, **options), (leaf(value) for value in data(40, 2))
+    loss, (x, y) = annealing_loss(reduction=reduction, **options), (leaf(value) for value in data(40, 2))
     by_input, by_target = torch.autograd.grad(loss(x, y).sum(), (x, y))
     torch.testing.assert_close(by_input, -by_target, rtol=0.0, atol=0.0)
 
@@ -265,21 +265,21 @@ def test_the_gradient_by_the_target_is_the_negative_gradient_by_the_prediction(r
 def test_the_gradient_by_a_weight_is_the_value_of_its_element(options):
     x, y = data(40, 2)
     weight = torch.ones(40, 2, dtype=torch.float64)
-    loss, leaf_weight = annealing(reduction="sum", **options), leaf(weight)
+    loss, leaf_weight = annealing_loss(reduction="sum", **options), leaf(weight)
     (slope,) = torch.autograd.grad(loss(x, y, leaf_weight), leaf_weight)
-    each = annealing(reduction="none", **options)
+    each = annealing_loss(reduction="none", **options)
     torch.testing.assert_close(slope, each(x, y, weight).detach(), rtol=1e-10, atol=1e-12)
-    mean, leaf_weight = annealing(**options), leaf(weight)
+    mean, leaf_weight = annealing_loss(**options), leaf(weight)
     value = mean(x, y, leaf_weight)
     (slope,) = torch.autograd.grad(value, leaf_weight)
-    expected = annealing(reduction="none", **options)(x, y, weight).detach()
+    expected = annealing_loss(reduction="none", **options)(x, y, weight).detach()
     torch.testing.assert_close(slope, (expected - value.detach()) / 80.0, rtol=1e-8, atol=1e-12)
 
 
 @each_robust
 @pytest.mark.parametrize("options_too", [{}, NOT_LEARNED], ids=["learned", "fixed"])
 def test_repeated_backward_passes_are_bitwise_equal_and_scale_with_the_upstream_gradient(options, options_too):
-    loss, (x, y) = annealing(**options, **options_too), (leaf(entry) for entry in data(40, 2))
+    loss, (x, y) = annealing_loss(**options, **options_too), (leaf(entry) for entry in data(40, 2))
     wanted = [x, y, *loss.parameters()]
     value = loss(x, y)
     loss(*data(40, 2, seed=9))  # another batch in between changes the running state, not this graph
@@ -295,8 +295,8 @@ def test_repeated_backward_passes_are_bitwise_equal_and_scale_with_the_upstream_
 
 
 def loss_at(loss, value, x, y):
-    """The terms at the state that gave a value, by going back one batch."""
-    before = annealing(
+    """The terms at the state that gave ``value``, from a loss rebuilt before its last batch."""
+    before = annealing_loss(
         **({} if loss._follows else ROBUST["given d"]), **({} if loss.raw_d is not None else NOT_LEARNED)
     )
     found = before(x, y)
@@ -306,7 +306,7 @@ def loss_at(loss, value, x, y):
 
 def test_hessians_by_forward_over_reverse_and_reverse_over_reverse():
     y = data(6, 1)[1]
-    loss = annealing(1, d=1.5)
+    loss = annealing_loss(1, d=1.5)
 
     def value(raw):
         parameters = {"raw_kappa": raw[1:2], "raw_d": raw[2:3]}
@@ -322,8 +322,8 @@ def test_hessians_by_forward_over_reverse_and_reverse_over_reverse():
 
 
 def test_freezing_the_scale_keeps_the_numbers_and_ends_the_robust_objective():
-    for options in ({}, NOT_LEARNED, *ROBUST.values(), LIKELIHOOD["d follows"]):
-        loss, (x, y) = annealing(**options), data(30, 2, seed=7)
+    for options in ({}, NOT_LEARNED, *ROBUST.values(), LIKELIHOOD["auto d"]):
+        loss, (x, y) = annealing_loss(**options), data(30, 2, seed=7)
         value, numbers = loss.eval()(x, y), [getattr(loss, name).detach() for name in ("sigma", "d", "bound", "d_min")]
         loss.train().freeze_scale()
         assert loss.objective == "likelihood"
@@ -356,7 +356,7 @@ def test_a_loss_frozen_at_its_floor_can_still_learn():
     assert all(bool(torch.isfinite(value).all()) for value in (*slopes, *loss.parameters()))
 
 
-def minimised(loss, steps):
+def minimise_by_lbfgs(loss, steps):
     """Slope and loss values of a line fitted by L-BFGS with a line search to points with wrong targets."""
     g = generator(3)
     x = torch.randn(200, 1, generator=g, dtype=torch.float64)
@@ -391,7 +391,7 @@ def minimised(loss, steps):
 
 
 def test_with_a_frozen_scale_a_line_search_converges():
-    model, slopes, values = minimised(MKCLoss(1).double(), 200)
+    model, slopes, values = minimise_by_lbfgs(MKCLoss(1).double(), 200)
     assert slopes.abs().max() < 1e-6
     assert float(model.weight.detach()) == pytest.approx(2.0, abs=0.03)
     assert float(model.bias.detach()) == pytest.approx(0.0, abs=0.03)
@@ -415,27 +415,27 @@ def test_a_prediction_that_is_not_finite_is_refused_with_a_remedy_for_line_searc
 # --- a guide: a schedule of a trainer
 
 
-def test_a_guide_gives_a_loss_with_given_d_the_robust_objective_in_training():
+def test_guide_gives_a_loss_with_given_d_the_robust_objective_in_training():
     x, y = data(60, 1)
     plain, loss = MKCLoss(1, d=1.0).double(), MKCLoss(1, d=1.0).double()
     scale, schedule = ResidualScale(1).double(), BandwidthSchedule(1).double()
     keys = set(loss.state_dict())
     loss.guide(scale, schedule)
 
-    def looked_at(loss):
+    def value_and_gradient(loss):
         inputs = leaf(x)
         value = loss(inputs, y)
         return value.detach(), torch.autograd.grad(value, inputs)[0]
 
-    value, pull = looked_at(loss)
+    value, gradient = value_and_gradient(loss)
     own = MKCLoss(1, d=1.0, objective="robust").double()
-    torch.testing.assert_close((value, pull), looked_at(own), rtol=0.0, atol=0.0)
+    torch.testing.assert_close((value, gradient), value_and_gradient(own), rtol=0.0, atol=0.0)
     torch.testing.assert_close(scale.state_dict(), own.residual_scale.state_dict(), rtol=0.0, atol=0.0)
     torch.testing.assert_close(schedule.state_dict(), own.schedule.state_dict(), rtol=0.0, atol=0.0)
-    assert not torch.allclose(pull, looked_at(plain)[1], rtol=0.1)
+    assert not torch.allclose(gradient, value_and_gradient(plain)[1], rtol=0.1)
     assert set(loss.state_dict()) == keys
-    torch.testing.assert_close(looked_at(loss.eval()), looked_at(plain.eval()))
+    torch.testing.assert_close(value_and_gradient(loss.eval()), value_and_gradient(plain.eval()))
     assert schedule.steps.tolist() == [1]
     loss.train().guide(None, None)
-    torch.testing.assert_close(looked_at(loss), looked_at(plain.train()), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(value_and_gradient(loss), value_and_gradient(plain.train()), rtol=0.0, atol=0.0)
     assert schedule.steps.tolist() == [1]

@@ -28,7 +28,7 @@ class Criterion(nn.Module):
         return self.loss(self.net(x), y)
 
 
-class Predicted(nn.Module):
+class HeadWithLikelihood(nn.Module):
     """A network with a head, and its likelihood where there are targets."""
 
     def __init__(self):
@@ -51,8 +51,8 @@ def batch(count, labels=False):
     return x, 3.0 * torch.randn(count, 2, generator=generator)
 
 
-def refuse_other(module, make, sizes=(1, 3, 17)):
-    """Fail if the exported module and the module differ, on batches of other sizes."""
+def assert_export_equals_module(module, make, sizes=(1, 3, 17)):
+    """Assert that the exported module equals the module on batches of other sizes."""
     module.eval()
     size = torch.export.Dim("samples", min=1)
     given = make(4)
@@ -76,17 +76,17 @@ def trained(loss):
 
 
 @pytest.mark.e2e
-def test_a_head_and_its_likelihood():
+def test_an_exported_head_and_its_likelihood_equal_the_module():
     torch.manual_seed(0)
-    module = Predicted()
+    module = HeadWithLikelihood()
     # widths that a sigmoid with seven decimals rounds to 0
     assert float(module(*batch(17))[1].max()) > 500.0
-    refuse_other(module, batch)
+    assert_export_equals_module(module, batch)
 
 
-def test_a_head_at_every_place_of_an_image():
+def test_an_exported_head_of_images_equals_the_module():
     torch.manual_seed(0)
-    refuse_other(
+    assert_export_equals_module(
         MKCConvHead(3, 2, bound=50.0, d_min=1e-3),
         lambda count: (torch.randn(count, 3, 4, 5, generator=torch.Generator().manual_seed(count)),),
     )
@@ -101,22 +101,22 @@ def test_a_head_at_every_place_of_an_image():
     ],
     ids=["learned", "fixed"],
 )
-def test_a_loss_with_given_d(options):
+def test_an_exported_loss_with_given_d_equals_the_module(options):
     torch.manual_seed(0)
-    refuse_other(Criterion(MKCLoss(2, **options)), batch)
+    assert_export_equals_module(Criterion(MKCLoss(2, **options)), batch)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("settled", [False, True])
-def test_a_loss_with_auto_d_before_and_after_freezing(settled):
+def test_an_exported_loss_with_auto_d_equals_the_module_before_and_after_freezing(settled):
     module = trained(MKCLoss(2))
     if settled:
         module.loss.freeze_scale()
-    refuse_other(module, batch)
+    assert_export_equals_module(module, batch)
 
 
 @pytest.mark.e2e
-def test_the_losses_of_labels_and_without_a_scale():
+def test_exported_losses_of_labels_and_of_entropy_equal_the_module():
     torch.manual_seed(0)
-    refuse_other(Criterion(GeneralizedCrossEntropyLoss(), 3), lambda count: batch(count, labels=True))
-    refuse_other(Criterion(LELoss()), batch, sizes=(2, 3, 17))
+    assert_export_equals_module(Criterion(GeneralizedCrossEntropyLoss(), 3), lambda count: batch(count, labels=True))
+    assert_export_equals_module(Criterion(LELoss()), batch, sizes=(2, 3, 17))

@@ -34,7 +34,7 @@ def randn(*size, seed=0):
     return torch.randn(*size, generator=generator(seed), dtype=torch.float64)
 
 
-def updated(*batches, channels=None, dtype=torch.float64):
+def scale_after(*batches, channels=None, dtype=torch.float64):
     """A scale after batches of residuals; a batch may be a pair of residuals and weights."""
     pairs = [batch if isinstance(batch, tuple) else (batch, None) for batch in batches]
     scale = ResidualScale(channels or pairs[0][0].shape[-1]).to(dtype)
@@ -43,16 +43,16 @@ def updated(*batches, channels=None, dtype=torch.float64):
     return scale
 
 
-def numbers(scale):
+def state_of(scale):
     return {name: value for name, value in scale.state_dict().items() if name not in ("recent", "position")}
 
 
 def assert_same_numbers(left, other, **tolerance):
-    torch.testing.assert_close(numbers(left), numbers(other), **(tolerance or {"rtol": 0.0, "atol": 0.0}))
+    torch.testing.assert_close(state_of(left), state_of(other), **(tolerance or {"rtol": 0.0, "atol": 0.0}))
 
 
 def quantile(residual):
-    """The smallest absolute value up to which a share of them lies."""
+    """The empirical quantile of the absolute residuals, without interpolation."""
     ordered = sorted(abs(float(r)) for r in residual)
     return ordered[math.ceil(QUANTILE * len(ordered)) - 1]
 
@@ -62,7 +62,7 @@ def quantile(residual):
 
 def test_the_scale_is_the_quantile_of_absolute_residuals_over_that_of_a_normal_variable():
     residual = randn(237, 2) * torch.tensor([1.0, 50.0])
-    scale = updated(residual)
+    scale = scale_after(residual)
     expected = [quantile(column) / NORMAL_QUANTILE for column in residual.T]
     torch.testing.assert_close(scale.scale, torch.tensor(expected, dtype=torch.float64), rtol=1e-12, atol=0.0)
     torch.testing.assert_close(scale.half_range, 0.5 * (residual.amax(0) - residual.amin(0)))
@@ -72,16 +72,16 @@ def test_the_scale_is_the_quantile_of_absolute_residuals_over_that_of_a_normal_v
 
 def test_the_scale_of_normal_residuals_is_their_standard_deviation():
     large = torch.linspace(-1.0, 1.0, 20_001, dtype=torch.float64)[1:-1].erfinv() * 2.0**0.5
-    assert float(updated(7.0 * large.unsqueeze(-1)).scale) == pytest.approx(7.0, rel=1e-2)
+    assert float(scale_after(7.0 * large.unsqueeze(-1)).scale) == pytest.approx(7.0, rel=1e-2)
 
 
 def test_the_scale_is_robust_in_each_channel_and_about_0():
     residual = randn(1000, 2) * torch.tensor([1.0, 50.0])
     residual[:450, 0] = 1e4
-    scale = updated(residual)
+    scale = scale_after(residual)
     assert 1.0 < float(scale.scale[0]) < 3.0
     assert float(scale.scale[1]) == pytest.approx(50.0, rel=0.1)
-    offset = updated(torch.full((100, 1), 1000.0))
+    offset = scale_after(torch.full((100, 1), 1000.0))
     assert float(offset.scale) == pytest.approx(1000.0 / NORMAL_QUANTILE, rel=1e-6)
 
 
@@ -89,7 +89,7 @@ def test_the_scale_is_robust_in_each_channel_and_about_0():
 @settings(max_examples=20, deadline=None)
 def test_all_numbers_have_the_unit_of_the_target(exponent, seed):
     unit, batches = 10.0**exponent, [randn(30, 2, seed=seed), randn(50, 2, seed=seed + 1)]
-    left, other = updated(*batches), updated(*(unit * batch for batch in batches))
+    left, other = scale_after(*batches), scale_after(*(unit * batch for batch in batches))
     for name in ("scale", "half_range", "floor", "bound"):
         torch.testing.assert_close(unit * getattr(left, name), getattr(other, name), rtol=1e-9, atol=0.0)
 
@@ -97,21 +97,21 @@ def test_all_numbers_have_the_unit_of_the_target(exponent, seed):
 def test_the_floor_is_a_thousandth_of_the_spread_of_the_first_residuals_about_their_mean():
     residual = 1000.0 + 2.0 * randn(500, 1)
     spread = (residual - residual.mean()).abs().mean()
-    assert float(updated(residual).floor) == pytest.approx(1e-3 * float(spread), rel=1e-6)
-    assert float(updated(residual, 1e-3 * residual).floor) == pytest.approx(1e-3 * float(spread), rel=1e-6)
+    assert float(scale_after(residual).floor) == pytest.approx(1e-3 * float(spread), rel=1e-6)
+    assert float(scale_after(residual, 1e-3 * residual).floor) == pytest.approx(1e-3 * float(spread), rel=1e-6)
 
 
 def test_far_outliers_do_not_lift_the_floor_above_a_thousandth_of_the_scale():
     residual = randn(500, 1)
     residual[:100] = 1e9
-    scale = updated(residual)
+    scale = scale_after(residual)
     assert float(scale.floor) == pytest.approx(1e-3 * float(scale.scale))
 
 
 def test_if_most_residuals_are_0_their_mean_size_gives_the_scale():
     residual = torch.zeros(100, 1, dtype=torch.float64)
     residual[:5] = torch.tensor([1.0, -2.0, 3.0, -4.0, 5.0]).unsqueeze(-1)
-    assert float(updated(residual).scale) == pytest.approx(0.15, rel=1e-12)
+    assert float(scale_after(residual).scale) == pytest.approx(0.15, rel=1e-12)
 
 
 def test_the_log_scale_is_the_mean_of_the_first_batches_and_later_updated_by_a_tenth():
@@ -128,12 +128,12 @@ def test_the_log_scale_is_the_mean_of_the_first_batches_and_later_updated_by_a_t
 
 def test_the_scale_follows_residuals_that_shrink():
     noise = randn(100, 1)
-    scale = updated(*(noise * 100.0 * 0.9 ** min(step, 60) for step in range(120)))
-    assert float(scale.scale) == pytest.approx(100.0 * 0.9**60 * float(updated(noise).scale), rel=0.05)
+    scale = scale_after(*(noise * 100.0 * 0.9 ** min(step, 60) for step in range(120)))
+    assert float(scale.scale) == pytest.approx(100.0 * 0.9**60 * float(scale_after(noise).scale), rel=0.05)
 
 
 def test_the_half_range_widens_at_once_and_shrinks_slowly():
-    scale = updated(*(size * torch.tensor([[-1.0], [0.1], [0.2], [3.0]]) for size in (1.0, 10.0, 1.0, 1.0)))
+    scale = scale_after(*(size * torch.tensor([[-1.0], [0.1], [0.2], [3.0]]) for size in (1.0, 10.0, 1.0, 1.0)))
     assert float(scale.half_range) == pytest.approx(20.0 * RANGE_DECAY**2)
 
 
@@ -146,9 +146,9 @@ def test_residuals_that_are_not_finite_or_of_weight_0_are_ignored():
     contaminated[::4], contaminated[2::4], contaminated[4] = math.nan, math.inf, -math.inf
     mask = torch.ones(200, 1, dtype=torch.bool)
     mask[::2] = False
-    expected = updated(residual[1::2])
+    expected = scale_after(residual[1::2])
     for weight in (mask, mask.double(), None):
-        assert_same_numbers(updated((contaminated, weight)), expected, rtol=1e-12, atol=0.0)
+        assert_same_numbers(scale_after((contaminated, weight)), expected, rtol=1e-12, atol=0.0)
         scale = ResidualScale(1).double()
         scale.update(torch.zeros_like(residual), contaminated, weight)
         assert_same_numbers(scale, expected, rtol=1e-12, atol=0.0)
@@ -167,31 +167,31 @@ def test_masked_residuals_equal_missing_residuals(seed, count, offset, weighted)
     mask = torch.rand(count, 1, generator=generator(seed + 1)) < 0.6
     kept = mask.flatten()
     first = randn(40, 1, seed=seed + 2)
-    found = updated(first, (torch.where(mask, residual, 1e3), weight * mask))
-    expected = updated(first, *([(residual[kept], weight[kept])] if kept.any() else []))
+    found = scale_after(first, (torch.where(mask, residual, 1e3), weight * mask))
+    expected = scale_after(first, *([(residual[kept], weight[kept])] if kept.any() else []))
     assert_same_numbers(found, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["masked", "weight 0", "not finite"])
 @pytest.mark.parametrize("rows", [16, 600])
 def test_a_batch_without_usable_residuals_changes_no_number(kind, rows):
-    scale = updated(randn(50, 2), 3.0 * randn(50, 2, seed=1))
-    before = copy.deepcopy(numbers(scale))
+    scale = scale_after(randn(50, 2), 3.0 * randn(50, 2, seed=1))
+    before = copy.deepcopy(state_of(scale))
     residual = torch.full((rows, 2), math.inf if kind == "not finite" else 1e3, dtype=torch.float64)
     weight = {"masked": torch.zeros(rows, 2, dtype=torch.bool), "weight 0": torch.zeros(rows, 2)}.get(kind)
     for _ in range(3):
         scale.update(residual, torch.zeros_like(residual), weight)
-    torch.testing.assert_close(numbers(scale), before, rtol=0.0, atol=0.0)
+    torch.testing.assert_close(state_of(scale), before, rtol=0.0, atol=0.0)
 
 
 def test_a_fully_masked_channel_keeps_its_state_while_others_update():
     mask = torch.tensor([True, False]).expand(50, 2)
-    scale = updated((randn(50, 2), mask), (randn(50, 2, seed=1), mask))
+    scale = scale_after((randn(50, 2), mask), (randn(50, 2, seed=1), mask))
     assert scale.batches.tolist() == [2, 0]
     assert scale.log_scale.tolist()[1] == 0.0
     scale.update(1e3 * randn(50, 2, seed=2), torch.zeros(50, 2))
     assert scale.batches.tolist() == [3, 1]
-    expected = updated((1e3 * randn(50, 2, seed=2))[:, 1:])
+    expected = scale_after((1e3 * randn(50, 2, seed=2))[:, 1:])
     assert float(scale.log_scale[1]) == pytest.approx(float(expected.log_scale), rel=1e-12)
     assert float(scale.half_range[1]) == float(expected.half_range)
 
@@ -199,14 +199,14 @@ def test_a_fully_masked_channel_keeps_its_state_while_others_update():
 def test_a_weight_equals_repetition():
     residual, times = randn(40, 1), torch.randint(1, 4, (40, 1), generator=generator())
     repeated = residual.repeat_interleave(times.flatten(), 0)
-    assert_same_numbers(updated((residual, times)), updated(repeated), rtol=1e-12, atol=1e-12)
+    assert_same_numbers(scale_after((residual, times)), scale_after(repeated), rtol=1e-12, atol=1e-12)
 
 
 def test_channels_are_independent():
     residual = randn(70, 3) * torch.tensor([1.0, 10.0, 1e-3])
-    together = numbers(updated(residual, 2.0 * residual))
+    together = state_of(scale_after(residual, 2.0 * residual))
     for channel in range(3):
-        alone = numbers(updated(residual[:, [channel]], 2.0 * residual[:, [channel]]))
+        alone = state_of(scale_after(residual[:, [channel]], 2.0 * residual[:, [channel]]))
         for name, value in alone.items():
             assert float(value) == float(together[name][channel])
 
@@ -214,7 +214,7 @@ def test_channels_are_independent():
 @given(values=st.lists(st.tuples(st.integers(0, 20), st.integers(0, 3)), min_size=1, max_size=12))
 @settings(max_examples=200, deadline=None)
 def test_a_weighted_quantile_is_the_smallest_value_with_the_share_of_the_weight(values):
-    numbers, weights = (torch.tensor([value], dtype=torch.float64) for value in zip(*values, strict=True))
+    residuals, weights = (torch.tensor([value], dtype=torch.float64) for value in zip(*values, strict=True))
     total = sum(weight for _, weight in values)
     reached = [
         number
@@ -224,8 +224,8 @@ def test_a_weighted_quantile_is_the_smallest_value_with_the_share_of_the_weight(
     # with weights of 0 alone, any finite number is accepted
     expected = min((n for n in reached if any(w > 0 for m, w in values if m <= n)), default=None)
     for found in (
-        float(weighted_quantile(torch, numbers, weights, 0.4)[0]),
-        float(weighted_quantile(np, numbers.numpy(), weights.numpy(), 0.4)[0]),
+        float(weighted_quantile(torch, residuals, weights, 0.4)[0]),
+        float(weighted_quantile(np, residuals.numpy(), weights.numpy(), 0.4)[0]),
     ):
         assert math.isfinite(found)
         if expected is not None:
@@ -252,7 +252,7 @@ def test_the_most_recent_residuals_are_kept_with_predictions_and_weights():
 
 @pytest.mark.parametrize("rows", [MOST_RECENT - 1, MOST_RECENT, MOST_RECENT + 1, 1000, 5000])
 def test_evenly_spaced_residuals_of_a_large_batch_are_kept(rows):
-    scale = updated(torch.arange(1.0, rows + 1.0, dtype=torch.float64).unsqueeze(-1))
+    scale = scale_after(torch.arange(1.0, rows + 1.0, dtype=torch.float64).unsqueeze(-1))
     kept = scale.recent[0, 0].sort().values
     kept = kept[kept > 0]
     assert len(kept) == min(rows, MOST_RECENT)
@@ -272,7 +272,7 @@ def test_the_buffer_of_many_channels_stays_small(channels):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_most_extreme_of_evenly_spaced_residuals_give_the_half_range_of_a_large_batch(dtype):
     residual = torch.linspace(-3.0, 5.0, 5 * RANGE_ROWS + 7, dtype=dtype).unsqueeze(-1)
-    assert float(updated(residual, dtype=dtype).half_range) == pytest.approx(4.0, rel=2.0 / RANGE_ROWS)
+    assert float(scale_after(residual, dtype=dtype).half_range) == pytest.approx(4.0, rel=2.0 / RANGE_ROWS)
 
 
 @given(
@@ -331,8 +331,8 @@ def test_numpy_and_torch_compute_the_same_state(dtype, weighted, monkeypatch):
 def test_many_channels_in_torch_equal_single_channels():
     channels = module.SMALL_STATE + 1
     residual = randn(300, channels)
-    many = numbers(updated(residual, residual**3))
-    few = numbers(updated(residual[:, :5], residual[:, :5] ** 3))
+    many = state_of(scale_after(residual, residual**3))
+    few = state_of(scale_after(residual[:, :5], residual[:, :5] ** 3))
     for name, value in few.items():
         torch.testing.assert_close(many[name][:5], value, rtol=1e-12, atol=1e-12)
 
@@ -349,7 +349,7 @@ def test_the_state_has_no_gradient_and_keeps_no_graph():
 
 
 def test_update_is_the_only_method_that_changes_the_state():
-    scale = updated(randn(30, 2))
+    scale = scale_after(randn(30, 2))
     before = copy.deepcopy(scale.state_dict())
     x, y = randn(40, 2, seed=5), randn(40, 2, seed=6)
     scale.with_batch(x, y, None, -1)
@@ -359,7 +359,7 @@ def test_update_is_the_only_method_that_changes_the_state():
 
 
 def test_with_batch_equals_an_update_for_channels_without_a_batch():
-    scale = updated((randn(30, 2), torch.tensor([True, False]).expand(30, 2)))
+    scale = scale_after((randn(30, 2), torch.tensor([True, False]).expand(30, 2)))
     x, y, weight = 5.0 * randn(40, 2, seed=5), randn(40, 2, seed=6), torch.rand(40, 2, generator=generator())
     seen = scale.with_batch(x, y, weight, -1)
     for name in ("log_scale", "half_range", "floor"):
@@ -371,7 +371,7 @@ def test_with_batch_equals_an_update_for_channels_without_a_batch():
 
 def test_a_scale_resumed_from_a_state_dict_is_bitwise_equal():
     batches = [randn(90, 2, seed=n) * 1.1**n for n in range(20)]
-    scale, resumed = updated(*batches[:13]), ResidualScale(2).double()
+    scale, resumed = scale_after(*batches[:13]), ResidualScale(2).double()
     resumed.load_state_dict(copy.deepcopy(scale.state_dict()))
     for batch in batches[13:]:
         for value in (scale, resumed):

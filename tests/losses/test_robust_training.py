@@ -13,7 +13,7 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def sampled(seed=0, noise=0.3):
+def sample_data(seed=0, noise=0.3):
     """Inputs, the truth, and targets with Gaussian noise."""
     g = generator(seed)
     x = torch.rand(N, 3, generator=g)
@@ -21,7 +21,7 @@ def sampled(seed=0, noise=0.3):
     return x, truth, truth + noise * torch.randn(N, 1, generator=g)
 
 
-def wrong(target, share, kind, seed=1):
+def with_wrong_targets(target, share, kind, seed=1):
     g = generator(seed)
     count = int(share * N)
     rows = torch.randperm(N, generator=g)[:count]
@@ -35,7 +35,7 @@ def wrong(target, share, kind, seed=1):
     return target
 
 
-class Scaled(nn.Module):
+class ScaledNetwork(nn.Module):
     """A network whose last step multiplies by the target's unit, as in a model of a physical quantity."""
 
     def __init__(self, scale=1.0, offset=0.0):
@@ -49,7 +49,7 @@ class Scaled(nn.Module):
 
 def trained(loss, x, y, seed=0, steps=500, scale=1.0, offset=0.0):
     torch.manual_seed(seed)
-    model = Scaled(scale, offset)
+    model = ScaledNetwork(scale, offset)
     groups = [{"params": list(model.parameters())}]
     groups += loss.param_groups(lr=1e-2) if isinstance(loss, MKCLoss) else []
     optimiser = torch.optim.Adam(groups, lr=1e-2)
@@ -70,8 +70,8 @@ def rmse(model, x, truth):
 @pytest.mark.e2e
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1e-3, 0.1), (200.0, 1000.0)])
 def test_targets_of_any_unit_and_offset_are_learned_like_standardised_targets(scale, offset):
-    x, truth, y = sampled()
-    y = wrong(y, 0.2, "uniform")
+    x, truth, y = sample_data()
+    y = with_wrong_targets(y, 0.2, "uniform")
     plain = rmse(trained(MKCLoss(1), x, y), x, truth)
     other = trained(MKCLoss(1), x, y * scale + offset, scale=scale, offset=offset)
     assert rmse(other, x, truth * scale + offset) / scale == pytest.approx(plain, rel=0.05)
@@ -80,8 +80,8 @@ def test_targets_of_any_unit_and_offset_are_learned_like_standardised_targets(sc
 
 @pytest.mark.e2e
 def test_a_plain_network_learns_unscaled_targets():
-    x, truth, y = sampled()
-    truth, y = 1000.0 + 200.0 * truth, wrong(1000.0 + 200.0 * y, 0.2, "factor 1000")
+    x, truth, y = sample_data()
+    truth, y = 1000.0 + 200.0 * truth, with_wrong_targets(1000.0 + 200.0 * y, 0.2, "factor 1000")
     torch.manual_seed(0)
     errors = []
     for loss in (MKCLoss(1), nn.MSELoss()):
@@ -101,7 +101,7 @@ def test_a_plain_network_learns_unscaled_targets():
 def test_on_clean_targets_the_loss_is_as_good_as_least_squares():
     errors = []
     for seed in range(3):
-        x, truth, y = sampled(seed)
+        x, truth, y = sample_data(seed)
         errors.append([rmse(trained(loss, x, y, seed), x, truth) for loss in (MKCLoss(1), nn.MSELoss())])
     ours, squares = torch.tensor(errors).mean(0).tolist()
     assert ours < 1.02 * squares
@@ -109,25 +109,25 @@ def test_on_clean_targets_the_loss_is_as_good_as_least_squares():
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("kind", ["one-sided", "factor 1000", "uniform"])
-def test_half_of_the_targets_may_be_wrong(kind):
-    x, truth, y = sampled()
-    error = rmse(trained(MKCLoss(1), x, wrong(y, 0.5, kind)), x, truth)
-    absolute = rmse(trained(nn.L1Loss(), x, wrong(y, 0.5, kind)), x, truth)
+def test_the_truth_is_learned_with_half_of_the_targets_wrong(kind):
+    x, truth, y = sample_data()
+    error = rmse(trained(MKCLoss(1), x, with_wrong_targets(y, 0.5, kind)), x, truth)
+    absolute = rmse(trained(nn.L1Loss(), x, with_wrong_targets(y, 0.5, kind)), x, truth)
     assert error < 0.15
     assert error < absolute
 
 
-def test_half_of_the_targets_may_be_wrong_with_a_given_d():
-    x, truth, y = sampled()
+def test_the_truth_is_learned_with_a_given_d_and_half_of_the_targets_wrong():
+    x, truth, y = sample_data()
     loss = MKCLoss(1, d=0.3, bound=40.0, objective="robust")
-    assert rmse(trained(loss, x, wrong(y, 0.5, "one-sided")), x, truth) < 0.15
+    assert rmse(trained(loss, x, with_wrong_targets(y, 0.5, "one-sided")), x, truth) < 0.15
 
 
 @pytest.mark.e2e
-def test_half_of_the_targets_may_be_permuted_among_each_other():
+def test_the_truth_is_learned_with_half_of_the_targets_permuted():
     errors = []
     for seed in (3, 4):
-        x, truth, y = sampled(seed)
+        x, truth, y = sample_data(seed)
         rows = torch.randperm(N, generator=generator(seed))[: N // 2]
         y[rows] = y[rows.roll(1)]
         losses = MKCLoss(1), nn.L1Loss(), nn.MSELoss()
@@ -138,11 +138,11 @@ def test_half_of_the_targets_may_be_permuted_among_each_other():
 
 
 @pytest.mark.e2e
-def test_sigma_and_d_describe_the_noise():
-    x, _, y = sampled(noise=0.3)
+def test_learned_sigma_and_d_describe_the_noise():
+    x, _, y = sample_data(noise=0.3)
     clean, heavy = MKCLoss(1), MKCLoss(1)
     trained(clean, x, y)
-    trained(heavy, x, wrong(y, 0.3, "uniform"))
+    trained(heavy, x, with_wrong_targets(y, 0.3, "uniform"))
     assert clean.d.item() == pytest.approx(0.3, rel=0.15)
     assert heavy.d.item() == pytest.approx(0.3, rel=0.25)
     assert heavy.sigma.item() < clean.sigma.item()
@@ -152,8 +152,8 @@ def test_sigma_and_d_describe_the_noise():
 @pytest.mark.e2e
 def test_monitored_values_fall_after_the_schedule_as_the_network_improves():
     """The network term in training and the value in evaluation, which a scheduler or early stopping monitors."""
-    x, truth, y = sampled()
-    y, loss = wrong(y, 0.3, "one-sided"), MKCLoss(1)
+    x, truth, y = sample_data()
+    y, loss = with_wrong_targets(y, 0.3, "one-sided"), MKCLoss(1)
     model = trained(loss, x, y, steps=400)
     assert float(loss.schedule.share) == 1.0
     start = copied(model)
@@ -167,7 +167,7 @@ def test_monitored_values_fall_after_the_schedule_as_the_network_improves():
 
 
 def copied(model):
-    twin = Scaled()
+    twin = ScaledNetwork()
     twin.load_state_dict(model.state_dict())
     return twin
 

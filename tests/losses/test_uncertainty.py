@@ -20,7 +20,7 @@ INF, NAN = math.inf, math.nan
 FIXED = {"learn_sigma": False, "learn_d": False}
 
 
-def made(num_channels=3, *, dtype=torch.float64, **options):
+def make_loss(num_channels=3, *, dtype=torch.float64, **options):
     m = num_channels
     settings = {"sigma": [0.7, 3.0, 20.0][:m], "d": [0.5, 1.0, 2.0][:m], "bound": [9.0, 40.0, 1e3][:m], **options}
     return MKCLoss(m, **{k: torch.tensor(v, dtype=dtype) if isinstance(v, list) else v for k, v in settings.items()})
@@ -36,8 +36,8 @@ def data(*shape, dtype=torch.float64, seed=0):
 
 @pytest.mark.parametrize(("shape", "channel_dim"), [((5, 3), -1), ((3, 5), 0), ((5, 3, 4), 1), ((3,), 0)])
 @pytest.mark.parametrize("options", [{}, FIXED], ids=["learned", "fixed"])
-def test_inlier_weights_are_those_of_the_fixed_point(shape, channel_dim, options):
-    loss = made(channel_dim=channel_dim, **options)
+def test_inlier_weights_equal_those_of_the_fixed_point(shape, channel_dim, options):
+    loss = make_loss(channel_dim=channel_dim, **options)
     x, y = data(*shape)
     expected = mkc_weight((x - y).movedim(channel_dim, -1), loss.sigma, loss.d).movedim(-1, channel_dim)
     found = inlier_weight(loss, x, y)
@@ -46,8 +46,8 @@ def test_inlier_weights_are_those_of_the_fixed_point(shape, channel_dim, options
     assert ((found >= 0) & (found <= 1)).all()
 
 
-def test_inlier_weight_is_the_gradient_relative_to_least_squares():
-    loss = made(reduction="sum")
+def test_the_inlier_weight_equals_the_gradient_relative_to_least_squares():
+    loss = make_loss(reduction="sum")
     x, y = data(6, 3)
     x.requires_grad_()
     (slope,) = torch.autograd.grad(loss(x, y), x)
@@ -55,14 +55,14 @@ def test_inlier_weight_is_the_gradient_relative_to_least_squares():
 
 
 def test_infinite_sigma_gives_weight_1_everywhere():
-    loss = made(sigma=INF, **FIXED)
+    loss = make_loss(sigma=INF, **FIXED)
     x, y = data(4, 3)
     assert (inlier_weight(loss, x, 1e30 * y) == 1).all()
     assert not outliers(loss, x, 1e30 * y).any()
 
 
 def test_weights_of_half_precision_are_computed_in_float32():
-    loss = made(dtype=torch.float32)
+    loss = make_loss(dtype=torch.float32)
     x, y = data(4, 3, dtype=torch.bfloat16)
     found = inlier_weight(loss, x, y)
     assert found.dtype == torch.float32
@@ -70,7 +70,7 @@ def test_weights_of_half_precision_are_computed_in_float32():
 
 
 def test_a_nan_is_refused_as_by_the_loss():
-    loss = made()
+    loss = make_loss()
     x, y = data(4, 3)
     y[2, 1] = NAN
     for function in (inlier_weight, outliers):
@@ -80,7 +80,7 @@ def test_a_nan_is_refused_as_by_the_loss():
 
 
 def test_outliers_are_the_errors_beyond_their_distance():
-    loss = made()
+    loss = make_loss()
     x, y = data(200, 3)
     y[0] = INF
     for limit in (0.01, 0.1, 0.5):
@@ -89,7 +89,7 @@ def test_outliers_are_the_errors_beyond_their_distance():
     assert outliers(loss, x, y).dtype == torch.bool
 
 
-def test_planted_outliers_are_found_and_few_others():
+def test_simulated_outliers_are_found_and_few_others():
     generator = torch.Generator().manual_seed(0)
     y = torch.randn(2000, 1, dtype=torch.float64, generator=generator)
     planted = torch.rand(2000, 1, generator=generator) < 0.2
@@ -104,14 +104,14 @@ def test_planted_outliers_are_found_and_few_others():
 @pytest.mark.parametrize("limit", [0.0, 1.0, -0.1, NAN])
 def test_a_limit_outside_0_and_1_is_refused(limit):
     with pytest.raises(ValueError, match=r"`weight_below`.*\(0, 1\)"):
-        outliers(made(), *data(4, 3), weight_below=limit)
+        outliers(make_loss(), *data(4, 3), weight_below=limit)
 
 
 # --- beyond the bound
 
 
 def test_elements_beyond_the_bound_are_counted_per_channel():
-    loss = made(2, bound=10.0, channel_dim=1)
+    loss = make_loss(2, bound=10.0, channel_dim=1)
     y = torch.zeros(2, 2, 4, dtype=torch.float64)
     y[0, 0, 0], y[1, 0, 2], y[1, 1, 3], y[0, 1, 1] = 10.1, -11.0, 1e9, 10.0
     found = beyond_bound(loss, torch.zeros_like(y), y)
@@ -121,7 +121,7 @@ def test_elements_beyond_the_bound_are_counted_per_channel():
 
 
 def test_weights_and_masks_change_the_share_and_exclude_masked_elements():
-    loss = made(2, bound=10.0)
+    loss = make_loss(2, bound=10.0)
     x, y = torch.zeros(4, 2), torch.tensor([[20.0, 0.0], [0.0, 20.0], [20.0, 0.0], [NAN, INF]])
     found = beyond_bound(loss, x, y, torch.tensor([3.0, 0.5, 0.0, 0.0]))
     assert found.count.tolist() == [1, 1]
@@ -136,7 +136,7 @@ def test_weights_and_masks_change_the_share_and_exclude_masked_elements():
 
 
 def test_a_single_sample_of_rank_one_is_counted():
-    found = beyond_bound(made(), torch.zeros(3), torch.tensor([10.0, 10.0, 1e4]))
+    found = beyond_bound(make_loss(), torch.zeros(3), torch.tensor([10.0, 10.0, 1e4]))
     assert found.count.tolist() == [1, 0, 1]
     assert found.share.tolist() == [1, 0, 1]
 
@@ -144,7 +144,7 @@ def test_a_single_sample_of_rank_one_is_counted():
 # --- intervals
 
 
-def covered(loss, y, level):
+def coverage(loss, y, level):
     low, high = predictive_interval(loss, torch.zeros_like(y), level)
     return ((y > low) & (y < high)).double().mean(0), (y <= low).double().mean(0)
 
@@ -157,7 +157,7 @@ def within_binomial(share, expected, count):
 def draws():
     """A loss and 20 000 draws of its density."""
     torch.manual_seed(0)
-    loss = made()
+    loss = make_loss()
     return loss, MKCDistribution(loss.sigma.detach(), loss.d.detach(), loss.bound).sample((20_000,))
 
 
@@ -165,7 +165,7 @@ def draws():
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.99])
 def test_interval_covers_draws_of_the_density_at_its_level_with_equal_tails(draws, level):
     loss, y = draws
-    inside, below = covered(loss, y, level)
+    inside, below = coverage(loss, y, level)
     count = y.shape[0]
     assert within_binomial(inside, level, count)
     assert within_binomial(below, (1 - level) / 2, count)
@@ -177,13 +177,13 @@ def test_interval_fitted_to_gaussian_noise_covers_new_noise(level):
     count, scale = 40_000, torch.tensor([0.3, 5.0], dtype=torch.float64)
     seen, y = (scale * torch.randn(count, 2, dtype=torch.float64, generator=generator) for _ in range(2))
     fit = fit_density(seen)
-    inside, _ = covered(MKCLoss(2, sigma=fit.sigma, d=fit.d, bound=fit.bound, **FIXED), y, level)
+    inside, _ = coverage(MKCLoss(2, sigma=fit.sigma, d=fit.d, bound=fit.bound, **FIXED), y, level)
     assert within_binomial(inside, level, count / 2)  # the fitted d is as uncertain as the share
 
 
 @pytest.mark.parametrize(("shape", "channel_dim"), [((5, 3), -1), ((3, 5), 0), ((5, 3, 4), -2), ((3,), 0)])
 def test_interval_is_the_quantiles_about_each_prediction(shape, channel_dim):
-    loss = made(channel_dim=channel_dim)
+    loss = make_loss(channel_dim=channel_dim)
     x, _ = data(*shape)
     low, high = predictive_interval(loss, x, 0.8)
     assert low.shape == high.shape == x.shape
@@ -213,12 +213,12 @@ def test_interval_of_the_smallest_sigma_in_float32_and_half_precision(dtype):
 @pytest.mark.parametrize("level", [0.0, 1.0, 90, NAN])
 def test_a_level_that_is_not_a_probability_is_refused(level):
     with pytest.raises(ValueError, match=r"`level`.*\(0, 1\)"):
-        predictive_interval(made(), torch.zeros(4, 3), level)
+        predictive_interval(make_loss(), torch.zeros(4, 3), level)
 
 
 @pytest.mark.parametrize("function", [inlier_weight, outliers, beyond_bound])
 def test_arguments_that_the_loss_refuses_are_refused(function):
-    loss, x = made(), torch.zeros(4, 3)
+    loss, x = make_loss(), torch.zeros(4, 3)
     with pytest.raises(ValueError, match="`input` and `target` of the same shape"):
         function(loss, x, torch.zeros(4, 1))
     with pytest.raises(ValueError, match="3 channels"):
@@ -231,7 +231,7 @@ def test_arguments_that_the_loss_refuses_are_refused(function):
         function(loss, x.numpy(), x)
 
 
-def fields(function, loss, x):
+def result_fields(function, loss, x):
     found = function(loss, x, x)
     return vars(found).values() if hasattr(found, "__dict__") and not isinstance(found, torch.Tensor) else found
 
@@ -250,13 +250,15 @@ def test_another_loss_is_refused_and_a_compiled_loss_accepted(function):
     ):
         with pytest.raises(TypeError, match=rf"`loss`.*MKCLoss.*got {got}; pass the loss that is trained with"):
             function(other, x, x)
-    loss = made()
-    for found, expected in zip(fields(function, torch.compile(loss), x), fields(function, loss, x), strict=True):
+    loss = make_loss()
+    for found, expected in zip(
+        result_fields(function, torch.compile(loss), x), result_fields(function, loss, x), strict=True
+    ):
         assert torch.equal(found, expected)
 
 
 def test_predictions_that_are_not_finite_are_refused():
-    loss, x = made(), torch.zeros(4, 3)
+    loss, x = make_loss(), torch.zeros(4, 3)
     bad = x.clone()
     bad[2, 1] = NAN
     for call in (lambda: predictive_interval(loss, bad), lambda: beyond_bound(loss, bad, x)):
@@ -269,6 +271,6 @@ def test_predictions_that_are_not_finite_are_refused():
 def test_limits_that_are_not_numbers_are_refused():
     x = torch.zeros(4, 3)
     with pytest.raises(TypeError, match=r"`weight_below`.*\(0, 1\).*got 'a'"):
-        outliers(made(), x, x, "a")
+        outliers(make_loss(), x, x, "a")
     with pytest.raises(TypeError, match=r"`level`.*\(0, 1\).*got None"):
-        predictive_interval(made(), x, None)
+        predictive_interval(make_loss(), x, None)

@@ -57,7 +57,7 @@ def linear_residual(X: Tensor, y: Tensor):
 
 
 @pytest.mark.e2e
-def test_least_squares_is_that_of_scipy():
+def test_least_squares_equals_scipy():
     residual = residual_to(noisy(0))
     found = minimise(residual, START, tol=1e-15)
     expected = least_squares(for_scipy(residual), START.numpy(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -68,7 +68,7 @@ def test_least_squares_is_that_of_scipy():
 
 
 @pytest.mark.parametrize(("sigma", "d"), [(1.0, 0.2), (3.0, 0.05), (0.7, 0.5)])
-def test_the_mkc_loss_is_that_of_scipy_with_a_loss_of_its_own(sigma, d):
+def test_the_mkc_loss_equals_scipy_with_a_custom_loss(sigma, d):
     residual = residual_to(noisy(1, 0.2))
 
     def loss(z: np.ndarray) -> np.ndarray:  # SciPy minimises f_scale² Σ rho(z) / 2 with z = (e / f_scale)²
@@ -86,7 +86,7 @@ def test_the_mkc_loss_is_that_of_scipy_with_a_loss_of_its_own(sigma, d):
     torch.testing.assert_close(found.weights, torch.exp(-z.square() / (2 * sigma**2)))
 
 
-def test_bounds_are_those_of_scipy():
+def test_a_bounded_fit_equals_scipy():
     residual = residual_to(noisy(2))
     lower, upper = torch.tensor([0.0, 0.8, -math.inf]).double(), torch.tensor([2.5, math.inf, math.inf]).double()
     found = minimise(residual, torch.tensor([1.0, 1.0, 0.0]).double(), lower=lower, upper=upper, tol=1e-15)
@@ -125,7 +125,7 @@ def test_a_start_outside_the_bounds_is_moved_to_the_nearest_point():
     assert torch.equal(reference.theta, other.theta)
 
 
-def test_equal_bounds_hold_a_parameter():
+def test_equal_bounds_fix_a_parameter():
     residual, fixed = residual_to(noisy(2)), torch.tensor([math.inf, 0.6, math.inf], dtype=torch.float64)
     found = minimise(residual, START, lower=torch.where(fixed < 1, fixed, -math.inf), upper=fixed)
     assert float(found.theta[1]) == 0.6
@@ -163,7 +163,7 @@ def test_missing_convergence_is_reported():
 # identities
 
 
-def test_infinite_sigma_is_weighted_least_squares():
+def test_infinite_sigma_equals_weighted_least_squares():
     X, y = linear(0)
     weight = sample(5, 40).abs()
     found = minimise(linear_residual(X, y), torch.zeros(3).double(), d=0.3, weight=weight)
@@ -174,7 +174,7 @@ def test_infinite_sigma_is_weighted_least_squares():
     torch.testing.assert_close(found.residual.squeeze(-1), X @ expected - y)
 
 
-def test_channels_are_weighed_by_their_d():
+def test_channels_are_weighted_by_their_d():
     X, y = linear(0)
     z = y + 2.0 + sample(9, 40)
     d = torch.tensor([0.5, 2.0]).double()
@@ -183,7 +183,7 @@ def test_channels_are_weighed_by_their_d():
     torch.testing.assert_close(found.theta, expected)
 
 
-def test_a_prior_is_ridge_and_augmented_rows():
+def test_a_prior_equals_ridge_regression_and_augmented_rows():
     X, y = linear(1)
     mean, precision = torch.tensor([1.0, -1.0, 0.5]).double(), torch.tensor([3.0, 0.0, 20.0]).double()
     found = minimise(linear_residual(X, y), torch.zeros(3).double(), prior=GaussianPrior(mean, precision))
@@ -198,13 +198,13 @@ def test_a_prior_is_ridge_and_augmented_rows():
     torch.testing.assert_close(stacked.curvature, found.curvature)
 
 
-def test_a_prior_determines_what_the_residuals_do_not():
+def test_a_prior_determines_parameters_that_the_residuals_do_not():
     prior = GaussianPrior(torch.tensor([1.0, 2.0]).double(), torch.tensor([1.0, 1.0]).double())
     found = minimise(lambda t: (t[:1] - 3.0).unsqueeze(-1), torch.zeros(2).double(), prior=prior)
     torch.testing.assert_close(found.theta, torch.tensor([2.0, 2.0]).double())
 
 
-def test_weight_zero_is_removal_of_whatever_is_there():
+def test_weight_zero_equals_removal_of_any_value():
     X, y = linear(2)
     contaminated = torch.cat([y, torch.tensor([math.nan, math.inf, 1e9]).double()])
     wide = torch.cat([X, torch.tensor([[math.nan] * 3, [1.0] * 3, [1.0] * 3]).double()])
@@ -233,7 +233,7 @@ def test_a_weight_of_two_counts_a_sample_twice():
 
 
 @pytest.mark.parametrize("jacobian", ["reverse", "reverse twice"])
-def test_reverse_mode_gives_what_forward_mode_gives(jacobian):
+def test_reverse_mode_agrees_with_forward_mode(jacobian):
     residual = residual_to(noisy(0, 0.1)[:20].repeat(6))
     for start in (START, torch.stack([START, 1.1 * START])):
         reference = minimise(residual, start, sigma=2.0, d=0.2)
@@ -242,7 +242,7 @@ def test_reverse_mode_gives_what_forward_mode_gives(jacobian):
         torch.testing.assert_close(reference.jacobian, other.jacobian)
 
 
-class Once(torch.autograd.Function):
+class OnceDifferentiable(torch.autograd.Function):
     """The exponential, with a derivative in each mode but no second derivative."""
 
     @staticmethod
@@ -270,12 +270,12 @@ class Once(torch.autograd.Function):
     "function",
     [
         lambda theta: torch.where(T > 0, (T * theta[1]).abs().sqrt(), theta[1]) + theta[0] * T + theta[2],
-        lambda theta: Once.apply(-theta[1] * T) * theta[0] + theta[2],
+        lambda theta: OnceDifferentiable.apply(-theta[1] * T) * theta[0] + theta[2],
         lambda theta: theta[0] * T + theta[2] + 0.0 * theta[1],
     ],
     ids=["infinite slope left out", "no second derivative", "linear"],
 )
-def test_what_reverse_mode_cannot_differentiate_twice_forward_mode_differentiates(function):
+def test_forward_mode_differentiates_functions_without_a_second_derivative(function):
     from mkc_torch._support.forward_mode import forward_tangents, twice_reverse_tangents
 
     found = twice_reverse_tangents(function)(TRUTH)
@@ -297,7 +297,7 @@ def test_float32_stays_float32():
 # constraints
 
 
-def test_an_equality_is_lagranges_closed_form():
+def test_an_equality_gives_the_closed_form_of_lagrange():
     X, y = linear(3)
     C, c = torch.tensor([[1.0, 1.0, 1.0], [1.0, -2.0, 0.0]]).double(), torch.tensor([2.0, 0.5]).double()
     found = minimise(linear_residual(X, y), torch.zeros(3).double(), equality=lambda t: C @ t - c)
@@ -310,7 +310,7 @@ def test_an_equality_is_lagranges_closed_form():
     assert float((C @ free - c).abs().max()) > 0.5
 
 
-def test_a_nonlinear_equality_is_that_of_scipy():
+def test_a_nonlinear_equality_gives_the_solution_of_scipy():
     residual = residual_to(noisy(0))
     found = minimise(residual, START, equality=lambda t: (t[0] * t[1] - 1.5).reshape(1), tol=1e-13)
     expected = scipy_minimize(
@@ -324,7 +324,7 @@ def test_a_nonlinear_equality_is_that_of_scipy():
     np.testing.assert_allclose(found.theta.numpy(), expected.x, rtol=1e-4)
 
 
-def test_an_inequality_that_holds_changes_nothing_and_one_that_does_not_becomes_an_equality():
+def test_an_inactive_inequality_changes_nothing_and_an_active_inequality_acts_as_an_equality():
     X, y = linear(3)
     free = torch.linalg.lstsq(X, y).solution
     loose = minimise(linear_residual(X, y), torch.zeros(3).double(), inequality=lambda t: t + 10.0)
@@ -344,7 +344,7 @@ def test_bounds_and_inequalities_agree():
     torch.testing.assert_close(reference.theta, other.theta, rtol=0, atol=1e-6)
 
 
-def test_a_fit_keeps_bounds_and_equalities_and_knows_no_error_along_them():
+def test_active_bounds_and_equalities_have_standard_error_zero():
     residual = residual_to(noisy(4, 0.2))
     upper = torch.tensor([2.8, math.inf, math.inf], dtype=torch.float64)
     bounded = fit(residual, START, upper=upper, bound=10.0)
@@ -366,13 +366,13 @@ def batch_data() -> tuple[Tensor, Tensor]:
     return torch.stack([noisy(10 * s, 0.05 * s) for s in range(6)]).reshape(2, 3, -1), START.expand(2, 3, 3)
 
 
-def with_data(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
+def decay_residual(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
     return (decay(theta) - data["y"]).unsqueeze(-1)
 
 
-def test_a_batch_is_a_loop():
+def test_a_batch_of_minimisations_equals_a_loop():
     y, start = batch_data()
-    found = minimise(with_data, start, data={"y": y}, sigma=2.0, d=0.1)
+    found = minimise(decay_residual, start, data={"y": y}, sigma=2.0, d=0.1)
     assert found.theta.shape == (2, 3, 3)
     assert found.residual.shape == found.weights.shape == (2, 3, 120, 1)
     assert found.objective.shape == found.converged.shape == (2, 3)
@@ -385,9 +385,9 @@ def test_a_batch_is_a_loop():
             torch.testing.assert_close(found.curvature[i, j], alone.curvature, rtol=1e-5, atol=1e-6)
 
 
-def test_a_batch_of_fits_is_a_loop():
+def test_a_batch_of_fits_equals_a_loop():
     y, start = batch_data()
-    found = fit(with_data, start, data={"y": y})
+    found = fit(decay_residual, start, data={"y": y})
     assert found.sigma.shape == found.d.shape == found.bound.shape == (2, 3, 1)
     assert found.log_likelihood.shape == found.converged.shape == (2, 3)
     assert found.standard_error().shape == (2, 3, 3)
@@ -409,7 +409,7 @@ def test_a_batch_of_starts_shares_a_residual_without_data():
 # MKC-EM
 
 
-def test_an_exponential_decay_survives_thirty_per_cent_of_outliers_and_least_squares_does_not():
+def test_a_decay_is_recovered_from_thirty_per_cent_outliers_unlike_by_least_squares():
     for seed in range(5):
         residual = residual_to(noisy(seed, 0.3))
         found = fit(residual, START)
@@ -421,13 +421,13 @@ def test_an_exponential_decay_survives_thirty_per_cent_of_outliers_and_least_squ
         assert float(found.weights.squeeze(-1)[outlying].max()) < 0.01
 
 
-def test_a_bad_start_is_overcome():
+def test_distant_starts_reach_the_truth():
     for start in ([10.0, 3.0, -5.0], [0.1, 0.01, 3.0], [-2.0, 0.5, 2.0]):
         found = fit(residual_to(noisy(1, 0.3)), torch.tensor(start).double())
         torch.testing.assert_close(found.theta, TRUTH, rtol=0, atol=0.12)
 
 
-def test_gaussian_data_lose_nothing_to_least_squares():
+def test_on_gaussian_data_the_fit_agrees_with_least_squares():
     residual = residual_to(noisy(0))
     found, least = fit(residual, START), minimise(residual, START)
     assert float(found.sigma) > 4
@@ -436,7 +436,7 @@ def test_gaussian_data_lose_nothing_to_least_squares():
     assert float(found.d) == pytest.approx(0.05, rel=0.15)
 
 
-def test_a_linear_residual_gives_what_the_linear_regression_gives():
+def test_a_linear_residual_equals_the_linear_regression():
     X, y = linear(0, 300)
     y[:60] += 5.0
     # the same domain, since the rough fits that choose it differ
@@ -473,7 +473,7 @@ def test_no_fit_is_less_likely_than_a_gaussian_at_least_squares():
         assert float(found.log_likelihood) >= float(gaussian.log_likelihood) - 1e-9
 
 
-def test_a_fit_that_could_interpolate_keeps_its_d():
+def test_d_does_not_collapse_with_few_residuals_per_parameter():
     for seed in range(20):
         X = sample(seed, 20, 9)
         found = fit(linear_residual(X, X.sum(-1) + sample(seed + 1000, 20)), torch.zeros(9).double())
@@ -499,7 +499,7 @@ def test_each_channel_learns_its_own_density():
     assert float(found.d[1]) == pytest.approx(0.2, rel=0.3)
 
 
-def test_a_prior_is_weighed_against_the_likelihood():
+def test_a_prior_and_the_likelihood_are_weighted_by_their_precisions():
     residual = residual_to(noisy(0))
     free = fit(residual, START)
     error = float(free.standard_error()[0])
@@ -536,7 +536,7 @@ def test_a_parameter_without_effect_has_an_infinite_error():
 @pytest.mark.e2e
 @settings(derandomize=True, deadline=None, max_examples=15)
 @given(seed=st.integers(0, 1000), exponent=st.integers(-6, 6), share=st.floats(0.0, 0.3))
-def test_the_unit_of_the_residual_does_not_matter(seed, exponent, share):
+def test_the_fit_is_equivariant_to_the_unit_of_the_residual(seed, exponent, share):
     unit, y = 10.0**exponent, noisy(seed, share)
     reference = fit(residual_to(y), START, bound=20.0)
     other = fit(lambda t: unit * residual_to(y)(t), START, bound=20.0 * unit)
@@ -551,7 +551,7 @@ def test_the_unit_of_the_residual_does_not_matter(seed, exponent, share):
     exponents=st.lists(st.integers(-5, 5), min_size=3, max_size=3),
     sigma=st.sampled_from([1.0, 3.0, math.inf]),
 )
-def test_the_units_of_the_parameters_do_not_matter(seed, exponents, sigma):
+def test_the_fit_is_equivariant_to_the_units_of_the_parameters(seed, exponents, sigma):
     X, y = linear(seed)
     unit = 10.0 ** torch.tensor(exponents).double()
     reference = minimise(linear_residual(X, y), torch.zeros(3).double(), sigma=sigma, d=0.5, tol=1e-13)
@@ -599,26 +599,26 @@ def test_hac_errors_cover_under_correlated_noise_and_those_for_independent_sampl
 # refusals
 
 
-def test_no_covariance_has_no_standard_error():
+def test_without_a_covariance_standard_errors_are_refused():
     found = fit(residual_to(noisy(0)), START, covariance=None)
     assert found.covariance is None
     with pytest.raises(ValueError, match="covariance=None"):
         found.standard_error()
 
 
-def test_a_residual_that_is_not_finite_is_counted():
+def test_residuals_that_are_not_finite_at_the_start_are_refused_with_their_count():
     y = noisy(0)
     y[3:6] = math.nan
     with pytest.raises(ValueError, match=r"finite at `start`.*got 3 of 120"):
         minimise(residual_to(y), START)
 
 
-def test_derivatives_that_are_not_finite_are_named():
+def test_derivatives_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match="finite derivatives at `start`"):
         minimise(lambda t: (T + t[0] + t[1].sqrt()).unsqueeze(-1), torch.tensor([1.0, 0.0]).double())
 
 
-def test_a_step_into_nan_is_not_taken():
+def test_a_step_into_nan_is_shortened():
     found = minimise(lambda t: (torch.log(t) + 3.0).unsqueeze(-1), torch.tensor([5.0]).double())
     torch.testing.assert_close(found.theta, torch.tensor([math.exp(-3.0)]).double())
 
@@ -689,7 +689,7 @@ def test_bad_starts_and_residuals_are_refused(function):
         ({"tol": "a"}, "`tol` to be a number"),
     ],
 )
-def test_arguments_of_another_kind_are_refused(function, arguments, message):
+def test_arguments_of_another_type_are_refused(function, arguments, message):
     given = {"residual": residual_to(noisy(0)), "start": START} | arguments
     with pytest.raises(TypeError, match=message):
         function(given.pop("residual"), given.pop("start"), **given)

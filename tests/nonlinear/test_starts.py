@@ -11,7 +11,7 @@ from mkc_torch.nonlinear import GaussianPrior, fit
 LOW, HIGH = torch.tensor([0.5]).double(), torch.tensor([8.5]).double()
 
 
-def wave(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def contaminated_sine(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """x, sin(kx) with noise of 0.1 and one value in ten a gross outlier, k, and a random start."""
     generator = torch.Generator().manual_seed(seed)
     draw = torch.rand(62, generator=generator, dtype=torch.float64)
@@ -21,65 +21,65 @@ def wave(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return x, y, k, start
 
 
-X, Y, K, START = (torch.stack(part) for part in zip(*(wave(seed) for seed in range(20)), strict=True))
+X, Y, K, START = (torch.stack(part) for part in zip(*(contaminated_sine(seed) for seed in range(20)), strict=True))
 DATA = {"x": X, "y": Y}
 
 
-def off(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
+def sine_residual(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
     return (data["y"] - torch.sin(theta * data["x"])).unsqueeze(-1)
 
 
 def residual_of(seed: int):
-    return lambda theta: off(theta, {"x": X[seed], "y": Y[seed]})
+    return lambda theta: sine_residual(theta, {"x": X[seed], "y": Y[seed]})
 
 
 @pytest.fixture(scope="module")
-def many():
-    return fit(off, START, data=DATA, lower=LOW, upper=HIGH, starts=32)
+def fit_of_many_starts():
+    return fit(sine_residual, START, data=DATA, lower=LOW, upper=HIGH, starts=32)
 
 
 @pytest.fixture(scope="module")
-def single():
-    return fit(off, START, data=DATA, lower=LOW, upper=HIGH)
+def fit_of_a_single_start():
+    return fit(sine_residual, START, data=DATA, lower=LOW, upper=HIGH)
 
 
 @pytest.mark.e2e
-def test_thirty_two_starts_find_what_one_does_not(many, single):
-    assert int(((single.theta - K).abs() < 0.05).sum()) <= 8
-    assert bool(single.converged.all())
-    assert int(((many.theta - K).abs() < 0.05).sum()) >= 19
-    assert bool(((many.agreeing >= 1) & (many.agreeing <= 20)).all())
-    assert many.starts == 32
-    assert single.starts == 1
-    assert single.agreeing.tolist() == [1] * 20
+def test_thirty_two_starts_find_minima_that_a_single_start_misses(fit_of_many_starts, fit_of_a_single_start):
+    assert int(((fit_of_a_single_start.theta - K).abs() < 0.05).sum()) <= 8
+    assert bool(fit_of_a_single_start.converged.all())
+    assert int(((fit_of_many_starts.theta - K).abs() < 0.05).sum()) >= 19
+    assert bool(((fit_of_many_starts.agreeing >= 1) & (fit_of_many_starts.agreeing <= 20)).all())
+    assert fit_of_many_starts.starts == 32
+    assert fit_of_a_single_start.starts == 1
+    assert fit_of_a_single_start.agreeing.tolist() == [1] * 20
 
 
 @pytest.mark.e2e
-def test_the_explained_share_distinguishes_the_right_minimum(many, single):
-    right = (single.theta - K).abs().squeeze(-1) < 0.05
-    share = single.explained(Y.unsqueeze(-1)).squeeze(-1)
+def test_the_explained_share_distinguishes_the_right_minimum(fit_of_many_starts, fit_of_a_single_start):
+    right = (fit_of_a_single_start.theta - K).abs().squeeze(-1) < 0.05
+    share = fit_of_a_single_start.explained(Y.unsqueeze(-1)).squeeze(-1)
     assert float(share[~right].max()) < 0.8
     assert float(share[right].min()) > 0.9
-    assert float(many.explained(Y.unsqueeze(-1)).min()) > 0.9
+    assert float(fit_of_many_starts.explained(Y.unsqueeze(-1)).min()) > 0.9
 
 
 @pytest.mark.e2e
-def test_the_result_is_that_of_a_fit_from_the_best_end(many):
-    again = fit(off, many.theta, data=DATA, lower=LOW, upper=HIGH, graduate=False)
-    torch.testing.assert_close(many.theta, again.theta, rtol=1e-6, atol=0)
-    torch.testing.assert_close(many.standard_error(), again.standard_error(), rtol=1e-3, atol=0)
-    torch.testing.assert_close(many.log_likelihood, again.log_likelihood, rtol=0, atol=1e-6)
+def test_the_result_equals_a_fit_from_the_best_minimum(fit_of_many_starts):
+    again = fit(sine_residual, fit_of_many_starts.theta, data=DATA, lower=LOW, upper=HIGH, graduate=False)
+    torch.testing.assert_close(fit_of_many_starts.theta, again.theta, rtol=1e-6, atol=0)
+    torch.testing.assert_close(fit_of_many_starts.standard_error(), again.standard_error(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(fit_of_many_starts.log_likelihood, again.log_likelihood, rtol=0, atol=1e-6)
 
 
 @pytest.mark.e2e
-def test_a_batch_is_a_loop_and_a_seed_gives_the_same(many):
+def test_a_batch_equals_a_loop_and_equal_seeds_give_equal_results(fit_of_many_starts):
     for seed in (2, 7):
         separate = fit(residual_of(seed), START[seed], lower=LOW, upper=HIGH, starts=32)
-        torch.testing.assert_close(separate.theta, many.theta[seed], rtol=1e-6, atol=0)
+        torch.testing.assert_close(separate.theta, fit_of_many_starts.theta[seed], rtol=1e-6, atol=0)
         assert separate.agreeing.dim() == 0
 
 
-def test_a_domain_and_a_density_that_are_given_are_kept():
+def test_a_given_domain_and_density_are_kept():
     found = fit(residual_of(3), START[3], lower=LOW, upper=HIGH, starts=32, bound=12.0, sigma=2.0, d=0.1)
     assert float((found.theta - K[3]).abs()) < 0.05
     assert (float(found.bound), float(found.sigma), float(found.d)) == pytest.approx((12.0, 2.0, 0.1))
@@ -95,11 +95,11 @@ def test_weights_enter_the_choice_of_the_best_result():
     weight = torch.ones(60).double()
     weight[:6] = 0.0
     contaminated = {"x": X[4], "y": torch.where(weight > 0, Y[4], math.nan)}
-    found = fit(lambda k: off(k, contaminated), START[4], weight=weight, lower=LOW, upper=HIGH, starts=32)
+    found = fit(lambda k: sine_residual(k, contaminated), START[4], weight=weight, lower=LOW, upper=HIGH, starts=32)
     assert float((found.theta - K[4]).abs()) < 0.05
 
 
-def test_a_start_where_the_residual_is_not_finite_is_left_out():
+def test_a_start_where_the_residual_is_not_finite_is_ignored():
     x = torch.linspace(0.1, 3.0, 40, dtype=torch.float64)
     y = torch.sqrt(2.0 * x)
 
@@ -110,7 +110,7 @@ def test_a_start_where_the_residual_is_not_finite_is_left_out():
     assert float(found.theta) == pytest.approx(2.0)
 
 
-def test_one_minimum_is_where_every_start_ends():
+def test_every_start_reaches_a_unique_minimum():
     x = torch.linspace(0.0, 3.0, 50, dtype=torch.float64)
     y = 2.0 * torch.exp(-1.5 * x) + 0.02 * torch.randn(50, generator=torch.Generator().manual_seed(0)).double()
     box = {"lower": torch.tensor([0.5, 0.5]), "upper": torch.tensor([4.0, 3.0])}

@@ -1,4 +1,4 @@
-"""Files as loggers leave them: without a header, with a torn end, in units that the format implies."""
+"""Files as loggers leave them: without a header, with a truncated end, in units that the format implies."""
 
 import pytest
 import torch
@@ -39,18 +39,18 @@ def test_a_header_of_three_names_is_kept(tmp_path):
 
 @pytest.mark.parametrize("end", [["21.0,3"], ["21.0,3", "4"], ["21.0,3", "4", "5.0,6"]])
 @pytest.mark.parametrize("header", [[], ["mag_x,mag_y,mag_z"]])
-def test_torn_lines_at_the_end_are_reported_and_left_out(tmp_path, end, header):
+def test_truncated_lines_at_the_end_are_reported_and_left_out(tmp_path, end, header):
     recording = read(tmp_path, [*header, *ROWS, *end])
     assert len(recording) == len(ROWS)
     assert any("cut short and left out" in note for note in recording.notes)
 
 
-def test_words_at_the_end_are_refused(tmp_path):
+def test_text_after_the_last_row_is_refused(tmp_path):
     with pytest.raises(RecordingError):
         read(tmp_path, ["mag_x,mag_y,mag_z", *ROWS, "the end", "of it"])
 
 
-def test_a_unit_that_the_format_implies_is_not_said_to_be_in_the_file():
+def test_a_unit_implied_by_the_format_is_distinguished_from_a_unit_in_the_file():
     mag = MessageFormat("MAG", "Qh", ("TimeUS", "MagX"), 13)
     implied, stated = units_of(mag, "", "", {}, {}), units_of(mag, "sG", "FC", {"s": "s", "G": "Gauss"}, {"C": 1e-3})
     assert isinstance(implied["MagX"], UsualUnit)
@@ -58,6 +58,6 @@ def test_a_unit_that_the_format_implies_is_not_said_to_be_in_the_file():
     assert isinstance(px4_units("sensor_mag", ["x"])["x"], UsualUnit)
 
 
-def test_a_missing_column_is_named_with_the_column_most_like_it():
+def test_the_error_for_a_missing_column_suggests_the_most_similar_column():
     with pytest.raises(ValueError, match="--columns voltage=Voltage_V"):
         Recording({"time": torch.zeros(3), "Voltage_V": torch.zeros(3)})["voltage"]

@@ -22,7 +22,7 @@ HEAD = "time,mag_x,mag_y,mag_z\n"
 GOOD = HEAD + ROWS
 
 
-def changed(line, text):
+def with_line(line, text):
     """The good table with another text in a line, from 1."""
     lines = GOOD.splitlines()
     lines[line - 1] = text
@@ -63,18 +63,21 @@ BAD = {
     ),
     "JSON": ('{"time": [0, 1],\n "mag_x": [1, 2]}\n', "no column|header|rows|no magnetometer|quotation"),
     # rows
-    "a row too long": (changed(9, "0.14,1,2,3,4"), "line 9 has 5 values but the header names 4 columns"),
-    "a row too short": (changed(9, "0.14,1,2"), "line 9 has 3 values but the header names 4 columns.*remove that line"),
+    "a row too long": (with_line(9, "0.14,1,2,3,4"), "line 9 has 5 values but the header names 4 columns"),
+    "a row too short": (
+        with_line(9, "0.14,1,2"),
+        "line 9 has 3 values but the header names 4 columns.*remove that line",
+    ),
     "the last row too long": (GOOD + "0.7,1,2,3,4\n", "line 32 has 5 values"),
-    "text between rows": (changed(9, "sensor lost"), "line 9 has 1 value but the header names 4 columns"),
-    "text in a number": (changed(9, "0.14,1,two,3"), 'column `mag_y` holds text at line 9, "two"; correct it'),
-    "two numbers in a cell": (changed(9, "0.14,1,2 5,3"), 'column `mag_y` holds text at line 9, "2 5"'),
-    "two points": (changed(9, "0.14,1,2.3.4,3"), 'column `mag_y` holds text at line 9, "2.3.4"'),
-    "underscores": (changed(9, "0.14,1,2_000,3"), 'column `mag_y` holds text at line 9, "2_000"'),
-    "hexadecimal": (changed(9, "0.14,1,0x1F,3"), 'column `mag_y` holds text at line 9, "0x1F"'),
-    "a unit in a cell": (changed(9, "0.14,1,2 uT,3"), 'column `mag_y` holds text at line 9, "2 uT"'),
-    "a quotation that does not end": (changed(9, '0.14,1,"2,3'), "line 9 has an unclosed quotation mark"),
-    "another header": (changed(9, "time,gyro_x,gyro_y,gyro_z"), "line 9 holds words and no numbers.*split the file"),
+    "text between rows": (with_line(9, "sensor lost"), "line 9 has 1 value but the header names 4 columns"),
+    "text in a number": (with_line(9, "0.14,1,two,3"), 'column `mag_y` holds text at line 9, "two"; correct it'),
+    "two numbers in a cell": (with_line(9, "0.14,1,2 5,3"), 'column `mag_y` holds text at line 9, "2 5"'),
+    "two points": (with_line(9, "0.14,1,2.3.4,3"), 'column `mag_y` holds text at line 9, "2.3.4"'),
+    "underscores": (with_line(9, "0.14,1,2_000,3"), 'column `mag_y` holds text at line 9, "2_000"'),
+    "hexadecimal": (with_line(9, "0.14,1,0x1F,3"), 'column `mag_y` holds text at line 9, "0x1F"'),
+    "a unit in a cell": (with_line(9, "0.14,1,2 uT,3"), 'column `mag_y` holds text at line 9, "2 uT"'),
+    "a quotation that does not end": (with_line(9, '0.14,1,"2,3'), "line 9 has an unclosed quotation mark"),
+    "another header": (with_line(9, "time,gyro_x,gyro_y,gyro_z"), "line 9 holds words and no numbers.*split the file"),
     "decimals both ways": ("time;mag_x;mag_y;mag_z\n0.5;1,5;2;3\n1.5;2;2;3\n", '"1,5"; write decimals with a point'),
     "decimal commas between commas": (HEAD + "0,0,1,5,2,5,3,5\n" * 5, "has 8 values.*export the table with semicolons"),
     "thousands or decimals": (
@@ -82,7 +85,7 @@ BAD = {
         "may mark decimals or thousands; write decimals with a point",
     ),
     # time
-    "a day as people write it": (changed(2, "3 May,1,2,3"), 'column `time` holds text at line 2, "3 May"'),
+    "a day as people write it": (with_line(2, "3 May,1,2,3"), 'column `time` holds text at line 2, "3 May"'),
     "an impossible day": (
         HEAD + "2024-02-30T10:00:00,1,2,3\n2024-02-30T10:00:01,1,2,3\n",
         'column `time` holds text at line 2, "2024-02-30T10:00:00"; write times as seconds, or as',
@@ -136,14 +139,14 @@ def test_bad_text_is_rejected_with_the_reason(tmp_path, kind):
     assert re.search(message, sentence), sentence
 
 
-def test_the_kinds_are_many_and_their_messages_differ():
+def test_bad_texts_are_many_and_their_messages_differ():
     assert len(BAD) >= 50
     assert len({message for _, message in BAD.values()}) > 35
 
 
 @pytest.mark.parametrize("kind", ["a row too short", "two sensors", "binary", "zones and none", "two that may be it"])
 @pytest.mark.parametrize("command", ["calibrate", "inspect"])
-def test_the_commands_report_it_in_a_line_and_write_nothing(tmp_path, kind, command):
+def test_commands_report_bad_text_without_a_traceback_and_write_nothing(tmp_path, kind, command):
     content, _ = BAD[kind]
     path = tmp_path / "bad.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -174,17 +177,17 @@ PIECES = [b",", b";", b'"', b"\n", b"\r", b"\0", b"nan", b"-", b"1e999", b"9" * 
     length=st.sampled_from([60, 150, 400, 4000]),
     changes=st.lists(st.tuples(st.integers(0, 400), st.sampled_from(PIECES), st.integers(0, 40)), max_size=10),
 )
-def test_damaged_text_is_read_or_refused_and_nothing_else(tmp_path_factory, source, length, changes):
+def test_damaged_text_is_read_or_refused(tmp_path_factory, source, length, changes):
     data = bytearray(source.bytes()[:length])
     for place, piece, gone in changes:
         data[place : place + gone] = piece
     path = tmp_path_factory.mktemp("damaged") / "rec.csv"
     path.write_bytes(bytes(data))
     for look in (Recording.read, inspect_file):
-        assert _refusal(look, path).startswith((str(path), "rec: "))
+        assert _message_or_name(look, path).startswith((str(path), "rec: "))
 
 
-def _refusal(look, path):
+def _message_or_name(look, path):
     """The error message if a file is rejected; its name if it is read."""
     try:
         look(path)

@@ -58,7 +58,7 @@ def dialects(draw):
 
 @settings(derandomize=True, deadline=None, max_examples=100)
 @given(dialect=dialects())
-def test_any_dialect_is_the_same_recording_to_the_last_digit(tmp_path_factory, dialect):
+def test_every_dialect_gives_the_same_recording_to_the_last_digit(tmp_path_factory, dialect):
     assert_same(read(tmp_path_factory.mktemp("d"), dialect))
 
 
@@ -76,14 +76,14 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_calibration_is_the_same_to_the_last_digit(tmp_path, kind):
+def test_every_dialect_gives_the_same_calibration_to_the_last_digit(tmp_path, kind):
     columns = {"time": torch.from_numpy(SECONDS)}
     columns |= {f"mag_{axis}": torch.from_numpy(MICROTESLA[:, k]) for k, axis in enumerate("xyz")}
     expected, found = calibrate(Recording(columns)), calibrate(read(tmp_path, KINDS[kind]))
     assert (found.center, found.center_se, found.matrix) == (expected.center, expected.center_se, expected.matrix)
 
 
-def test_a_parquet_of_the_same_samples_is_the_same(tmp_path):
+def test_a_parquet_file_of_the_same_samples_gives_the_same_recording(tmp_path):
     columns = {"timestamp": TIME * 100_000} | {f"mag{axis} [uT]": MICROTESLA[:, k] for k, axis in enumerate("XYZ")}
     write_table(tmp_path / "rec.parquet", columns)
     assert_same(Recording.read(tmp_path / "rec.parquet", units={"time": "ns"}))
@@ -94,7 +94,7 @@ def test_warnings_report_what_was_done(tmp_path, kind):
     assert read(tmp_path, KINDS[kind]).notes
 
 
-def test_a_clean_table_is_read_without_a_word(tmp_path):
+def test_a_clean_table_is_read_without_a_warning(tmp_path):
     assert read(tmp_path, PLAIN).warnings == ()
 
 

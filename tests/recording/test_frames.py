@@ -1,4 +1,6 @@
-"""Recordings of NumPy arrays and data frames: what a file of the same table would give."""
+"""Recordings of NumPy arrays and data frames equal those of a file with the same table."""
+
+import re
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ def columns_of(recording):
     return {name: values.numpy() for name, values in recording.columns.items()}
 
 
-def same(recording, other):
+def same_columns(recording, other):
     return recording.names == other.names and all(
         torch.equal(recording[name].nan_to_num(-9.0), other[name].nan_to_num(-9.0)) for name in recording.names
     )
@@ -43,11 +45,11 @@ def test_series_are_columns(library):
 
 
 @each_library
-def test_a_frame_is_a_recording(library):
+def test_a_frame_becomes_a_recording(library):
     want, _ = simulated_recording()
     frame = library.DataFrame(columns_of(want))
     for got in (Recording(frame, name="r"), Recording.from_frame(frame, name="r")):
-        assert same(got, want)
+        assert same_columns(got, want)
         assert got.units == want.units
         assert (got.name, got.warnings) == ("r", ())
     points = got.finite().magnetometer()
@@ -55,7 +57,7 @@ def test_a_frame_is_a_recording(library):
 
 
 @each_library
-def test_a_frame_gives_what_its_file_gives(library, tmp_path):
+def test_a_frame_gives_the_recording_of_its_file(library, tmp_path):
     table = {
         "time": [0.0, 0.1, 0.2],
         "mx": [1, None, 3],
@@ -66,9 +68,10 @@ def test_a_frame_gives_what_its_file_gives(library, tmp_path):
     pl.DataFrame(table).write_parquet(tmp_path / "r.parquet")
     want = Recording.read(tmp_path / "r.parquet", columns={"mag_x": "mx"})
     got = Recording.from_frame(frame, columns={"mag_x": "mx"}, name="r")
-    assert same(got, want)
+    assert same_columns(got, want)
     assert (got.labels, got.units, got.warnings) == (want.labels, want.units, want.warnings)
-    assert got.notes == ("Column `note` holds no numbers and is left out.",)
+    (note,) = got.notes
+    assert re.search(r"`note`.*left out", note)
     assert list(Recording(frame).experiments()) == ["left", "right"]
 
 
@@ -92,7 +95,7 @@ def test_units_and_names_are_those_after_renaming():
         Recording.from_frame(frame, columns={"mag_y": "my"})
 
 
-def test_an_index_with_a_name_is_a_column():
+def test_a_named_index_becomes_a_column():
     frame = pd.DataFrame({"time": [0.0, 0.1], "x": [1.0, 2.0]})
     assert Recording(frame.set_index("time")).names == ("time", "x")
     assert Recording(frame.set_index(pd.Index([5, 6], dtype="Int64", name="x"))).names == ("time", "x")
@@ -125,7 +128,8 @@ def test_frames_without_numbers_are_rejected(frame, message):
 
 def test_times_that_are_not_required_are_left_out():
     frame = pd.DataFrame({"x": [1.0], "written": pd.to_datetime(["2020-01-01"])})
-    assert Recording(frame).warnings == ("Column `written` holds no numbers and is left out.",)
+    (warning,) = Recording(frame).warnings
+    assert re.search(r"`written`.*left out", warning)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.join_recordings import join_recordings
 
 
-def run(begin, name, count=4, step=0.1, **more):
+def run_from(begin, name, count=4, step=0.1, **more):
     time = begin + step * torch.arange(count, dtype=torch.float64)
     return Recording({"time": time, "speed": time * 0.0 + begin, **more}, name=name)
 
@@ -23,7 +23,7 @@ def test_runs_are_named_by_recording_and_label():
         name="bench",
         labels={"experiment": ("slow", "fast")},
     )
-    both = join_recordings([table, run(0.0, "road")])
+    both = join_recordings([table, run_from(0.0, "road")])
     assert both.labels["experiment"] == ("bench/slow", "bench/fast", "road")
     assert both["experiment"].tolist() == [0, 0, 1, 2, 2, 2, 2]
     assert both["speed"].tolist() == [0, 1, 2, 0, 0, 0, 0]
@@ -31,12 +31,12 @@ def test_runs_are_named_by_recording_and_label():
 
 
 def test_missing_and_equal_names_become_unique():
-    both = join_recordings([run(0.0, ""), run(0.0, "a"), run(0.0, "a")])
+    both = join_recordings([run_from(0.0, ""), run_from(0.0, "a"), run_from(0.0, "a")])
     assert both.labels["experiment"] == ("recording 1", "a", "a (2)")
 
 
 def test_a_single_recording_without_runs_is_unchanged():
-    alone = run(5.0, "alone")
+    alone = run_from(5.0, "alone")
     assert join_recordings([alone]) is alone
 
 
@@ -52,7 +52,7 @@ def test_a_single_recording_without_runs_is_unchanged():
     ],
 )
 def test_a_clock_is_shifted_with_a_warning_if_runs_would_overlap(clock, second, begins, warning):
-    both = join_recordings([run(0.0, "a"), run(second, "b")], clock)
+    both = join_recordings([run_from(0.0, "a"), run_from(second, "b")], clock)
     assert float(both["time"][4]) == pytest.approx(begins)
     assert warning in " ".join(both.warnings)
     assert bool(both.warnings) == bool(warning)
@@ -64,7 +64,7 @@ def test_a_clock_is_shifted_with_a_warning_if_runs_would_overlap(clock, second, 
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (run(0.0, "b", current=torch.zeros(4)), "b has `current`, which a has not"),
+        (run_from(0.0, "b", current=torch.zeros(4)), "b has `current`, which a has not"),
         (Recording({"time": torch.arange(4.0)}, name="b"), "a has `speed`, which b has not"),
         (
             Recording({"time": torch.arange(4.0), "speed": torch.zeros(4)}, name="b", units={"speed": "km/h"}),
@@ -74,7 +74,7 @@ def test_a_clock_is_shifted_with_a_warning_if_runs_would_overlap(clock, second, 
 )
 def test_recordings_that_differ_are_refused_with_the_difference(other, words):
     with pytest.raises(RecordingError, match="cannot be diagnosed together") as error:
-        join_recordings([run(0.0, "a"), other])
+        join_recordings([run_from(0.0, "a"), other])
     assert words in str(error.value)
 
 

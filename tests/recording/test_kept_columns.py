@@ -21,7 +21,7 @@ NANOSECONDS = [1735689600000000001, 1735689600000000002, None]
 
 
 @pytest.fixture
-def typed(tmp_path):
+def typed_parquet(tmp_path):
     """A Parquet file with columns of every type that loggers write."""
     day = datetime.date(2026, 1, 1)
     frame = polars.DataFrame(
@@ -50,8 +50,8 @@ def read_csv(path):
     return list(csv.reader(io.StringIO(text), delimiter="\t" if path.suffix == ".tsv" else ","))
 
 
-def test_types_and_missing_values_of_parquet_stay(typed, tmp_path):
-    source, frame = typed
+def test_types_and_missing_values_of_parquet_are_kept(typed_parquet, tmp_path):
+    source, frame = typed_parquet
     target = tmp_path / "deep" / "out.parquet"
     target.parent.mkdir()
     write_with_columns(source, target, NEW)
@@ -62,8 +62,8 @@ def test_types_and_missing_values_of_parquet_stay(typed, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["csv", "tsv"])
-def test_parquet_becomes_text_with_all_its_digits(typed, tmp_path, ending):
-    source, frame = typed
+def test_parquet_becomes_text_with_all_its_digits(typed_parquet, tmp_path, ending):
+    source, frame = typed_parquet
     target = tmp_path / f"out.{ending}"
     write_with_columns(source, target, NEW)
     header, *rows = read_csv(target)
@@ -114,7 +114,7 @@ def test_columns_without_a_name_are_kept(tmp_path):
     assert rows == [["0", "1.50", "", "1.0"], ["1", "2.50", "", "1.0"]]
 
 
-def test_a_column_of_that_name_is_replaced_in_its_place(tmp_path):
+def test_an_existing_column_of_the_same_name_is_replaced_in_place(tmp_path):
     source = tmp_path / "in.csv"
     source.write_text("field_x,a\n9,1\n9,2\n", encoding="utf-8")
     assert write_with_columns(source, tmp_path / "out.csv", {"field_x": torch.ones(2)}) == ("field_x", "a")
@@ -131,7 +131,7 @@ first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";
 @example(rows=[("", "0A")])  # a unit stays in its cell
 @example(rows=[("a", "b 0")])  # a blank separates no cells here
 @given(rows=st.lists(st.tuples(first, cell), min_size=1, max_size=6))
-def test_every_cell_of_a_csv_is_written_as_it_stands(tmp_path_factory, rows):
+def test_every_cell_of_a_csv_is_written_unchanged(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("cells")
     source, target = folder / "in.csv", folder / "out.csv"
     with source.open("w", encoding="utf-8", newline="") as file:

@@ -30,76 +30,76 @@ EXPECTED_WARNINGS = {
 
 
 @pytest.fixture(scope="module")
-def whole():
+def whole_calibration():
     return calibrate(Recording.read(shared_data("magnetometer/full_sphere.csv")))
 
 
-def file(name):
+def messy_file(name):
     return shared_case(f"messy/{name}.csv")
 
 
-def read(name, units=None, sensor=None):
-    return read_magnetometer(file(name), {}, units or {}, sensor)[0]
+def read_messy_file(name, units=None, sensor=None):
+    return read_magnetometer(messy_file(name), {}, units or {}, sensor)[0]
 
 
-def assert_centre(found, whole):
+def assert_centre(found, whole_calibration):
     """Check agreement within two standard errors of either centre."""
     for mine, other, error, other_error in zip(
-        found.center, whole.center, found.center_se, whole.center_se, strict=True
+        found.center, whole_calibration.center, found.center_se, whole_calibration.center_se, strict=True
     ):
         assert abs(mine - other) <= 2.0 * max(error, other_error)
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", sorted(set(SAMPLES) - {"clipped", "frozen_sensor"}))
-def test_the_centre_is_that_of_the_whole_recording(name, whole):
-    recording = read(name)
+def test_every_file_gives_the_centre_of_the_whole_recording(name, whole_calibration):
+    recording = read_messy_file(name)
     assert len(recording) == SAMPLES[name]
     found = calibrate(recording)
     assert found.unit == "µT"
-    assert_centre(found, whole)
+    assert_centre(found, whole_calibration)
 
 
 @pytest.mark.parametrize("name", sorted(EXPECTED_WARNINGS))
 def test_warnings_report_what_was_done_to_read_a_file(name):
-    warnings = " ".join(read(name).notes)
+    warnings = " ".join(read_messy_file(name).notes)
     for words in EXPECTED_WARNINGS[name]:
         assert words in warnings, warnings
 
 
-def test_a_field_in_gauss_is_asked_for_and_then_converted(whole):
+def test_a_field_in_gauss_requires_its_unit_and_is_converted(whole_calibration):
     with pytest.raises(RecordingError, match=r"in gauss .* it would be.*`--convert mag=gauss`"):
-        read("gauss")
-    assert_centre(calibrate(read("gauss", {"mag": "gauss"})), whole)
+        read_messy_file("gauss")
+    assert_centre(calibrate(read_messy_file("gauss", {"mag": "gauss"})), whole_calibration)
 
 
-def test_two_sensors_are_two_calibrations(whole):
-    assert sensor_names(file("two_sensors"), {}, None) == ["mag0", "mag1"]
-    assert_centre(calibrate(read("two_sensors", sensor="mag0")), whole)
-    other = calibrate(read("two_sensors", sensor="mag1"))
+def test_two_sensors_give_two_calibrations(whole_calibration):
+    assert sensor_names(messy_file("two_sensors"), {}, None) == ["mag0", "mag1"]
+    assert_centre(calibrate(read_messy_file("two_sensors", sensor="mag0")), whole_calibration)
+    other = calibrate(read_messy_file("two_sensors", sensor="mag1"))
     assert other.center == pytest.approx((-6.59, 2.34, -17.76), abs=0.1)
     with pytest.raises(RecordingError, match="2 magnetometers, `mag0`, `mag1`; choose one with `--sensor mag0`"):
-        read("two_sensors")
+        read_messy_file("two_sensors")
 
 
 @pytest.mark.parametrize("name", ["header_again", "time_restarts"])
-def test_a_time_that_starts_again_is_a_second_run(name):
-    runs = read(name).experiments()
+def test_a_restarted_time_begins_a_second_run(name):
+    runs = read_messy_file(name).experiments()
     assert [len(run) for run in runs.values()] == [1365, 1365]
     assert all((run.time.diff() >= 0).all() for run in runs.values())
-    in_order = read(name).sorted_by_time()
+    in_order = read_messy_file(name).sorted_by_time()
     assert in_order["mag_x"][:1365].tolist() == runs["1"]["mag_x"].tolist()
 
 
 @pytest.mark.parametrize("name", ["iso_timestamps", "timestamp_in_microseconds", "two_topics"])
 def test_times_are_seconds_from_the_first_sample_without_loss(name):
-    expected = read("gauss", {"mag": "gauss"}).time
-    assert (read(name).time - expected).abs().max() <= 1e-6 + 1e-12  # written with a digit less
+    expected = read_messy_file("gauss", {"mag": "gauss"}).time
+    assert (read_messy_file(name).time - expected).abs().max() <= 1e-6 + 1e-12  # written with a digit less
 
 
 @pytest.mark.parametrize("name", ["clipped", "frozen_sensor"])
-def test_what_the_sensor_got_wrong_is_read_as_it_stands(name):
-    recording = read(name)
+def test_clipped_and_frozen_values_are_read_unchanged(name):
+    recording = read_messy_file(name)
     assert len(recording) == SAMPLES[name]
     assert recording.warnings == ()
     frozen = (recording.magnetometer().diff(dim=0) == 0).all(-1).sum()
@@ -109,7 +109,7 @@ def test_what_the_sensor_got_wrong_is_read_as_it_stands(name):
 
 @pytest.mark.parametrize("name", ["one_block", "one_block_no_time"])
 def test_the_order_of_rows_is_kept(name):
-    recording = read(name)
+    recording = read_messy_file(name)
     assert len(recording) == 400
     assert recording["mag_x"][:3].tolist() == [8.49677, 8.60255, 40.04067]
     assert recording.warnings == ()

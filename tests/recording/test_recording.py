@@ -2,6 +2,7 @@ import copy
 import math
 import os
 import pickle
+import re
 import subprocess
 import sys
 
@@ -22,20 +23,20 @@ def column(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def same(a, b):
-    """Equal to the bit (but for the payload of NaNs)."""
+def bitwise_equal(a, b):
+    """Bitwise equal, except for the payload of NaNs."""
     a, b = torch.as_tensor(a, dtype=torch.float64), torch.as_tensor(b, dtype=torch.float64)
     return a.shape == b.shape and bool(((a == b) & (a.signbit() == b.signbit()) | a.isnan() & b.isnan()).all())
 
 
-def as_file(tmp_path, text, name="rec.csv"):
+def write_file(tmp_path, text, name="rec.csv"):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 
 
 def read(tmp_path, text, name="rec.csv", **options):
-    return Recording.read(as_file(tmp_path, text, name), **options)
+    return Recording.read(write_file(tmp_path, text, name), **options)
 
 
 # --- the class
@@ -46,7 +47,7 @@ def test_a_recording_has_its_columns_in_order_with_length_and_names():
     assert recording.names == ("b", "a")
     assert list(recording.columns) == ["b", "a"]
     assert len(recording) == 3
-    assert same(recording["a"], [4, 5, 6])
+    assert bitwise_equal(recording["a"], [4, 5, 6])
     assert "a" in recording
     assert "c" not in recording
     assert recording.name == "run"
@@ -58,7 +59,7 @@ def test_a_recording_has_its_columns_in_order_with_length_and_names():
 def test_columns_become_float64(dtype):
     recording = Recording({"a": torch.ones(2, dtype=dtype)})
     assert recording["a"].dtype == torch.float64
-    assert same(recording["a"], [1, 1])
+    assert bitwise_equal(recording["a"], [1, 1])
 
 
 def test_columns_are_detached_copies():
@@ -66,7 +67,7 @@ def test_columns_are_detached_copies():
     recording = Recording({"a": source})
     with torch.no_grad():
         source += 1
-    assert same(recording["a"], [0, 0])
+    assert bitwise_equal(recording["a"], [0, 0])
     assert not recording["a"].requires_grad
 
 
@@ -87,7 +88,7 @@ def test_a_recording_survives_pickling(clone):
     recording = Recording({"experiment": column(0)}, name="n", warnings=["W."], labels={"experiment": ["x"]})
     again = clone(recording)
     assert (again.name, again.warnings, again.labels, again.units) == ("n", ("W.",), recording.labels, recording.units)
-    assert same(again["experiment"], [0])
+    assert bitwise_equal(again["experiment"], [0])
 
 
 def test_units_follow_from_names():
@@ -140,13 +141,13 @@ def test_units_and_labels_of_absent_columns_are_refused(option):
 
 def test_stack_returns_columns_in_the_requested_order():
     recording = Recording({"a": column(1, 2), "b": column(3, 4)})
-    assert same(recording.stack("b", "a"), [[3, 1], [4, 2]])
+    assert bitwise_equal(recording.stack("b", "a"), [[3, 1], [4, 2]])
 
 
 def test_stack_is_a_copy():
     recording = Recording({"a": column(1, 2)})
     recording.stack("a").zero_()
-    assert same(recording["a"], [1, 2])
+    assert bitwise_equal(recording["a"], [1, 2])
 
 
 def test_stack_of_nothing_is_refused():
@@ -156,7 +157,7 @@ def test_stack_of_nothing_is_refused():
 
 def test_magnetometer_is_the_three_axes():
     recording = Recording({"mag_z": column(3), "time": column(0), "mag_y": column(2), "mag_x": column(1)})
-    assert same(recording.magnetometer(), [[1, 2, 3]])
+    assert bitwise_equal(recording.magnetometer(), [[1, 2, 3]])
 
 
 @pytest.mark.parametrize("use", [lambda r: r["mag_x"], lambda r: r.stack("t", "mag_x"), lambda r: r.magnetometer()])
@@ -173,7 +174,7 @@ def test_a_missing_column_error_is_a_value_error():
 
 def test_time_is_the_column_or_none():
     assert Recording({"a": column(1)}).time is None
-    assert same(Recording({"time": column(1, 2)}).time, [1, 2])
+    assert bitwise_equal(Recording({"time": column(1, 2)}).time, [1, 2])
 
 
 # --- finite
@@ -187,16 +188,14 @@ def test_finite_drops_rows_and_counts_nan_and_infinite_per_column():
         warnings=["Before."],
     )
     kept = recording.finite("a", "b")
-    assert same(kept.stack("a", "b"), [[1, 1], [3, 3]])
-    assert same(kept["c"], [NAN, 1])
-    assert kept.warnings == (
-        "Before.",
-        "Dropped 4 of 6 samples that are not finite: `a` 2 NaN, 1 infinite; `b` 1 NaN, 1 infinite.",
-    )
+    assert bitwise_equal(kept.stack("a", "b"), [[1, 1], [3, 3]])
+    assert bitwise_equal(kept["c"], [NAN, 1])
+    assert kept.warnings[0] == "Before."
+    assert re.search(r"4 of 6 samples.*not finite.*`a` 2 NaN, 1 infinite.*`b` 1 NaN, 1 infinite", kept.warnings[1])
     assert (kept.name, kept.units["a"]) == ("run", "V")
 
 
-def test_finite_of_no_names_looks_at_every_column():
+def test_finite_without_names_checks_every_column():
     assert len(Recording({"a": column(1, NAN, 1), "b": column(INF, 1, 1)}).finite()) == 1
 
 
@@ -213,7 +212,9 @@ def test_finite_refuses_to_leave_no_row():
 
 def test_finite_counts_a_column_named_twice_once():
     kept = Recording({"a": column(1, NAN)}).finite("a", "a")
-    assert kept.warnings == ("Dropped 1 of 2 samples that are not finite: `a` 1 NaN.",)
+    (warning,) = kept.warnings
+    assert re.search(r"1 of 2 samples.*not finite.*`a` 1 NaN", warning)
+    assert warning.count("`a`") == 1
 
 
 def test_finite_names_a_missing_column():
@@ -228,16 +229,17 @@ def test_a_regular_recording_is_sorted_without_a_warning():
     recording = Recording({"time": torch.arange(10) / 10, "a": torch.arange(10)})
     again = recording.sorted_by_time()
     assert again.warnings == ()
-    assert same(again.stack("time", "a"), recording.stack("time", "a"))
+    assert bitwise_equal(again.stack("time", "a"), recording.stack("time", "a"))
 
 
 def test_unsorted_times_are_sorted_with_a_warning():
     recording = Recording({"time": column(0, 2, 1, 4, 3), "a": column(0, 20, 10, 40, 30)})
     again = recording.sorted_by_time()
-    assert same(again["time"], [0, 1, 2, 3, 4])
-    assert same(again["a"], [0, 10, 20, 30, 40])
-    assert again.warnings == ("The time ran backwards 2 times; the samples were sorted by time.",)
-    assert same(recording["time"], [0, 2, 1, 4, 3])
+    assert bitwise_equal(again["time"], [0, 1, 2, 3, 4])
+    assert bitwise_equal(again["a"], [0, 10, 20, 30, 40])
+    (warning,) = again.warnings
+    assert re.search(r"backwards 2 times.*sorted by time", warning)
+    assert bitwise_equal(recording["time"], [0, 2, 1, 4, 3])
 
 
 def test_of_repeated_times_the_first_in_the_file_is_kept_and_the_others_counted():
@@ -245,17 +247,17 @@ def test_of_repeated_times_the_first_in_the_file_is_kept_and_the_others_counted(
         {"time": column(2, 0, 1, 1, 2, 2), "a": column(5, 0, 1, 1, 6, 5), "b": column(NAN, 0, 0, 0, NAN, NAN)}
     )
     again = recording.sorted_by_time()
-    assert same(again.stack("time", "a"), [[0, 0], [1, 1], [2, 5]])
-    assert again.warnings[1:] == (
-        "Dropped 3 of 6 samples that repeat the time of an earlier sample, 1 of them with other values.",
-    )
+    assert bitwise_equal(again.stack("time", "a"), [[0, 0], [1, 1], [2, 5]])
+    (warning,) = again.warnings[1:]
+    assert re.search(r"3 of 6 samples.*repeat the time.*1 of them with other values", warning)
 
 
 def test_times_that_are_not_finite_are_dropped_and_counted():
     recording = Recording({"time": column(0, NAN, 1, INF, 2), "a": column(0, 9, 1, 9, NAN)})
     again = recording.sorted_by_time()
-    assert same(again.stack("time", "a"), [[0, 0], [1, 1], [2, NAN]])
-    assert again.warnings == ("Dropped 2 of 5 samples without a finite time.",)
+    assert bitwise_equal(again.stack("time", "a"), [[0, 0], [1, 1], [2, NAN]])
+    (warning,) = again.warnings
+    assert re.search(r"2 of 5 samples.*finite time", warning)
 
 
 def test_no_finite_time_at_all_is_an_error():
@@ -270,9 +272,8 @@ def test_sorting_without_times_names_the_missing_column():
 
 def test_gaps_of_more_than_ten_median_intervals_are_reported_with_place_and_length():
     again = Recording({"time": column(0, 1, 2, 3, 4, 5, 16, 17, 18, 43, 44)}).sorted_by_time()
-    assert again.notes == (
-        "The time has 2 gaps of more than 10 median intervals (1 s); the longest, 25 s, begins at 18 s.",
-    )
+    (note,) = again.notes
+    assert re.search(r"2 gaps of more than 10 median intervals \(1 s\).*longest, 25 s, begins at 18 s", note)
 
 
 def test_a_gap_of_ten_median_intervals_is_not_reported():
@@ -290,21 +291,18 @@ def test_each_experiment_has_its_own_clock():
         {"experiment": column(7, 7, 3, 3, 7, 3), "time": column(0, 1, 1, 2, 1, 3), "a": column(0, 1, 2, 3, 4, 5)}
     )
     again = recording.sorted_by_time()
-    assert same(again["experiment"], [7, 7, 3, 3, 3])
-    assert same(again["time"], [0, 1, 1, 2, 3])
-    assert same(again["a"], [0, 1, 2, 3, 5])
-    assert again.warnings == (
-        "Dropped 1 of 6 samples that repeat the time of an earlier sample, 1 of them with other values.",
-    )
+    assert bitwise_equal(again["experiment"], [7, 7, 3, 3, 3])
+    assert bitwise_equal(again["time"], [0, 1, 1, 2, 3])
+    assert bitwise_equal(again["a"], [0, 1, 2, 3, 5])
+    (warning,) = again.warnings
+    assert re.search(r"1 of 6 samples.*repeat the time.*1 of them with other values", warning)
 
 
 def test_a_gap_in_a_run_is_found_and_the_step_between_runs_is_not_a_gap():
     group, time = column(0, 0, 0, 1, 1, 1, 1, 1), column(0, 1, 2, 900, 901, 902, 903, 950)
     again = Recording({"experiment": group, "time": time}, labels={"experiment": ["up", "down"]}).sorted_by_time()
-    assert again.notes == (
-        "The time has 1 gap of more than 10 median intervals (1 s); "
-        "the longest, 47 s, begins at 903 s in experiment down.",
-    )
+    (note,) = again.notes
+    assert re.search(r"1 gap .*longest, 47 s, begins at 903 s in experiment down", note)
 
 
 # --- experiments
@@ -320,8 +318,8 @@ def test_experiments_separate_a_table_by_label_and_drop_the_column():
     )
     parts = recording.experiments()
     assert list(parts) == ["down", "up"]
-    assert same(parts["down"]["a"], [1, 3])
-    assert same(parts["up"]["a"], [2])
+    assert bitwise_equal(parts["down"]["a"], [1, 3])
+    assert bitwise_equal(parts["up"]["a"], [2])
     assert parts["up"].names == ("a",)
     assert (parts["up"].name, parts["up"].units, parts["up"].warnings) == ("table/up", {"a": "V"}, ("W.",))
 
@@ -343,7 +341,7 @@ def test_a_csv_becomes_named_float64_columns(tmp_path):
     recording = read(tmp_path, "time,mag_x\n0,1\n1,-2.5e-3\n")
     assert recording.names == ("time", "mag_x")
     assert recording["time"].dtype == torch.float64
-    assert same(recording.stack("time", "mag_x"), [[0, 1], [1, -2.5e-3]])
+    assert bitwise_equal(recording.stack("time", "mag_x"), [[0, 1], [1, -2.5e-3]])
     assert recording.name == "rec"
     assert recording.warnings == ()
 
@@ -355,36 +353,36 @@ def test_separator_line_ends_and_byte_order_mark_are_recognised(tmp_path, separa
     rows = [["time", " mag_x ", "mag_y"], ["0", " 1", "2 "], ["1", "3", "4"]]
     recording = read(tmp_path, bom + end.join(separator.join(row) for row in rows) + end)
     assert recording.names == ("time", "mag_x", "mag_y")
-    assert same(recording.stack("time", "mag_x", "mag_y"), [[0, 1, 2], [1, 3, 4]])
+    assert bitwise_equal(recording.stack("time", "mag_x", "mag_y"), [[0, 1, 2], [1, 3, 4]])
 
 
 @pytest.mark.parametrize("name", ["rec.CSV", "rec.tsv", "rec.txt"])
-def test_endings_of_text_tables(tmp_path, name):
+def test_text_tables_of_every_extension_are_read(tmp_path, name):
     assert read(tmp_path, "a\tb\n1\t2\n", name)["b"].tolist() == [2]
 
 
 @pytest.mark.parametrize("cell", ["nan", "NaN", "NAN", "-nan", "", "  ", "NA", '""', "null"])
 def test_missing_values_are_nan(tmp_path, cell):
     recording = read(tmp_path, f"time,mag_x\n0,{cell}\n1,2\n")
-    assert same(recording["mag_x"], [NAN, 2])
+    assert bitwise_equal(recording["mag_x"], [NAN, 2])
 
 
 def test_infinities_are_read(tmp_path):
-    assert same(read(tmp_path, "a\ninf\n-inf\nInfinity\n")["a"], [INF, -INF, INF])
+    assert bitwise_equal(read(tmp_path, "a\ninf\n-inf\nInfinity\n")["a"], [INF, -INF, INF])
 
 
-def test_a_column_of_missing_values_alone_stays(tmp_path):
-    assert same(read(tmp_path, "a,b\n1,\n2,nan\n")["b"], [NAN, NAN])
+def test_a_column_of_missing_values_alone_is_kept(tmp_path):
+    assert bitwise_equal(read(tmp_path, "a,b\n1,\n2,nan\n")["b"], [NAN, NAN])
 
 
-def test_blank_lines_are_no_samples(tmp_path):
+def test_blank_lines_are_skipped(tmp_path):
     assert len(read(tmp_path, "\na,b\n\n1,2\n  \n3,4\n\n\n")) == 2
 
 
 def test_quoted_names_and_values_may_hold_the_separator(tmp_path):
     recording = read(tmp_path, '"speed, left","b;c;d;e"\n"1","2"\n')
     assert recording.names == ("speed, left", "b;c;d;e")
-    assert same(recording["b;c;d;e"], [2])
+    assert bitwise_equal(recording["b;c;d;e"], [2])
 
 
 def test_a_column_without_a_name_is_left_out_with_a_warning(tmp_path):
@@ -396,18 +394,19 @@ def test_a_column_without_a_name_is_left_out_with_a_warning(tmp_path):
 def test_a_text_column_that_is_not_required_is_left_out_with_a_warning(tmp_path):
     recording = read(tmp_path, "time,phase,a\n0,up,1\n1,,2\n2,down,3\n")
     assert recording.names == ("time", "a")
-    assert recording.notes == ("Column `phase` holds no numbers and is left out.",)
+    (note,) = recording.notes
+    assert re.search(r"`phase`.*no numbers.*left out", note)
 
 
 def test_text_among_experiments_is_numbered_and_labelled(tmp_path):
     recording = read(tmp_path, "experiment,a\nball/2,1\n7,2\nball/2,3\n")
-    assert same(recording["experiment"], [0, 1, 0])
+    assert bitwise_equal(recording["experiment"], [0, 1, 0])
     assert recording.labels == {"experiment": ("ball/2", "7")}
-    assert same(recording.experiments()["ball/2"]["a"], [1, 3])
+    assert bitwise_equal(recording.experiments()["ball/2"]["a"], [1, 3])
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
-def test_labels_are_written_as_they_were_read(tmp_path, ending):
+def test_labels_round_trip_through_a_file(tmp_path, ending):
     path = tmp_path / f"runs{ending}"
     write_table(path, {"experiment": column(0, 0, 1), "x": column(1, 2, 3)}, labels={"experiment": ["up", "down"]})
     again = Recording.read(path)
@@ -428,14 +427,15 @@ def test_columns_are_renamed(tmp_path):
 
 def test_columns_can_be_swapped(tmp_path):
     recording = read(tmp_path, "mag_x,mag_y\n1,2\n", columns={"mag_x": "mag_y", "mag_y": "mag_x"})
-    assert same(recording.stack("mag_x", "mag_y"), [[2, 1]])
+    assert bitwise_equal(recording.stack("mag_x", "mag_y"), [[2, 1]])
     assert recording.warnings == ()
 
 
 def test_a_renamed_column_replaces_the_files_column_with_a_warning(tmp_path):
     recording = read(tmp_path, "mag_x,mx\n1,2\n", columns={"mag_x": "mx"})
-    assert same(recording["mag_x"], [2])
-    assert recording.notes == ("Column `mag_x` of the file is left out: `mx` takes its name.",)
+    assert bitwise_equal(recording["mag_x"], [2])
+    (note,) = recording.notes
+    assert re.search(r"`mag_x`.*left out.*`mx`", note)
 
 
 def test_renaming_an_absent_column_lists_those_present(tmp_path):
@@ -480,7 +480,7 @@ def test_a_renamed_column_of_text_is_an_error(tmp_path):
         read(tmp_path, "v,a\nfast,1\n", columns={"speed": "v"})
 
 
-def test_an_absent_file_is_named(tmp_path):
+def test_an_absent_file_is_refused_by_name(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"absent\.csv: there is no such file"):
         Recording.read(tmp_path / "absent.csv")
 
@@ -492,7 +492,7 @@ def test_a_folder_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "kind"), [("rec.xlsx", "files ending in .xlsx"), ("rec", "files without an ending")])
-def test_an_unknown_ending_lists_what_can_be_read(tmp_path, name, kind):
+def test_an_unknown_extension_is_refused_with_the_known_extensions(tmp_path, name, kind):
     with pytest.raises(
         RecordingError, match=rf"{kind} are not known; .*; known endings: \.csv, \.tsv, \.txt, \.dat, \.asc, \.parquet"
     ):
@@ -515,12 +515,11 @@ def test_parquet_columns_of_any_number_type_become_float64(tmp_path):
     ).write_parquet(tmp_path / "rec.parquet")
     recording = Recording.read(tmp_path / "rec.parquet")
     assert recording.names == ("time", "mag_x", "on", "empty")
-    assert same(recording["mag_x"], [0.5, NAN, NAN])
-    assert same(recording["on"], [1, 0, NAN])
-    assert same(recording["empty"], [NAN, NAN, NAN])
-    assert recording.notes == (
-        "Column `phase` holds no numbers and is left out.",
-        "Column `day` holds no numbers and is left out.",
+    assert bitwise_equal(recording["mag_x"], [0.5, NAN, NAN])
+    assert bitwise_equal(recording["on"], [1, 0, NAN])
+    assert bitwise_equal(recording["empty"], [NAN, NAN, NAN])
+    assert all(
+        re.search(rf"`{name}`.*left out", note) for name, note in zip(("phase", "day"), recording.notes, strict=True)
     )
 
 
@@ -529,9 +528,9 @@ def test_parquet_columns_are_renamed(tmp_path):
     assert Recording.read(tmp_path / "rec.parquet", columns={"mag_x": "mx"}).names == ("mag_x",)
 
 
-def test_a_parquet_file_name_is_no_pattern(tmp_path):
+def test_a_parquet_file_name_is_not_expanded_as_a_pattern(tmp_path):
     write_table(tmp_path / "run[1].parquet", {"a": column(1)})
-    assert same(Recording.read(tmp_path / "run[1].parquet")["a"], [1])
+    assert bitwise_equal(Recording.read(tmp_path / "run[1].parquet")["a"], [1])
 
 
 @pytest.mark.parametrize(
@@ -560,7 +559,7 @@ def test_a_file_that_only_claims_to_be_parquet_is_an_error(tmp_path):
 
 
 @pytest.mark.process
-def test_the_module_imports_without_the_table_reader():
+def test_the_module_imports_without_polars():
     code = "import sys; sys.modules['polars'] = None; import mkc_torch.recording.recording"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -571,7 +570,7 @@ def test_reading_without_polars_names_the_extra_to_install(tmp_path, monkeypatch
         read(tmp_path, "a\n1\n")
 
 
-def test_writing_a_csv_needs_no_table_reader(tmp_path, monkeypatch):
+def test_writing_a_csv_does_not_need_polars(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "polars", None)
     write_table(tmp_path / "a.csv", {"a": column(1)})
     assert (tmp_path / "a.csv").read_text() == "a\n1.0\n"
@@ -588,7 +587,7 @@ def test_a_written_table_is_read_back_to_the_bit(tmp_path, name):
     write_table(tmp_path / name, columns)
     again = Recording.read(tmp_path / name)
     assert again.names == tuple(columns)
-    assert all(same(again[key], values) for key, values in columns.items())
+    assert all(bitwise_equal(again[key], values) for key, values in columns.items())
 
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cf", "Z"]), min_size=1, max_size=8)
@@ -603,7 +602,7 @@ def test_any_table_is_read_back_to_the_bit(tmp_path_factory, data, names, rows):
     write_table(path, columns)
     again = Recording.read(path)
     assert again.names == tuple(columns)
-    assert all(same(again[key], values) for key, values in columns.items())
+    assert all(bitwise_equal(again[key], values) for key, values in columns.items())
 
 
 def test_an_existing_table_is_replaced_only_on_demand(tmp_path):
@@ -611,12 +610,12 @@ def test_an_existing_table_is_replaced_only_on_demand(tmp_path):
     write_table(path, {"a": column(1)})
     with pytest.raises(FileExistsError, match="--force"):
         write_table(path, {"a": column(2)})
-    assert same(Recording.read(path)["a"], [1])
+    assert bitwise_equal(Recording.read(path)["a"], [1])
     write_table(path, {"a": column(2)}, overwrite=True)
-    assert same(Recording.read(path)["a"], [2])
+    assert bitwise_equal(Recording.read(path)["a"], [2])
 
 
-def test_a_table_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
@@ -635,7 +634,7 @@ def test_a_table_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
         ("a.csv", {}, "at least one column"),
     ],
 )
-def test_what_could_not_be_read_back_is_not_written(tmp_path, name, columns, message):
+def test_tables_that_could_not_be_read_back_are_refused(tmp_path, name, columns, message):
     with pytest.raises(RecordingError, match=message):
         write_table(tmp_path / name, columns)
     assert list(tmp_path.iterdir()) == []
@@ -661,7 +660,7 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path, name, columns, mes
 def test_real_magnetometer_recordings_are_read_whole(name, samples, columns, first):
     recording = Recording.read(shared_data(f"magnetometer/{name}.csv"))
     assert (recording.name, len(recording), len(recording.names)) == (name, samples, columns)
-    assert same(recording.magnetometer()[0], first)
+    assert bitwise_equal(recording.magnetometer()[0], first)
     assert recording.warnings == ()
     in_order = recording.finite().sorted_by_time()
     assert (in_order.time.diff() > 0).all()
@@ -681,21 +680,19 @@ def test_a_real_table_of_several_runs_is_separated_by_its_labels():
 @pytest.mark.parametrize("word", ["n/a", "NA", " null "])
 def test_words_for_a_missing_value_are_reported(tmp_path, word):
     recording = read(tmp_path, f"time,a\n0,1\n1,{word}\n2,\n3,nan\n4,{word}\n")
-    assert same(recording["a"], [1, NAN, NAN, NAN, NAN])
+    assert bitwise_equal(recording["a"], [1, NAN, NAN, NAN, NAN])
     (warning,) = recording.notes
-    assert warning == (
-        f'Column `a` holds "{word.strip()}" or the like 2 times, first at line 3; it is read as a missing value.'
-    )
+    assert re.search(rf'`a` holds "{word.strip()}".* 2 times, first at line 3.*missing value', warning)
 
 
-def test_a_moment_is_a_time(tmp_path):
+def test_a_datetime_column_is_read_as_time(tmp_path):
     path = tmp_path / "a.parquet"
     frame = pl.DataFrame({"time": [10, 250_010], "a": [1.0, 2.0]})
     frame.with_columns(pl.col("time").cast(pl.Datetime("us"))).write_parquet(path)
-    assert same(Recording.read(path).time, [0.0, 0.25])
+    assert bitwise_equal(Recording.read(path).time, [0.0, 0.25])
 
 
-def test_a_moment_is_no_field(tmp_path):
+def test_a_datetime_column_is_refused_as_field(tmp_path):
     path = tmp_path / "a.parquet"
     frame = pl.DataFrame({"mag_x": [0, 1], "a": [1.0, 2.0]})
     frame.with_columns(pl.col("mag_x").cast(pl.Datetime)).write_parquet(path)

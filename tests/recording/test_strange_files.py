@@ -28,7 +28,7 @@ TIME = 0.02 * np.arange(ROWS)
 START = datetime(2024, 5, 3, 23, 59, 58)
 
 
-def turned(offset):
+def simulated_field(offset):
     """A field of 48 µT that turns slowly, about an offset, in tenths of nT."""
     way = np.linspace(0.0, 18.0, ROWS)
     high = np.sin(0.37 * way)
@@ -37,7 +37,7 @@ def turned(offset):
     return np.round(field + offset + 0.1 * np.random.default_rng(3).normal(size=(ROWS, 3)), 4)
 
 
-FIELD, OTHER = turned([12.0, -8.0, 21.0]), turned([-30.0, 5.0, 9.0])
+FIELD, OTHER = simulated_field([12.0, -8.0, 21.0]), simulated_field([-30.0, 5.0, 9.0])
 
 
 def cell(value):
@@ -58,17 +58,17 @@ def german(value):
     return f"{value:,.4f}".replace(",", "_").replace(".", ",").replace("_", ".")
 
 
-def whole(values):
+def whole_numbers(values):
     return [f"{round(value)}" for value in np.asarray(values, dtype=float).tolist()]
 
 
-def ros(since):
+def ros_stamp(since):
     """Seconds and nanoseconds of a stamp."""
     ns = [round(t * 1e9) + 500_000_000 for t in TIME.tolist()]
     return [f"{since + n // 10**9}" for n in ns], [f"{n % 10**9}" for n in ns]
 
 
-SEC, NSEC = ros(1_700_000_000)
+SEC, NSEC = ros_stamp(1_700_000_000)
 MAG = "time,mag_x,mag_y,mag_z"
 XYZ = FIELD.T
 NT = 1000.0 * FIELD
@@ -77,7 +77,7 @@ PLAIN = table(MAG, TIME, *XYZ)
 LINES = PLAIN.splitlines()
 CUT_HALFWAY = ("\n".join(LINES[:100]) + "\n" + LINES[100][:9]).encode() + b"\0" * 512 + b"\n"
 
-SAME = {
+READABLE_FILES = {
     # numbers
     "points between thousands": table(
         "Zeit [s],magX [nT],magY [nT],magZ [nT]", map(german, TIME), *(map(german, axis) for axis in NT.T), sep=";"
@@ -111,7 +111,7 @@ SAME = {
     ),
     "ROS 1, flattened": table(
         "header,seq,stamp,secs,nsecs,frame_id,magnetic_field,x,y,z",
-        [""] * ROWS, whole(range(ROWS)), [""] * ROWS, SEC, NSEC, ['"imu"'] * ROWS, [""] * ROWS, *TESLA,
+        [""] * ROWS, whole_numbers(range(ROWS)), [""] * ROWS, SEC, NSEC, ['"imu"'] * ROWS, [""] * ROWS, *TESLA,
     ),
     "C's timeval": table("tv_sec,tv_usec,mx,my,mz", SEC, [f"{int(n) // 1000}" for n in NSEC], *XYZ),
     # time
@@ -129,11 +129,11 @@ SAME = {
     "minutes and seconds": table(MAG, stamps("%M:%S.%f"), *XYZ),
     "hours": table("time [h],mx,my,mz", [f"{t / 3600:.12f}" for t in TIME], *XYZ),
     "days of a spreadsheet": table(MAG, [f"{45415.5 + t / 86400:.10f}" for t in TIME], *XYZ),
-    "32 bits of µs": table("time_us,mx,my,mz", whole((4294967296 - 2e6 + 1e6 * TIME) % 4294967296), *XYZ),
-    "16 bits of ms": table("time_ms,mx,my,mz", whole((65536 - 2e3 + 1e3 * TIME) % 65536), *XYZ),
+    "32 bits of µs": table("time_us,mx,my,mz", whole_numbers((4294967296 - 2e6 + 1e6 * TIME) % 4294967296), *XYZ),
+    "16 bits of ms": table("time_ms,mx,my,mz", whole_numbers((65536 - 2e3 + 1e3 * TIME) % 65536), *XYZ),
     "over midnight": table(MAG, [f"{(86399 + t) % 86400:.3f}" for t in TIME], *XYZ),
     "over the GPS week": table("GPS_TOW,mx,my,mz", [f"{(604799 + t) % 604800:.3f}" for t in TIME], *XYZ),
-    "a clock of seconds": table(MAG, whole(np.floor(1_700_000_000 + TIME)), *XYZ),
+    "a clock of seconds": table(MAG, whole_numbers(np.floor(1_700_000_000 + TIME)), *XYZ),
     "ten stamps a second": table(MAG, np.floor(TIME * 10.0) / 10.0, *XYZ),
 }  # fmt: skip
 
@@ -152,9 +152,9 @@ def assert_same(recording, field=FIELD, rows=ROWS):
     assert "experiment" not in recording
 
 
-@pytest.mark.parametrize("kind", SAME)
-def test_what_can_mean_one_thing_alone_is_read_as_that(tmp_path, kind):
-    assert_same(read_magnetometer(write(tmp_path, SAME[kind]), {}, {}, None)[0])
+@pytest.mark.parametrize("kind", READABLE_FILES)
+def test_unambiguous_files_are_read_exactly(tmp_path, kind):
+    assert_same(read_magnetometer(write(tmp_path, READABLE_FILES[kind]), {}, {}, None)[0])
 
 
 EXPECTED_WARNINGS = {
@@ -173,12 +173,12 @@ EXPECTED_WARNINGS = {
 
 @pytest.mark.parametrize("kind", EXPECTED_WARNINGS)
 def test_warnings_report_what_was_done(tmp_path, kind):
-    assert EXPECTED_WARNINGS[kind] in " ".join(Recording.read(write(tmp_path, SAME[kind])).notes)
+    assert EXPECTED_WARNINGS[kind] in " ".join(Recording.read(write(tmp_path, READABLE_FILES[kind])).notes)
 
 
 @pytest.mark.parametrize("kind", ["date and time", "ROS 2", "C's timeval"])
 def test_inspect_sees_the_rate_of_a_joined_time_and_the_columns_of_the_file(tmp_path, kind):
-    path = write(tmp_path, SAME[kind])
+    path = write(tmp_path, READABLE_FILES[kind])
     seen = inspect_file(path)
     assert seen.topics[0].rate == pytest.approx(50.0)
     header = path.read_text().splitlines()[0].split(",")
@@ -186,7 +186,7 @@ def test_inspect_sees_the_rate_of_a_joined_time_and_the_columns_of_the_file(tmp_
 
 
 def test_a_column_that_the_caller_names_is_not_joined(tmp_path):
-    path = write(tmp_path, SAME["C's timeval"])
+    path = write(tmp_path, READABLE_FILES["C's timeval"])
     recording = Recording.read(path, columns={"time": "tv_sec"})
     assert recording.names[0] == "time"
     assert "tv_usec" in recording
@@ -201,18 +201,18 @@ def test_a_word_for_a_missing_value_is_nan(tmp_path, word):
     assert f'holds "{word}" or the like 1 time, first at line 10' in " ".join(recording.notes)
 
 
-def test_a_row_that_a_power_off_cut_is_left_out_wherever_it_is(tmp_path):
+def test_a_truncated_row_is_left_out_anywhere_in_the_file(tmp_path):
     path = write(tmp_path, CUT_HALFWAY + "\n".join(LINES[101:]).encode())
     recording = Recording.read(path)
     np.testing.assert_array_equal(recording.magnetometer().numpy(), np.delete(FIELD, 99, axis=0))
     assert "1 line cut short by zero bytes left out, the first line 101" in " ".join(recording.warnings)
 
 
-def test_zero_bytes_at_the_end_of_each_line_cut_nothing(tmp_path):
+def test_zero_bytes_at_the_end_of_each_line_truncate_no_row(tmp_path):
     assert_same(Recording.read(write(tmp_path, PLAIN.replace("\n", "\0\n"))))
 
 
-def two(columns):
+def alternating_rows(columns):
     """Alternating rows of two sensors, with a column that identifies the sensor."""
     rows = [(t, columns[k], *values[i]) for i, t in enumerate(TIME) for k, values in enumerate((FIELD, OTHER))]
     return list(zip(*rows, strict=True))
@@ -222,8 +222,8 @@ def two(columns):
     ("name", "labels", "sensors"),
     [("id", ("0", "1"), ["id0", "id1"]), ("sensor", ("left", "right"), ["left", "right"])],
 )
-def test_rows_of_two_sensors_are_two_calibrations(tmp_path, name, labels, sensors):
-    path = write(tmp_path, table(f"time,{name},mag_x,mag_y,mag_z", *two(labels)))
+def test_alternating_rows_are_read_by_sensor(tmp_path, name, labels, sensors):
+    path = write(tmp_path, table(f"time,{name},mag_x,mag_y,mag_z", *alternating_rows(labels)))
     assert sensor_names(path, {}, None) == sensors
     for sensor, field in zip(sensors, (FIELD, OTHER), strict=True):
         assert_same(read_magnetometer(path, {}, {}, sensor)[0], field)
@@ -233,7 +233,7 @@ def test_rows_of_two_sensors_are_two_calibrations(tmp_path, name, labels, sensor
 
 
 def test_rows_of_several_sensors_are_separated(tmp_path):
-    path = write(tmp_path, table("time,type,x,y,z", *two(("MAG", "ACC"))))
+    path = write(tmp_path, table("time,type,x,y,z", *alternating_rows(("MAG", "ACC"))))
     recording = Recording.read(path)
     assert_same(recording)
     np.testing.assert_allclose(recording["accel_x"].numpy(), OTHER[:, 0], atol=1e-3)
@@ -241,7 +241,7 @@ def test_rows_of_several_sensors_are_separated(tmp_path):
 
 @pytest.mark.e2e
 def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_chosen_sensor(tmp_path):
-    path = write(tmp_path, table("time,id,mag_x,mag_y,mag_z", *two(("0", "1"))))
+    path = write(tmp_path, table("time,id,mag_x,mag_y,mag_z", *alternating_rows(("0", "1"))))
     run = CliRunner()
     made = run.invoke(app, ["calibrate", str(path), "--output", str(tmp_path / "out")])
     assert made.exit_code == 0, made.output
@@ -255,7 +255,9 @@ def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_chosen_sensor(tmp_p
 
 
 def test_alternating_rows_without_a_sensor_column_have_a_warning(tmp_path):
-    path = write(tmp_path, table("time,mag_x,mag_y,mag_z", *np.delete(np.array(two((0.0, 0.0))), 1, axis=0)))
+    path = write(
+        tmp_path, table("time,mag_x,mag_y,mag_z", *np.delete(np.array(alternating_rows((0.0, 0.0))), 1, axis=0))
+    )
     assert "rows of 2 sensors seem to take turns" in " ".join(Recording.read(path).warnings)
     assert interleaved(FIELD) == interleaved(np.random.default_rng(0).normal(size=(999, 3))) == 0
 
@@ -313,7 +315,7 @@ def test_an_error_contains_a_remedy(tmp_path, name, content, message):
 # frames
 
 
-def frame(names, columns):
+def frame_of(names, columns):
     return pd.DataFrame(dict(zip(names.split(","), columns, strict=True)))
 
 
@@ -325,7 +327,7 @@ def test_a_frame_is_recognised_and_converted_like_its_file():
         pd.Series(np.int64(1_700_000_000_000_000_000) + (TIME * 1e9).round().astype(np.int64)),
         pd.Series(stamps("%Y-%m-%dT%H:%M:%S.%f")),
     ):
-        given = frame("timestamp,magX [mG],magY [mG],magZ [mG]", [times, *(10.0 * XYZ)])
+        given = frame_of("timestamp,magX [mG],magY [mG],magZ [mG]", [times, *(10.0 * XYZ)])
         recording = Recording.from_frame(given)
         assert_same(recording)
         warnings = " ".join(recording.notes)
@@ -333,10 +335,10 @@ def test_a_frame_is_recognised_and_converted_like_its_file():
         assert "converted from milligauss" in warnings
 
 
-def test_a_frame_of_two_columns_of_time_or_of_two_sensors_is_read_too():
-    given = frame("secs,nsecs,mx,my,mz", [np.array(SEC, dtype=np.int64), np.array(NSEC, dtype=np.int64), *XYZ])
+def test_a_frame_of_two_time_columns_or_of_two_sensors_is_read():
+    given = frame_of("secs,nsecs,mx,my,mz", [np.array(SEC, dtype=np.int64), np.array(NSEC, dtype=np.int64), *XYZ])
     assert_same(Recording.from_frame(given))
-    both = frame("time,mag0_x,mag0_y,mag0_z,mag1_x,mag1_y,mag1_z", [TIME, *XYZ, *OTHER.T])
+    both = frame_of("time,mag0_x,mag0_y,mag0_z,mag1_x,mag1_y,mag1_z", [TIME, *XYZ, *OTHER.T])
     assert_same(Recording.from_frame(both, sensor="mag1"), OTHER)
     with pytest.raises(RecordingError, match="2 magnetometers, `mag0`, `mag1`; choose one"):
         Recording.from_frame(both)
@@ -344,8 +346,8 @@ def test_a_frame_of_two_columns_of_time_or_of_two_sensors_is_read_too():
     assert Recording(both).names == tuple(both.columns)
 
 
-def test_a_frame_that_is_a_file_s_gives_the_same_recording_to_the_last_digit(tmp_path):
-    path = write(tmp_path, SAME["ROS 2"])
+def test_a_frame_read_from_a_file_gives_the_recording_of_the_file(tmp_path):
+    path = write(tmp_path, READABLE_FILES["ROS 2"])
     of_file, of_frame = Recording.read(path), Recording.from_frame(pd.read_csv(path))
     assert torch.equal(of_file.time, of_frame.time)
     torch.testing.assert_close(of_file.magnetometer(), of_frame.magnetometer(), rtol=1e-15, atol=0.0)

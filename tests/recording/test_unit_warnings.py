@@ -20,7 +20,7 @@ def warnings_of(*columns, units=None, **single):
     return unit_warnings(Recording(table | single, units=units))
 
 
-def test_sizes_that_fit_are_not_spoken_of():
+def test_plausible_magnitudes_have_no_warning():
     recorded = (vector("mag", 50.0), vector("gyro", 2.0), vector("accel", 9.8))
     assert warnings_of(*recorded, time=0.02 * torch.arange(50)) == ()
 
@@ -40,7 +40,7 @@ def test_fields_of_the_earth_and_some_more_are_accepted(size):
         (5e4, "nanotesla (1000 nT = 1 µT)"),
     ],
 )
-def test_fields_in_another_unit_are_named(size, unit):
+def test_fields_in_another_unit_have_a_warning(size, unit):
     (sentence,) = warnings_of(vector("mag", size))
     assert f"in {unit} it would be" in sentence
     assert f"{size:g} µT" in sentence
@@ -48,15 +48,15 @@ def test_fields_in_another_unit_are_named(size, unit):
 
 
 @pytest.mark.parametrize("size", [3.0, 5e3, 1e6])
-def test_raw_counts_are_named(size):
+def test_raw_counts_have_a_warning(size):
     assert "may be raw counts" in warnings_of(vector("mag", size))[0]
 
 
-def test_a_unit_that_was_named_is_believed():
+def test_a_given_unit_has_no_warning():
     assert warnings_of(vector("mag", 500.0), units={f"mag_{a}": "counts" for a in "xyz"}) == ()
 
 
-def test_outliers_and_missing_values_give_nothing_away():
+def test_outliers_and_missing_values_have_no_warning():
     mag = vector("mag", 50.0)
     mag["mag_x"][:20] = 1e6
     mag["mag_y"][20:24] = torch.nan
@@ -64,13 +64,13 @@ def test_outliers_and_missing_values_give_nothing_away():
     assert warnings_of({name: torch.full((50,), torch.nan) for name in mag}) == ()
 
 
-def test_degrees_per_second_are_named():
+def test_degrees_per_second_have_a_warning():
     (sentence,) = warnings_of(vector("gyro", 115.0))
     assert "°/s" in sentence
     assert warnings_of(vector("gyro", 115.0), units={f"gyro_{a}": "°/s" for a in "xyz"}) == ()
 
 
-def test_accelerations_in_g_are_named():
+def test_accelerations_in_g_have_a_warning():
     (sentence,) = warnings_of(vector("accel", 1.0))
     assert "may be in g" in sentence
     assert warnings_of(vector("accel", 1.0), units={f"accel_{a}": "g" for a in "xyz"}) == ()
@@ -80,7 +80,7 @@ def test_accelerations_in_g_are_named():
     ("interval", "shown", "unit"), [(20.0, "20", "ms"), (2e4, "20000", "µs"), (2e7, "20000000", "ns")]
 )
 @pytest.mark.parametrize("since", [0.0, 1.7e9])
-def test_times_in_other_units_are_named(interval, shown, unit, since):
+def test_times_in_other_units_have_a_warning(interval, shown, unit, since):
     time = (50.0 * since + torch.arange(50).double()) * interval
     (sentence,) = warnings_of(vector("mag", 50.0), time=time)
     assert f"lie {shown} s apart" in sentence
@@ -91,13 +91,13 @@ def test_several_units_have_a_warning_each():
     assert len(warnings_of(vector("mag", 0.5), vector("gyro", 115.0), vector("accel", 1.0))) == 3
 
 
-def test_parts_of_a_vector_are_not_judged():
+def test_an_incomplete_vector_has_no_warning():
     mag = vector("mag", 500.0)
     del mag["mag_z"]
     assert warnings_of(mag) == ()
 
 
-def turned(size, offset, share=1.0):
+def measured_field(size, offset, share=1.0):
     """A field that a sensor with an offset measures in all directions, or in a cone about z."""
     direction = torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
@@ -110,12 +110,12 @@ def turned(size, offset, share=1.0):
 
 
 def test_the_length_excludes_the_offset_if_the_turns_determine_it():
-    assert warnings_of(turned(45.0, (590.0, 0.0, 0.0))) == ()
-    (sentence,) = warnings_of(turned(450.0, (2500.0, 0.0, 0.0)))
+    assert warnings_of(measured_field(45.0, (590.0, 0.0, 0.0))) == ()
+    (sentence,) = warnings_of(measured_field(450.0, (2500.0, 0.0, 0.0)))
     assert "measures about 450 µT" in sentence
     assert "milligauss" in sentence
 
 
-def test_a_sensor_that_hardly_turns_is_judged_by_what_it_shows():
-    (sentence,) = warnings_of(turned(450.0, (10.0, 0.0, 30.0), share=0.1))
+def test_a_sensor_that_hardly_turns_is_judged_by_its_magnitude():
+    (sentence,) = warnings_of(measured_field(450.0, (10.0, 0.0, 30.0), share=0.1))
     assert "milligauss" in sentence

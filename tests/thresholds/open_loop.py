@@ -190,12 +190,12 @@ def _slow(random: np.random.Generator, share: float) -> Array:
     return series
 
 
-class _SeenError(Exception):
-    """The search has come far enough."""
+class _SearchStoppedError(Exception):
+    """Stops the search once its statistics are collected."""
 
 
-def seen(name: str, hidden: str, seed: int) -> dict[str, Any]:
-    """Search a recording up to the comparison with a special case, and return what the rules decide by."""
+def search_statistics(name: str, hidden: str, seed: int) -> dict[str, Any]:
+    """Search a recording up to the comparison with a special case, and return the statistics that its rules use."""
     from mkc_torch import diagnose
 
     right = SAME.get(hidden, (hidden, "power_law"))
@@ -216,7 +216,7 @@ def seen(name: str, hidden: str, seed: int) -> dict[str, Any]:
         runs = free_runs(alone, terms, settings)
         row["free"] = [described(run, alone) for _, run in runs]
         if hidden == NOTHING:
-            raise _SeenError
+            raise _SearchStoppedError
         return runs
 
     def open_loop(best: Any, ranking: Any, rivals: Any, alone: Any, runs: Any, terms: Any) -> Any:
@@ -238,14 +238,14 @@ def seen(name: str, hidden: str, seed: int) -> dict[str, Any]:
                 gain = scores(located.fit).log_likelihood - scores(fit).log_likelihood
                 _, (low, _) = gain_interval(gain, blocks.block, torch.Generator().manual_seed(seed))
                 row["special"].append({"effect": other.effect.id, "gap": gaps[other.key], "low": low})
-        raise _SeenError
+        raise _SearchStoppedError
 
     begin = time.process_time()
     with (
         mock.patch.object(with_process_noise, "free_runs", free),
         mock.patch.object(with_process_noise, "with_open_loop_gain", open_loop),
         mock.patch.object(stepwise, "with_special_case", special),
-        contextlib.suppress(_SeenError),
+        contextlib.suppress(_SearchStoppedError),
     ):
         diagnose(SYSTEMS[name][0](), drawn(name, hidden, seed), surrogates=19, max_findings=1)
     return row | {"cpu_seconds": round(time.process_time() - begin, 1)}
@@ -305,7 +305,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in options.systems:
             for hidden in (*SYSTEMS[name][3], NOTHING):
                 if (name, hidden, seed) not in done:
-                    rows.append(seen(name, hidden, seed))
+                    rows.append(search_statistics(name, hidden, seed))
                     file.write_text(json.dumps(rows, indent=1), encoding="utf-8")
                     print(rows[-1], file=sys.stderr)
     print("\n".join(rates(rows)))

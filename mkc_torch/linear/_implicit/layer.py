@@ -24,7 +24,7 @@ from torch.autograd import forward_ad
 from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.density.energy import energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
-from mkc_torch.linear._implicit.refusal import Refusing
+from mkc_torch.linear._implicit.refusal import RaisingIdentity
 from mkc_torch.linear._implicit.stationary import FitData, FitState, stationary
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, checked_shapes, linear_problem
@@ -37,8 +37,8 @@ _APPLICATIONS = 2
 """Orders of derivatives that are right."""
 
 
-class Given(NamedTuple):
-    """What a fit is given in addition to the data, or None: σ, d and domain (*, m), starting coefficients."""
+class GivenParameters(NamedTuple):
+    """Parameters given to a fit, each None if it is not: σ, d and domain (*, m), starting coefficients."""
 
     sigma: Tensor | None
     d: Tensor | None
@@ -79,7 +79,7 @@ def fit_layer(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None,
-    solve: Callable[[LinearProblem, Given], FitState],
+    solve: Callable[[LinearProblem, GivenParameters], FitState],
     *,
     sigma: float | Tensor | None,
     d: float | Tensor | None,
@@ -94,12 +94,12 @@ def fit_layer(
     """
     values = checked_shapes(X, Y, sample_weight)
     rank = len(values.batch)
-    given = Given(*(_of_rank(v, rank, values.Y) for v in (sigma, d, bound, start)))
+    given = GivenParameters(*(_of_rank(v, rank, values.Y) for v in (sigma, d, bound, start)))
     search = _Search(solve, covariance)
     data = (_with_batch_rank(values.X, rank + 3), values.Y, values.sample_weight)
     found: tuple[Tensor, ...] = _Solve.apply(search, *data, *given)  # type: ignore[no-untyped-call]
-    count = len(_Found._fields)
-    return _differentiable(values, given, _Found(*found[:count]), found[count:])
+    count = len(_SearchResult._fields)
+    return _differentiable(values, given, _SearchResult(*found[:count]), found[count:])
 
 
 def _with_batch_rank(value: Tensor, rank: int) -> Tensor:
@@ -114,7 +114,7 @@ def _of_rank(value: float | Tensor | None, rank: int, like: Tensor) -> Tensor | 
     return _with_batch_rank(t, rank + 1)
 
 
-class _Found(NamedTuple):
+class _SearchResult(NamedTuple):
     """Constants that a search returns, each with the user's batch dimensions in front."""
 
     to_coef: Float[Tensor, "*#batch n n"]
@@ -131,11 +131,11 @@ class _Found(NamedTuple):
 
 
 class _Search(NamedTuple):
-    solve: Callable[[LinearProblem, Given], FitState]
+    solve: Callable[[LinearProblem, GivenParameters], FitState]
     covariance: tuple[CovarianceKind, float | None]
 
     @torch.no_grad()
-    def run(self, X: Tensor, Y: Tensor, weight: Tensor | None, given: Given) -> tuple[Tensor, ...]:
+    def run(self, X: Tensor, Y: Tensor, weight: Tensor | None, given: GivenParameters) -> tuple[Tensor, ...]:
         problem = linear_problem(X, Y, weight)
         fit_state = self.solve(problem, given)
         at = stationary(problem, fit_state)
@@ -166,7 +166,7 @@ class _Solve(torch.autograd.Function):
         bound: Tensor | None,
         start: Tensor | None,
     ) -> tuple[Tensor, ...]:
-        return search.run(X, Y, weight, Given(sigma, d, bound, start))
+        return search.run(X, Y, weight, GivenParameters(sigma, d, bound, start))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:  # noqa: ARG004 - signature of torch.autograd.Function
@@ -203,12 +203,14 @@ class _Solve(torch.autograd.Function):
         return found, (0,) * len(found)
 
 
-def _values_left(values: CanonicalShapes) -> Tensor:
+def _residual_dof(values: CanonicalShapes) -> Tensor:
     used = torch.ones_like(values.Y) if values.sample_weight is None else (values.sample_weight > 0).to(values.Y.dtype)
     return used.sum((-2, -1)) - values.X.shape[-1]
 
 
-def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras: tuple[Tensor, ...]) -> Layer:
+def _differentiable(
+    values: CanonicalShapes, given: GivenParameters, found: _SearchResult, extras: tuple[Tensor, ...]
+) -> Layer:
     """Recompute the solution from the data in plain torch: same values, derivatives by two Newton chord steps."""
     rows = torch.matmul(values.X.flatten(-3, -2), found.to_coef)
     likelihood = found.inverse.shape[-1] > found.beta.shape[-1]
@@ -233,7 +235,7 @@ def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras
         if likelihood:
             kappa, log_d = kappa + move[..., n : n + m], log_d + move[..., n + m :]
     unknowns = torch.cat([beta, kappa, log_d], -1)
-    unknowns = Refusing.apply(unknowns, found.cause, "")  # type: ignore[no-untyped-call]
+    unknowns = RaisingIdentity.apply(unknowns, found.cause, "")  # type: ignore[no-untyped-call]
     beta, kappa, log_d = unknowns[..., :n], unknowns[..., n : n + m], unknowns[..., n + m :]
     z = data.residual(beta) * torch.exp(-log_d).unsqueeze(-2)
     log_likelihood = None
@@ -249,7 +251,7 @@ def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras
         bound=torch.exp(log_bound),
         log_likelihood=log_likelihood,
         covariance=found.covariance,
-        dof=_values_left(values),
+        dof=_residual_dof(values),
         differentiable=found.cause == 0,
         converged=found.converged,
         extras=extras,

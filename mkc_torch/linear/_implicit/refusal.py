@@ -12,7 +12,7 @@ class NotDifferentiableError(ValueError):
     """A derivative was taken of a fit that has not converged or is not at a strict minimum."""
 
 
-class Refusing(torch.autograd.Function):
+class RaisingIdentity(torch.autograd.Function):
     """The identity, whose derivative raises for problems with a nonzero ``cause``.
 
     Backward raises only where a gradient arrives: a problem left out of the loss has a gradient of zeros.
@@ -23,7 +23,7 @@ class Refusing(torch.autograd.Function):
         refused = cause != 0
         if check and bool(refused.any()):
             requested = refused & (value != 0).any(-1) if check == "requested" else refused
-            if _somewhere(requested):
+            if _any_true(requested):
                 raise NotDifferentiableError(_refusal(cause, refused))
         return value.clone()
 
@@ -34,11 +34,11 @@ class Refusing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return Refusing.apply(grad, ctx.saved_tensors[0], "requested"), None, None  # type: ignore[no-untyped-call]
+        return RaisingIdentity.apply(grad, ctx.saved_tensors[0], "requested"), None, None  # type: ignore[no-untyped-call]
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
-        result: Tensor = Refusing.apply(tangent, ctx.saved_tensors[0], "all")  # type: ignore[no-untyped-call]
+        result: Tensor = RaisingIdentity.apply(tangent, ctx.saved_tensors[0], "all")  # type: ignore[no-untyped-call]
         return result
 
     @staticmethod
@@ -50,10 +50,10 @@ class Refusing(torch.autograd.Function):
             v.expand(size, *v.shape) if dim is None else v.movedim(dim, 0)
             for v, dim in zip((value, cause), in_dims[:2], strict=True)
         )
-        return Refusing.apply(value, cause, check), 0  # type: ignore[no-untyped-call]
+        return RaisingIdentity.apply(value, cause, check), 0  # type: ignore[no-untyped-call]
 
 
-def _somewhere(mask: Tensor) -> bool:
+def _any_true(mask: Tensor) -> bool:
     try:
         return bool(mask.any())
     except RuntimeError:  # gradients that autograd itself batches have no single value

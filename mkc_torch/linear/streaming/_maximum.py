@@ -9,7 +9,7 @@ import torch
 from mkc_torch.linear._blocks import PassResult
 from mkc_torch.linear._descent import Descent
 from mkc_torch.linear._implicit.stationary import FitState
-from mkc_torch.linear._many_rows import RowsMaximum, descended, maximum_of, more_likely_gaussian
+from mkc_torch.linear._many_rows import RowsMaximum, maximum_of, more_likely_gaussian, run_descent
 from mkc_torch.linear.streaming._rows import StreamedRows
 
 _NEAR = 2e-5
@@ -44,7 +44,7 @@ def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: i
     def descend(descent: Descent, first: PassResult | None = None) -> Descent:
         # the last pass is for the covariance in any case
         most = max_passes - 1 - source.passes + (first is not None)
-        return descended(source, descent, min(most, _EXACT_PASSES) if pilot.exact else most, first)
+        return run_descent(source, descent, min(most, _EXACT_PASSES) if pilot.exact else most, first)
 
     descent = source.begin(pilot.fit_state, **options)
     first: PassResult | None = None
@@ -60,7 +60,7 @@ def streamed_maximum(source: StreamedRows, *, learns_domain: bool, max_passes: i
     if end.done and source.passes < max_passes - 1:
         gaussian = source.ranks.from_first(lambda: more_likely_gaussian(end, pilot.slopes.grams))
         if gaussian is not None:
-            end = descend(replace(source.begin(gaussian, alike=False, **options), history=end.history))
+            end = descend(replace(source.begin(gaussian, slopes_valid=False, **options), history=end.history))
     if not end.done:
         assert end.best is not None
         last = replace(end, point=end.best.point, left=0.0)

@@ -11,7 +11,7 @@ from mkc_torch.calibration.aided import select_response
 from mkc_torch.calibration.aided.mounting import mounting, without_exchange
 from mkc_torch.calibration.aided.turns import turns_of_attitude, turns_of_gyroscope
 from mkc_torch.report import calibration_report
-from tests.calibration.aided.vehicle import changed, example, quaternions
+from tests.calibration.aided.vehicle import example, quaternions, with_columns
 from tests.shared_data import shared_data
 
 MAG, GYRO, Q = (tuple(f"{name}_{a}" for a in axes) for name, axes in (("mag", "xyz"), ("gyro", "xyz"), ("q", "wxyz")))
@@ -26,13 +26,13 @@ def few_samples():
 
 
 @pytest.fixture(scope="module")
-def drawn():
+def simulated():
     return example().drawn(1, 8.0, 15.0, seconds=60.0)
 
 
 @pytest.fixture(scope="module")
-def found(drawn):
-    return calibrate(drawn.recording)
+def calibrated(simulated):
+    return calibrate(simulated.recording)
 
 
 def heading(draw, c):
@@ -40,24 +40,26 @@ def heading(draw, c):
 
 
 @pytest.mark.e2e
-def test_a_gyroscope_gives_a_heading_where_an_ellipsoid_does_not(drawn, found):
-    assert float(heading(drawn, found).square().mean().sqrt()) < 2.0
+def test_a_gyroscope_determines_a_heading_that_an_ellipsoid_does_not(simulated, calibrated):
+    assert float(heading(simulated, calibrated).square().mean().sqrt()) < 2.0
     with pytest.raises(NotIdentifiableError):
-        calibrate(changed(drawn.recording, drop=GYRO))
-    least = example().by_least_squares(drawn)
+        calibrate(with_columns(simulated.recording, drop=GYRO))
+    least = example().by_least_squares(simulated)
     assert least is None or float(least.square().mean().sqrt()) > 4.0
 
 
 @pytest.mark.e2e
-def test_the_aid_is_reported_and_its_standard_errors_hold(drawn, found):
-    aid = found.aid
+def test_the_gyroscope_is_reported_as_aid_with_valid_standard_errors(simulated, calibrated):
+    aid = calibrated.aid
     assert (aid.by, aid.response) == ("gyroscope", "full matrix")
     assert {name for name, value in aid.evidence if value == 0.0} == {"full matrix"}
-    assert any("the gyroscope replaces the missing turns" in w and "Not identifiable" not in w for w in found.notes)
-    off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
+    assert any(
+        "the gyroscope replaces the missing turns" in w and "Not identifiable" not in w for w in calibrated.notes
+    )
+    off = (torch.tensor(calibrated.center).double() - simulated.offset) / torch.tensor(calibrated.center_se).double()
     assert float(off.abs().max()) < 4.0
     assert 0.0 < aid.heading_error < 1.5
-    assert 0.05 < found.rejected_share < 0.25
+    assert 0.05 < calibrated.rejected_share < 0.25
 
 
 @pytest.mark.slow
@@ -65,30 +67,30 @@ def test_the_gyroscopes_bias_is_estimated():
     draw = example().drawn(2, 8.0, 15.0, seconds=60.0)
     bias = torch.tensor([0.01, -0.02, 0.03]).double()
     rates = {name: draw.recording[name] + b for name, b in zip(GYRO, bias.tolist(), strict=True)}
-    before, after = calibrate(draw.recording).aid, calibrate(changed(draw.recording, **rates)).aid
+    before, after = calibrate(draw.recording).aid, calibrate(with_columns(draw.recording, **rates)).aid
     moved = torch.tensor(after.gyro_bias).double() - torch.tensor(before.gyro_bias).double()
     assert float((moved - bias).abs().max()) < 1e-3
 
 
 @pytest.mark.e2e
-def test_json_round_trips_and_old_files_are_read(found):
-    content = json.loads(found.to_json())
+def test_json_round_trips_and_old_files_are_read(calibrated):
+    content = json.loads(calibrated.to_json())
     assert content["schema"] == "mkc-calibration/1"
     assert content["aided"]["by"] == "gyroscope"
-    assert Calibration.from_json(found.to_json()) == found
+    assert Calibration.from_json(calibrated.to_json()) == calibrated
     del content["aided"], content["rejected"]["interval_unit"]
     old = Calibration.from_json(json.dumps(content))
     assert (old.aid, old.disturbed_unit) == (None, "s")
 
 
 @pytest.mark.e2e
-def test_the_report_names_the_aid(drawn, found):
-    page = calibration_report(found, drawn.recording)
+def test_the_report_names_the_aid(simulated, calibrated):
+    page = calibration_report(calibrated, simulated.recording)
     assert "By the gyroscope: offset and full matrix" in page
     assert "Gyroscope bias" in page
 
 
-def level(seconds=30.0, rate=50.0, noise=0.3):
+def level_vehicle(seconds=30.0, rate=50.0, noise=0.3):
     """A vehicle that only turns about its vertical, and its heading."""
     draw = torch.Generator().manual_seed(3)
     t = torch.arange(round(seconds * rate), dtype=torch.float64) / rate
@@ -101,9 +103,11 @@ def level(seconds=30.0, rate=50.0, noise=0.3):
     return t, yaw, columns
 
 
-def test_what_a_level_vehicle_does_not_determine_is_named_and_never_invented():
-    t, yaw, columns = level()
-    c = calibrate(changed(example().drawn(0, seconds=1.0).recording, drop=(*MAG, *GYRO, "time"), time=t, **columns))
+def test_the_vertical_offset_of_a_level_vehicle_is_reported_as_undetermined():
+    t, yaw, columns = level_vehicle()
+    c = calibrate(
+        with_columns(example().drawn(0, seconds=1.0).recording, drop=(*MAG, *GYRO, "time"), time=t, **columns)
+    )
     assert "offset_z" in c.aid.undetermined
     assert math.isinf(c.center_se[2])
     assert json.loads(c.to_json())["center"]["standard_error"][2] is None
@@ -119,24 +123,24 @@ def test_what_a_level_vehicle_does_not_determine_is_named_and_never_invented():
 
 
 @pytest.mark.e2e
-def test_an_attitude_determines_offset_and_matrix(drawn):
-    q = quaternions(drawn.to_world)
-    c = calibrate(changed(drawn.recording, drop=GYRO, **dict(zip(Q, q.unbind(-1), strict=True))))
+def test_an_attitude_determines_offset_and_matrix(simulated):
+    q = quaternions(simulated.to_world)
+    c = calibrate(with_columns(simulated.recording, drop=GYRO, **dict(zip(Q, q.unbind(-1), strict=True))))
     assert c.aid.by == "attitude"
     assert c.aid.gyro_bias is None
-    assert float(heading(drawn, c).square().mean().sqrt()) < 1.0
-    off = (torch.tensor(c.center).double() - drawn.offset) / torch.tensor(c.center_se).double()
+    assert float(heading(simulated, c).square().mean().sqrt()) < 1.0
+    off = (torch.tensor(c.center).double() - simulated.offset) / torch.tensor(c.center_se).double()
     assert float(off.abs().max()) < 4.0
 
 
 @pytest.mark.parametrize(("gains", "chosen"), [((1.0, 1.0, 1.0), "offset"), ((1.06, 0.95, 1.0), "offset and scale")])
-def test_the_simplest_response_that_explains_the_recording_is_chosen(drawn, gains, chosen):
+def test_the_simplest_response_that_explains_the_recording_is_selected(simulated, gains, chosen):
     draw = torch.Generator().manual_seed(5)
-    q = quaternions(drawn.to_world)
-    body = drawn.to_world.mT @ torch.tensor([0.0, 22.0, -40.0]).double()
+    q = quaternions(simulated.to_world)
+    body = simulated.to_world.mT @ torch.tensor([0.0, 22.0, -40.0]).double()
     seen = body * torch.tensor(gains) + torch.tensor([10.0, -5.0, 3.0]) + 0.5 * torch.randn(len(q), 3, generator=draw)
     columns = dict(zip((*MAG, *Q), torch.cat([seen, q], -1).unbind(-1), strict=True))
-    c = calibrate(changed(drawn.recording, drop=(*GYRO, *MAG), **columns))
+    c = calibrate(with_columns(simulated.recording, drop=(*GYRO, *MAG), **columns))
     assert c.aid.response == chosen
     off = (torch.tensor(c.center).double() - torch.tensor([10.0, -5.0, 3.0])) / torch.tensor(c.center_se).double()
     assert float(off.abs().max()) < 4.0
@@ -147,13 +151,13 @@ def test_the_simplest_response_that_explains_the_recording_is_chosen(drawn, gain
 
 
 @pytest.mark.e2e
-def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
-    r = drawn.recording
+def test_a_gyroscope_with_other_axes_or_units_is_refused_with_the_reason(simulated):
+    r = simulated.recording
     swapped = {"mag_x": r["mag_y"], "mag_y": r["mag_x"]}
     with pytest.raises(NotIdentifiableError, match=r"With the gyroscope: .*x and y seem exchanged"):
-        calibrate(changed(r, **swapped))
+        calibrate(with_columns(r, **swapped))
     with pytest.raises(NotIdentifiableError, match="With the gyroscope: the gyroscope does not turn like the field"):
-        calibrate(changed(r, **{name: 57.3 * r[name] for name in GYRO}))
+        calibrate(with_columns(r, **{name: 57.3 * r[name] for name in GYRO}))
 
 
 def test_a_response_with_exchanged_axes_is_reported():
@@ -174,11 +178,11 @@ def test_a_response_with_exchanged_axes_is_reported():
         ((2, 0, 1), (1, 1, 1), "axes seem to differ from the attitude's"),
     ],
 )
-def test_axes_are_checked_against_the_attitude(drawn, order, signs, words):
-    turns = turns_of_attitude(quaternions(drawn.to_world))
-    body = (drawn.to_world.mT @ drawn.field) @ drawn.response.mT + drawn.offset
+def test_exchanged_axes_and_signs_are_detected_by_the_attitude(simulated, order, signs, words):
+    turns = turns_of_attitude(quaternions(simulated.to_world))
+    body = (simulated.to_world.mT @ simulated.field) @ simulated.response.mT + simulated.offset
     seen = body[:, list(order)] * torch.tensor(signs)
-    found = mounting(seen, turns, torch.zeros_like(turns.window), float(drawn.field.norm()), "attitude")
+    found = mounting(seen, turns, torch.zeros_like(turns.window), float(simulated.field.norm()), "attitude")
     assert found is None if words is None else words in found.sentence
 
 
@@ -186,13 +190,13 @@ def test_a_sensor_at_rest_is_refused_with_a_gyroscope_too():
     draw = torch.Generator().manual_seed(0)
     columns = {name: 20.0 + 0.3 * torch.randn(600, generator=draw) for name in MAG}
     columns |= {name: 1e-3 * torch.randn(600, generator=draw) for name in GYRO}
-    recording = changed(example().drawn(0, seconds=1.0).recording, drop=(*MAG, *GYRO, "time"),
+    recording = with_columns(example().drawn(0, seconds=1.0).recording, drop=(*MAG, *GYRO, "time"),
                         time=torch.arange(600) / 50.0, **columns)  # fmt: skip
     with pytest.raises(NotIdentifiableError, match="at rest"):
         calibrate(recording)
 
 
-def test_slopes_of_the_turns_are_those_of_differences():
+def test_derivatives_of_the_turns_equal_differences():
     draw = torch.Generator().manual_seed(1)
     time = torch.arange(60, dtype=torch.float64) / 50.0
     rate = torch.randn(60, 3, generator=draw, dtype=torch.float64)
@@ -209,7 +213,7 @@ def test_slopes_of_the_turns_are_those_of_differences():
 
 
 @pytest.mark.slow
-def test_a_real_quadrotor_is_calibrated_by_what_it_has():
+def test_a_real_quadrotor_is_calibrated_by_its_attitude():
     from mkc_torch import Recording
 
     recording = Recording.read(shared_data("magnetometer/quadrotor_compass1.csv"))

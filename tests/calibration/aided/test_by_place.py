@@ -12,7 +12,7 @@ from mkc_torch.calibration.aided.length_model import Circle, LengthModel
 from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.aided.response import PlaceField
 from mkc_torch.report.words.numbers import aided
-from tests.calibration.aided.vehicle import changed, example
+from tests.calibration.aided.vehicle import example, with_columns
 
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
 
@@ -30,7 +30,7 @@ def field_of(draw, strength=1.0):
     return Field(strength * length, -math.asin(float(draw.field[2]) / length), 0.0)
 
 
-def level(tilt=0.0, count=1200, vertical=-42.0):
+def swaying_vehicle(tilt=0.0, count=1200, vertical=-42.0):
     """A vehicle that turns on level ground and sways by ``lean`` rad."""
     g = torch.Generator().manual_seed(4)
     yaw = torch.linspace(0.0, 20.0, count, dtype=torch.float64)
@@ -48,41 +48,43 @@ EARTH = Field(math.hypot(20.0, 42.0), math.atan2(42.0, 20.0), 0.0)
 
 
 @pytest.fixture(scope="module")
-def drawn():
+def simulated():
     return example().drawn(100_301, 8.0, 15.0, seconds=60.0)
 
 
 @pytest.fixture(scope="module")
-def found(drawn):
-    return calibrate(changed(drawn.recording, drop=GYRO), earth=field_of(drawn, 1.005))
+def calibrated(simulated):
+    return calibrate(with_columns(simulated.recording, drop=GYRO), earth=field_of(simulated, 1.005))
 
 
 @pytest.mark.e2e
-def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
-    off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
+def test_place_and_date_determine_offsets_and_headings_up_to_a_constant(simulated, calibrated):
+    off = (torch.tensor(calibrated.center).double() - simulated.offset) / torch.tensor(calibrated.center_se).double()
     assert float(off.abs().max()) < 4.0
     error = torch.deg2rad(
-        example().heading_errors(drawn, torch.tensor(found.center).double(), torch.tensor(found.matrix).double())
+        example().heading_errors(
+            simulated, torch.tensor(calibrated.center).double(), torch.tensor(calibrated.matrix).double()
+        )
     )
     constant = torch.atan2(error.sin().mean(), error.cos().mean())
     assert math.degrees(float((error - constant).sin().square().mean().sqrt())) < 3.0
     with pytest.raises(NotIdentifiableError):
-        calibrate(changed(drawn.recording, drop=GYRO))
+        calibrate(with_columns(simulated.recording, drop=GYRO))
 
 
-def test_warnings_state_the_aid_and_its_assumptions(found):
-    assert found.aid.by == "place"
-    assert any("field of the place replaces the missing turns" in note for note in found.notes)
-    assert any("level ground" in warning and "known heading" in warning for warning in found.warnings)
-    assert "By the place" in " ".join(aided(found))
-    assert "constant heading offset cannot be observed" in " ".join(aided(found))
-    matrix = torch.tensor(found.matrix)
+def test_warnings_state_the_aid_and_its_assumptions(calibrated):
+    assert calibrated.aid.by == "place"
+    assert any("field of the place replaces the missing turns" in note for note in calibrated.notes)
+    assert any("level ground" in warning and "known heading" in warning for warning in calibrated.warnings)
+    assert "By the place" in " ".join(aided(calibrated))
+    assert "constant heading offset cannot be observed" in " ".join(aided(calibrated))
+    matrix = torch.tensor(calibrated.matrix)
     assert torch.allclose(matrix, matrix.mT, atol=1e-6)
-    assert Calibration.from_json(found.to_json()) == found
+    assert Calibration.from_json(calibrated.to_json()) == calibrated
 
 
-def test_without_any_tilt_nobody_knows_on_which_side_of_the_circle_the_offset_lies():
-    c = calibrate(level(), earth=EARTH)
+def test_without_tilts_the_vertical_offset_is_undetermined():
+    c = calibrate(swaying_vehicle(), earth=EARTH)
     assert "offset_z" in c.aid.undetermined
     assert math.isinf(c.center_se[2])
     assert any(w.startswith("Not determined: the offset of z") and w.endswith("Tilt it more.") for w in c.warnings)
@@ -92,32 +94,32 @@ def test_without_any_tilt_nobody_knows_on_which_side_of_the_circle_the_offset_li
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("vertical", [-42.0, 42.0])
-def test_tilts_show_on_which_side_it_lies(vertical):
-    c = calibrate(level(0.15, vertical=vertical), earth=EARTH)
+def test_tilts_determine_the_vertical_offset(vertical):
+    c = calibrate(swaying_vehicle(0.15, vertical=vertical), earth=EARTH)
     assert "offset_z" not in c.aid.undetermined
     assert abs(c.center[2] - 15.0) < 4.0 * c.center_se[2] < 24.0
 
 
-def test_another_place_is_refused_with_both_widths():
+def test_the_field_of_another_place_is_refused_with_both_radii():
     with pytest.raises(NotIdentifiableError, match=r"circle of radius 20.*of the place is 40"):
-        calibrate(level(0.15), earth=Field(math.hypot(40.0, 20.0), math.atan2(20.0, 40.0), 0.0))
+        calibrate(swaying_vehicle(0.15), earth=Field(math.hypot(40.0, 20.0), math.atan2(20.0, 40.0), 0.0))
 
 
 def test_a_vehicle_that_hardly_turned_is_refused():
-    part = level(0.15, count=4000)
+    part = swaying_vehicle(0.15, count=4000)
     part = Recording({name: values[:100] for name, values in part.columns.items()})
     with pytest.raises(NotIdentifiableError, match=r"vertical axis, at least once round"):
         calibrate(part, earth=EARTH)
 
 
-def model(rises=0.6):
+def make_model(rises=0.6):
     axis = torch.tensor([0.0, 0.6, 0.8]).double()
     drawn = Circle(axis, torch.tensor([4.0, -2.0, 9.0]).double(), 35.0)
     return LengthModel("full matrix", 50.0, biased=False, circle=drawn, rises=rises, rises_error=0.02)
 
 
 def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle():
-    fitted_model, g = model(), torch.Generator().manual_seed(0)
+    fitted_model, g = make_model(), torch.Generator().manual_seed(0)
     response = 50.0 * torch.tensor([[1.1, 0.05, 0.0], [0.05, 0.9, 0.1], [0.0, 0.1, 1.2]]).double()
     theta = fitted_model.start(torch.tensor([3.0, 4.0, 5.0]).double(), response)
     assert torch.allclose(fitted_model.response(theta), response)
@@ -141,7 +143,7 @@ def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle
 @pytest.mark.parametrize("rises", [0.6, -0.6])
 def test_a_turn_without_tilts_is_equally_likely_on_either_side(rises):
     """Mirroring everything at the plane of the circle changes nothing: noise of lengths favours neither side."""
-    recording = level()
+    recording = swaying_vehicle()
     points, place = recording.magnetometer(), PlaceField(EARTH.strength, EARTH.inclination, 0.5, 0.01)
     first = by_place._judged(*_mirrored(points, rises, place))
     other = by_place._judged(*_mirrored(points, -rises, place))

@@ -12,7 +12,7 @@ from mkc_torch.calibration import calibrate, earth_field
 from mkc_torch.calibration.aided.place import Field, parsed_date, parsed_place
 
 
-def test_the_field_is_that_of_the_models_own_test_values():
+def test_the_field_equals_the_test_values_of_the_model():
     ahrs = pytest.importorskip("ahrs")
     lines = (Path(ahrs.__file__).parent / "utils/WMM2025/WMM2025_TEST_VALUES.txt").read_text().splitlines()
     rows = [list(map(float, line.split())) for line in lines if line.strip() and not line.startswith("#")]
@@ -43,12 +43,12 @@ def test_places_and_dates_out_of_range_are_refused(place, date, words):
 
 
 @pytest.mark.parametrize("text", ["", "48", "48,x", "1,2,3,4", "nan,1"])
-def test_a_place_is_two_or_three_numbers(text):
+def test_a_place_other_than_two_or_three_numbers_is_refused(text):
     with pytest.raises(ValueError, match="LAT,LON"):
         parsed_place(text)
 
 
-def test_a_date_is_a_date():
+def test_a_date_in_another_format_is_refused():
     assert parsed_date(" 2026-05-01") == datetime.date(2026, 5, 1)
     with pytest.raises(ValueError, match="YYYY-MM-DD"):
         parsed_date("1.5.2026")

@@ -14,25 +14,25 @@ from mkc_torch.calibration.aided.turns import HALF_A_TURN, WINDOW, Turns, turns_
 N = 60
 
 
-def draw(*shape, seed=0):
+def normal_draws(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def problem(name, biased):
+def response_problem(name, biased):
     """A model, parameters away from its start, and its residual."""
-    frames = torch.linalg.qr(draw(N, 3, 3))[0]
-    turns = Turns(frames, torch.arange(N) // 15, 0.1 * draw(N, 3, ERRORS, seed=1) if biased else None, None)
+    frames = torch.linalg.qr(normal_draws(N, 3, 3))[0]
+    turns = Turns(frames, torch.arange(N) // 15, 0.1 * normal_draws(N, 3, ERRORS, seed=1) if biased else None, None)
     model = Model(name, 50.0, biased)
-    theta = model.start(draw(3, seed=2), 50.0 * torch.eye(3, dtype=torch.float64))
-    measured, weight = 50.0 * draw(N, 3, seed=3), draw(N, seed=4).abs()
-    theta = theta + 0.01 * draw(len(theta), seed=5)
+    theta = model.start(normal_draws(3, seed=2), 50.0 * torch.eye(3, dtype=torch.float64))
+    measured, weight = 50.0 * normal_draws(N, 3, seed=3), normal_draws(N, seed=4).abs()
+    theta = theta + 0.01 * normal_draws(len(theta), seed=5)
     return theta, lambda parameters: model.residual(parameters, measured, turns, weight)
 
 
 @pytest.mark.parametrize("name", ["offset", "offset and scale", "full matrix"])
 @pytest.mark.parametrize("biased", [False, True])
-def test_tangents_are_differences_and_none_takes_torchs_functions_in_python(name, biased):
-    theta, residual = problem(name, biased)
+def test_tangents_equal_differences_without_python_fallbacks_of_torch(name, biased):
+    theta, residual = response_problem(name, biased)
     tangents = forward_tangents(residual)
     found = tangents(theta)  # the first use loads rules, which are Python's own
     used = []
@@ -55,7 +55,7 @@ def test_tangents_are_differences_and_none_takes_torchs_functions_in_python(name
     torch.testing.assert_close(found, moved / (2.0 * step), rtol=1e-6, atol=1e-6)
 
 
-def by_a_loop(time, rate):
+def first_samples_by_loop(time, rate):
     """The first sample of each sample's window."""
     turn = torch.linalg.vector_norm(0.5 * (rate[1:] + rate[:-1]), dim=-1) * time.diff()
     angle, broken = [0.0, *turn.cumsum(0).tolist()], [False, *gaps(time).tolist()]
@@ -69,12 +69,12 @@ def by_a_loop(time, rate):
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, 3.0, 40.0])
 @pytest.mark.parametrize("count", [2, 6, 700])
-def test_a_stretch_ends_after_its_time_or_half_a_turn_or_at_a_gap(count, speed):
-    time = (0.2 * draw(count, seed=6).abs()).cumsum(0)
+def test_a_window_ends_after_its_time_or_half_a_turn_or_at_a_gap(count, speed):
+    time = (0.2 * normal_draws(count, seed=6).abs()).cumsum(0)
     time[count // 2 :] += 30.0
-    rate = speed * draw(count, 3, seed=7)
+    rate = speed * normal_draws(count, 3, seed=7)
     found = turns_of_gyroscope(time, rate, (slice(0, count),), torch.zeros(ERRORS, dtype=torch.float64))
-    first = by_a_loop(time, rate)
+    first = first_samples_by_loop(time, rate)
     numbers = {begin: number for number, begin in enumerate(sorted(set(first)))}
     assert found.window.tolist() == [numbers[begin] for begin in first]
     # the rotation is counted from there

@@ -10,7 +10,7 @@ from mkc_torch.calibration.aided.rotation import from_quaternion, rotation_since
 RANDOM = np.random.default_rng(0)
 
 
-def test_quaternions_of_any_length_are_scipys_rotations():
+def test_quaternions_of_any_length_give_the_rotations_of_scipy():
     q = RANDOM.standard_normal((5, 7, 4))
     found = from_quaternion(torch.from_numpy(q))
     expected = Rotation.from_quat(q[..., [1, 2, 3, 0]].reshape(-1, 4)).as_matrix().reshape(5, 7, 3, 3)
@@ -18,7 +18,7 @@ def test_quaternions_of_any_length_are_scipys_rotations():
 
 
 @pytest.mark.parametrize("N", [1, 2, 3, 64, 65, 500])
-def test_the_prefix_product_is_a_loop_over_rotations(N):
+def test_the_prefix_product_equals_a_loop_over_rotations(N):
     time = np.cumsum(0.05 * RANDOM.random(N))
     rate = 3.0 * RANDOM.standard_normal((N, 3))
     starts = np.arange(N) // 13 * 13

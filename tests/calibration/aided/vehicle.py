@@ -23,7 +23,7 @@ def example():
 
 
 def quaternions(to_world):
-    """w, x, y, z of rotations of less than half a turn about whatever axis, by the largest of four."""
+    """w, x, y, z of rotations of less than half a turn, computed from the largest of the four."""
     m = to_world
     diagonal = m.diagonal(dim1=-2, dim2=-1)
     w = (1.0 + diagonal.sum(-1)).clamp(min=0.0).sqrt() / 2.0
@@ -34,6 +34,6 @@ def quaternions(to_world):
     )
 
 
-def changed(recording, drop=(), **columns):
+def with_columns(recording, drop=(), **columns):
     kept = {name: values for name, values in recording.columns.items() if name not in drop}
     return Recording({**kept, **columns}, name="vehicle")

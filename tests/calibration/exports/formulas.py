@@ -1,4 +1,4 @@
-"""What autopilots, ROS and C compute of a parameter file, from their own sources and apart from the package's code."""
+"""What autopilots, ROS and C compute from a parameter file, after their own sources, without code of the package."""
 
 import csv
 import io
@@ -46,32 +46,32 @@ def _symmetric(diagonal, off):
 def px4(values, readings, current=0.0, instance=0):
     """Magnetometer::Correct with no rotation: readings (N, 3) in tesla to the field in tesla, current in A."""
 
-    def three(what):
+    def per_axis(what):
         return np.array([values[f"CAL_MAG{instance}_{axis}{what}"] for axis in "XYZ"], dtype=np.float64)
 
     power = np.zeros(len(readings))
     compensation = np.zeros(3)
     if values.get("CAL_MAG_COMP_TYP") == 2:
         power = np.broadcast_to(current, len(readings)) * 0.001  # kA
-        compensation = three("COMP")
+        compensation = per_axis("COMP")
     data = readings / TESLA["gauss"]
-    scale = _symmetric(three("SCALE"), three("ODIAG"))
-    return ((data + power[:, None] * compensation) - three("OFF")) @ scale.T * TESLA["gauss"]
+    scale = _symmetric(per_axis("SCALE"), per_axis("ODIAG"))
+    return ((data + power[:, None] * compensation) - per_axis("OFF")) @ scale.T * TESLA["gauss"]
 
 
 def ardupilot(values, readings, current=0.0, instance=""):
     """AP_Compass_Backend::correct_field: readings (N, 3) in tesla to the field in tesla, current in A."""
 
-    def three(what):
+    def per_axis(what):
         return np.array([values[f"COMPASS_{what}{instance}_{axis}"] for axis in "XYZ"], dtype=np.float64)
 
-    field = readings / TESLA["mG"] + three("OFS")
+    field = readings / TESLA["mG"] + per_axis("OFS")
     factor = float(values[f"COMPASS_SCALE{instance}"])
     if 1 / 1.5 <= factor <= 1.5:
         field = field * factor
-    field = field @ _symmetric(three("DIA"), three("ODI")).T
+    field = field @ _symmetric(per_axis("DIA"), per_axis("ODI")).T
     if values.get("COMPASS_MOTCT") == 2:
-        field = field + np.broadcast_to(current, len(field))[:, None] * three("MOT")
+        field = field + np.broadcast_to(current, len(field))[:, None] * per_axis("MOT")
     return field * TESLA["mG"]
 
 

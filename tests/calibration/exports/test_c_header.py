@@ -29,8 +29,8 @@ int main(void)
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
 
 
-def run(correction, rows, folder, argument):
-    """The field that the compiled function makes of readings and currents."""
+def run_compiled_header(correction, rows, folder, argument):
+    """The field that the compiled function computes from readings and currents."""
     text = EXPORTS["c-header"].text(correction, Destination()).text
     (folder / "mag_calibration.h").write_text(text, encoding="utf-8")
     (folder / "main.c").write_text(MAIN % argument, encoding="utf-8")
@@ -44,7 +44,7 @@ def run(correction, rows, folder, argument):
 @pytest.mark.parametrize("unit", ["mG", "counts per µT */ #error"])
 def test_the_compiled_function_gives_the_field(tmp_path, unit):
     rows = np.random.default_rng(0).normal(size=(40, 4)) * 500.0
-    found = run(SensorCorrection("mast", unit, OFFSET, MATRIX, unit), rows, tmp_path, "")
+    found = run_compiled_header(SensorCorrection("mast", unit, OFFSET, MATRIX, unit), rows, tmp_path, "")
     expected = (rows[:, :3] - np.array(OFFSET)) @ np.array(MATRIX).T
     assert np.abs(found - expected).max() < 0.1 * 0.01  # mG: a tenth of 0.01 µT is 0.1 mG
 
@@ -53,6 +53,6 @@ def test_the_compiled_function_takes_off_the_field_of_a_current(tmp_path):
     k, mean = (3.1, -2.2, 4.7), 12.5
     rows = np.random.default_rng(1).normal(size=(40, 4)) * np.array([500.0, 500.0, 500.0, 20.0])
     correction = SensorCorrection("mast", "mG", OFFSET, MATRIX, "mG", None, CurrentCoefficients(k, mean, "current"))
-    found = run(correction, rows, tmp_path, "v[3],")
+    found = run_compiled_header(correction, rows, tmp_path, "v[3],")
     away = rows[:, :3] - np.array(OFFSET) - (rows[:, 3:] - mean) * np.array(k)
     assert np.abs(found - away @ np.array(MATRIX).T).max() < 0.1 * 0.01

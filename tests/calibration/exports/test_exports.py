@@ -15,7 +15,7 @@ from mkc_torch.recording.recording import Recording
 from tests.calibration.exports import formulas
 from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
 
-CLOSE = 0.01e-6  # T
+TOLERANCE_T = 0.01e-6  # T
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 CABLE = CurrentCoefficients((0.3, -0.2, 0.4), 3.0, "current")
 
@@ -75,32 +75,32 @@ def test_the_command_line_knows_every_kind():
 
 
 @given(data=st.data())
-def test_each_documented_formula_gives_what_apply_writes(fitted, data):
+def test_each_documented_formula_equals_what_apply_writes(fitted, data):
     calibration = data.draw(calibrations(fitted))
     readings = readings_of(calibration, data.draw(st.integers(0, 99)))
     expected, in_tesla = applied(calibration, readings), readings * formulas.TESLA[calibration.unit]
     correction = SensorCorrection.of(calibration)
     px4 = formulas.qgroundcontrol(exported("px4", correction, instance=2).text)
-    assert np.abs(formulas.px4(px4, in_tesla, instance=2) - expected).max() < CLOSE
+    assert np.abs(formulas.px4(px4, in_tesla, instance=2) - expected).max() < TOLERANCE_T
     assert not any("COMP" in name for name in px4)
     ardupilot = formulas.mission_planner(exported("ardupilot", correction, instance=3).text)
-    assert np.abs(formulas.ardupilot(ardupilot, in_tesla, instance="3") - expected).max() < CLOSE
+    assert np.abs(formulas.ardupilot(ardupilot, in_tesla, instance="3") - expected).max() < TOLERANCE_T
     assert not any("MOT" in name for name in ardupilot)
     numbers = json.loads(exported("json", correction).text)
-    assert np.abs(formulas.plain_json(numbers, in_tesla) - expected).max() < 1e-3 * CLOSE
+    assert np.abs(formulas.plain_json(numbers, in_tesla) - expected).max() < 1e-3 * TOLERANCE_T
     header = exported("c-header", correction).text
     field = formulas.c_header(header, in_tesla, calibration.unit, calibration.field_unit)
-    assert np.abs(field - expected).max() < CLOSE
+    assert np.abs(field - expected).max() < TOLERANCE_T
 
 
 @given(data=st.data())
-def test_ros_parameters_give_what_apply_writes(fitted, data):
+def test_ros_parameters_give_the_field_that_apply_writes(fitted, data):
     yaml = pytest.importorskip("yaml")
     calibration = data.draw(calibrations(fitted))
     readings = readings_of(calibration, 0)
     parameters = yaml.safe_load(exported("ros-yaml", SensorCorrection.of(calibration)).text)
     field = formulas.magnetometer_pipeline(parameters, readings * formulas.TESLA[calibration.unit])
-    assert np.abs(field - applied(calibration, readings)).max() < CLOSE
+    assert np.abs(field - applied(calibration, readings)).max() < TOLERANCE_T
 
 
 def test_the_ros_file_has_the_messages_covariance_in_tesla_squared(fitted):
@@ -172,11 +172,11 @@ def test_the_field_of_a_current_goes_into_each_autopilot(fitted, k, mean, most, 
     in_tesla = readings * formulas.TESLA[unit]
     px4 = formulas.qgroundcontrol(exported("px4", correction).text)
     assert px4["CAL_MAG_COMP_TYP"] == 2
-    assert np.abs(formulas.px4(px4, in_tesla, current) - expected).max() < CLOSE
+    assert np.abs(formulas.px4(px4, in_tesla, current) - expected).max() < TOLERANCE_T
     ardupilot = formulas.mission_planner(exported("ardupilot", correction).text)
-    assert np.abs(formulas.ardupilot(ardupilot, in_tesla, current) - expected).max() < CLOSE
+    assert np.abs(formulas.ardupilot(ardupilot, in_tesla, current) - expected).max() < TOLERANCE_T
     numbers = json.loads(exported("json", correction).text)
-    assert np.abs(formulas.plain_json(numbers, in_tesla, current) - expected).max() < CLOSE
+    assert np.abs(formulas.plain_json(numbers, in_tesla, current) - expected).max() < TOLERANCE_T
 
 
 def test_a_current_is_left_out_of_a_ros_file_with_a_warning():
@@ -193,7 +193,7 @@ def test_a_current_is_left_out_of_a_ros_file_with_a_warning():
 
 @pytest.mark.parametrize("unit", ["counts", "recorded units", "", "V"])
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "ros-yaml"])
-def test_a_calibration_in_unknown_units_is_refused_with_what_to_do(kind, unit):
+def test_a_calibration_in_unknown_units_is_refused_with_a_remedy(kind, unit):
     """Where the field's strength was given too: the readings' unit is what an autopilot needs."""
     for field_unit in (unit, "µT"):
         with pytest.raises(ExportError, match="--convert mag=gauss"):
@@ -201,19 +201,19 @@ def test_a_calibration_in_unknown_units_is_refused_with_what_to_do(kind, unit):
 
 
 @pytest.mark.parametrize("kind", ["c-header", "json"])
-def test_own_programs_take_any_unit(kind):
+def test_exports_for_own_programs_accept_any_unit(kind):
     assert "counts" in exported(kind, SensorCorrection("a", "counts", (1.0, 2.0, 3.0), EYE, "counts")).text
 
 
 @pytest.mark.parametrize(
     ("unit", "same"), [("Gauss", "gauss"), ("mGauss", "mG"), ("\N{GREEK SMALL LETTER MU}T", "µT"), (" uT ", "µT")]
 )
-def test_units_are_known_however_they_are_spelt(unit, same):
+def test_every_spelling_of_a_unit_is_recognised(unit, same):
     texts = [exported("px4", SensorCorrection("a", u, (0.1, 0.2, 0.3), EYE, u)).text for u in (unit, same)]
     assert texts[0] == texts[1]
 
 
-def test_places_on_the_vehicle():
+def test_instance_and_device_id_are_exported_and_checked():
     correction = SensorCorrection("a", "µT", (10.0, 0.0, 0.0), EYE, "µT")
     text = exported("px4", correction, instance=3, device_id=396825).text
     values = formulas.qgroundcontrol(text)
@@ -236,7 +236,7 @@ def test_places_on_the_vehicle():
             exported("px4", correction, device_id=identity)
 
 
-def test_the_scale_of_ardupilot_counts_within_its_limits_alone():
+def test_a_scale_beyond_the_limits_of_ardupilot_is_moved_into_the_diagonal():
     """ArduPilot ignores a scale beyond 1.5, so that it has to be in DIA then."""
     for factor, scale in ((1.2, 1.2), (1.7, 1.0), (0.5, 1.0)):
         matrix = tuple(tuple(factor * v for v in row) for row in EYE)
@@ -284,13 +284,13 @@ def test_a_rotation_is_left_out_with_a_warning_and_a_mirror_is_rejected(kind):
         "ardupilot": (formulas.ardupilot, formulas.mission_planner),
     }[kind]
     expected = (readings - np.array([5e-6, 6e-6, 7e-6])) @ shape.T
-    assert np.abs(formula(parse(text), readings) - expected).max() < CLOSE
+    assert np.abs(formula(parse(text), readings) - expected).max() < TOLERANCE_T
     mirrored = tuple(map(tuple, (np.diag([1.0, 1.0, -1.0]) @ turn).tolist()))
     with pytest.raises(ExportError, match="mirrors"):
         exported(kind, dataclasses.replace(correction, matrix=mirrored))
 
 
-def test_names_stay_in_their_comments():
+def test_names_cannot_end_their_comment():
     """A name with line ends, or with what ends a comment, breaks no file."""
     correction = SensorCorrection("a\n*/ int x; /*\tb", "µT", (10.0, 0.0, 0.0), EYE, "µT", left_out=("one\ntwo */",))
     assert len(formulas.qgroundcontrol(exported("px4", correction).text)) == 9
@@ -308,7 +308,7 @@ def test_numbers_of_32_bits_round_trip(value):
     assert "." in text
 
 
-def test_numbers_that_32_bits_do_not_hold_are_refused():
+def test_numbers_beyond_32_bits_are_refused():
     for kind, offset, strength in (("c-header", 1e60, 48.0), ("px4", 1e60, 48.0), ("c-header", 1e-60, 1e-59)):
         with pytest.raises(ExportError, match="32 bits"):
             exported(kind, SensorCorrection("a", "µT", (offset, 0.0, 0.0), EYE, "µT", strength))

@@ -21,7 +21,7 @@ from triton.compiler import ASTSource
 
 from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
 from mkc_torch.density.likelihood import DensityState
-from mkc_torch.linear._alternation import alternated
+from mkc_torch.linear._alternation import alternate_by_kernel
 from mkc_torch.linear._blocks import Density
 from mkc_torch.linear._concentration import concentrate, weighted_fits
 from mkc_torch.linear._fused_pass import fused_pass
@@ -59,7 +59,7 @@ def compiled(kernel: Any, tensors: Any, numbers: Any, constants: Any, warps: int
 
 
 def fuses_lanes(ptx: str) -> bool:
-    """Whether a lane's product is fused with a value of another lane: a sum then differs between lanes."""
+    """Whether a fused multiply-add uses a value of another lane, so that sums differ between lanes."""
     shuffled: set[str] = set()
     for line in ptx.splitlines():
         if found := re.search(r"shfl\.sync\.\w+\.b32\s+(%r\d+)", line):
@@ -138,7 +138,9 @@ def training_steps() -> Iterator[str]:
         X, y = torch.eye(samples, columns, dtype=torch.float64) + 1.0, torch.ones(samples, dtype=torch.float64)
         problem, one = linear_problem(X, y, y if weighted else None), torch.ones(1, 1, dtype=torch.float64)
         state = DensityState(one, one, one, one, one, one)
-        alternated(problem, torch.ones(1, columns, dtype=torch.float64), state, max_iter=20, tol=1e-10, patience=2)
+        alternate_by_kernel(
+            problem, torch.ones(1, columns, dtype=torch.float64), state, max_iter=20, tol=1e-10, patience=2
+        )
         return f"alternations, {name}"
 
     yield alternations("two columns", 100, 2)

@@ -1,4 +1,4 @@
-"""The kernels on a GPU if there is one, else under Triton's interpreter."""
+"""Kernels run on a GPU, or by Triton's interpreter on the CPU."""
 
 import pytest
 import torch

@@ -23,7 +23,7 @@ def data(rows, classes, dtype=torch.float64, ignored=-100, labels=torch.int64):
     return logits.to(dtype), target.to(labels)
 
 
-def differentiated(loss, logits, target, upstream=1.0):
+def value_and_gradient(loss, logits, target, upstream=1.0):
     """Value, and gradient by the logits."""
     leaf = logits.clone().requires_grad_()
     value = loss(leaf, target)
@@ -36,8 +36,8 @@ def assert_agrees(device, logits, target, upstream=1.0, **options):
     loss = GeneralizedCrossEntropyLoss(impl="triton", **options)
     loss = (loss.double() if logits.dtype == torch.float64 else loss).to(device)
     reference = GeneralizedCrossEntropyLoss(impl="eager", **options).double()
-    found = differentiated(loss, logits.to(device), target.to(device), upstream)
-    expected = differentiated(reference, logits.double(), target, upstream)
+    found = value_and_gradient(loss, logits.to(device), target.to(device), upstream)
+    expected = value_and_gradient(reference, logits.double(), target, upstream)
     tolerance = TOLERANCE[logits.dtype]
     for value, other in zip(found, expected, strict=True):
         torch.testing.assert_close(value, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
@@ -54,7 +54,7 @@ def test_value_and_gradient_equal_the_formulas(device, dtype, reduction, weighte
 
 
 @pytest.mark.parametrize(("rows", "classes"), [(1, 2), (7, 1), (3000, 3), (500, 10), (3, 1000), (2, 4096), (2, 5000)])
-def test_few_and_many_rows_and_classes(device, rows, classes):
+def test_the_kernel_equals_the_formulas_for_few_and_many_rows_and_classes(device, rows, classes):
     assert_agrees(device, *data(rows, classes, torch.float32))
     weight = torch.rand(classes, generator=torch.Generator().manual_seed(1))
     assert_agrees(device, *data(rows, classes, torch.float32), weight=weight)
@@ -63,11 +63,11 @@ def test_few_and_many_rows_and_classes(device, rows, classes):
 @pytest.mark.parametrize(
     ("labels", "ignored"), [(torch.uint8, 255), (torch.int8, -1), (torch.int16, 1), (torch.int32, 0)]
 )
-def test_labels_of_any_integer_type(device, labels, ignored):
+def test_labels_may_have_any_integer_type(device, labels, ignored):
     assert_agrees(device, *data(20, 4, torch.float32, ignored, labels), ignore_index=ignored)
 
 
-def test_upstream_gradients_per_row_and_strided_logits(device):
+def test_the_kernel_equals_the_formulas_for_upstream_gradients_per_row_and_strided_logits(device):
     logits, target = data(20, 4, torch.float32)
     upstream = torch.randn(20, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for grad in (upstream, upstream[:1].expand(20)):
@@ -81,25 +81,25 @@ def test_upstream_gradients_per_row_and_strided_logits(device):
 def test_ignored_rows_affect_neither_value_nor_gradient(device, reduction, classes):
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
     logits, target = (value.to(device) for value in data(4, classes, torch.float32))
-    expected = differentiated(loss, logits, target)
+    expected = value_and_gradient(loss, logits, target)
     logits[target == -100] = NAN
-    assert all(map(torch.equal, differentiated(loss, logits, target), expected))
+    assert all(map(torch.equal, value_and_gradient(loss, logits, target), expected))
     assert (expected[1][target.cpu() == -100] == 0).all()
-    nothing = differentiated(loss, logits, torch.full_like(target, -100))
+    nothing = value_and_gradient(loss, logits, torch.full_like(target, -100))
     assert all((value == 0).all() for value in nothing)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
 @pytest.mark.parametrize("sigma", [0.7, INF])
 @pytest.mark.parametrize("classes", [3, 4500])
-def test_infinite_negative_logits_are_impossible_classes(device, sigma, classes):
+def test_logits_of_minus_infinity_are_impossible_classes(device, sigma, classes):
     logits, target = data(4, classes, torch.float32)
     logits[:, 1] = -INF  # an impossible class
     target = torch.where(target == -100, target, logits.argmax(1))
     assert_agrees(device, logits, target, sigma=sigma)
     target[0] = 1
     loss = GeneralizedCrossEntropyLoss(sigma, reduction="none", impl="triton").to(device)
-    value, slope = differentiated(loss, logits.to(device), target.to(device))
+    value, slope = value_and_gradient(loss, logits.to(device), target.to(device))
     assert value[0].item() == pytest.approx(sigma**2)
     assert slope.isfinite().all()
 
@@ -113,14 +113,14 @@ def test_nan_and_infinite_logits_and_labels_out_of_range_give_nan(device, bad, s
     logits, target = (entry.to(device) for entry in data(4, classes, torch.float32))
     logits[0, 2] = bad
     target[2] = classes
-    value, slope = differentiated(loss, logits, target)
+    value, slope = value_and_gradient(loss, logits, target)
     assert value.isnan().tolist() == [True, False, True, False]
     assert slope.isnan().any(1).tolist() == [True, False, True, False]
     loss.reduction = "mean"
     assert loss(logits, target).isnan()
 
 
-def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
+def test_repeated_backward_passes_and_second_derivatives_equal_the_formulas(device):
     logits, target = data(6, 3)
     for reduction in ("mean", "none"):
         results = []
@@ -141,7 +141,7 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
 def test_setting_sigma_does_not_change_the_gradient_of_an_earlier_forward_pass(device):
     loss = GeneralizedCrossEntropyLoss(impl="triton").to(device)
     logits, target = (entry.to(device) for entry in data(6, 3, torch.float32))
-    _, expected = differentiated(loss, logits, target)
+    _, expected = value_and_gradient(loss, logits, target)
     value = loss(logits.requires_grad_(), target)
     loss.sigma = 0.6
     (found,) = torch.autograd.grad(value, logits)
@@ -171,7 +171,7 @@ def test_other_targets_shapes_and_transforms_use_the_formulas(device):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("dtype", "weighted"), [(torch.float32, True), (torch.float16, False)])
-def test_operators_are_well_formed(device, dtype, weighted):
+def test_operators_pass_opcheck(device, dtype, weighted):
     from mkc_torch.losses.kernels import label_operators as operators
 
     logits, target = (value.to(device) for value in data(5, 4, dtype))
@@ -192,7 +192,7 @@ def test_compiled_loss_equals_eager(device, reduction, dtype):
     loss = GeneralizedCrossEntropyLoss(reduction=reduction, impl="triton").to(device)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     logits, target = (value.to(device) for value in data(20, 4, dtype))
-    found, expected = (differentiated(value, logits, target, 100.0) for value in (compiled, loss))
+    found, expected = (value_and_gradient(value, logits, target, 100.0) for value in (compiled, loss))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
 
 
@@ -204,12 +204,13 @@ def test_impl_compile_equals_impl_eager(monkeypatch):
     compiled = torch.compile(GeneralizedCrossEntropyLoss._computed, backend="aot_eager")
     monkeypatch.setattr(generalized_cross_entropy, "_compiled", lambda: compiled)
     found, expected = (
-        differentiated(GeneralizedCrossEntropyLoss(impl=impl).double(), *data(5, 3)) for impl in ("compile", "eager")
+        value_and_gradient(GeneralizedCrossEntropyLoss(impl=impl).double(), *data(5, 3))
+        for impl in ("compile", "eager")
     )
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
 
 
-def test_fake_cuda_tensors_go_through_the_operators():
+def test_fake_cuda_tensors_use_the_operators():
     pytest.importorskip("triton")
     with FakeTensorMode():
         loss = GeneralizedCrossEntropyLoss(impl="triton")

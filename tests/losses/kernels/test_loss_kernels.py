@@ -16,7 +16,7 @@ MODES = {
     "learned": {"d": 1.0},
     "wide": {"d": 0.3, "sigma": 20.0},
     "gaussian": {"d": 1.0, "sigma": INF, "learn_sigma": False},
-    "as it comes": {},
+    "default": {},
     "automatic likelihood": {"objective": "likelihood"},
     "robust, given d": {"d": 1.0, "objective": "robust"},
     "given bound": {"bound": 9.0, "d_min": 0.01, "learn_sigma": False, "learn_d": False, "normalize": True},
@@ -78,28 +78,28 @@ def test_value_gradients_and_state_equal_torch(device, mode, dtype):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
+@pytest.mark.parametrize("mode", ["fixed", "learned", "default"])
 @pytest.mark.parametrize(
     ("shape", "axis"), [((33, 1), -1), ((64, 4), -1), ((3, 4, 6, 5), 1), ((300, 5), -1), ((2, 20), -1), ((9000, 2), -1)]
 )
-def test_all_layouts_and_sizes(device, mode, shape, axis):
+def test_kernels_equal_torch_for_all_layouts_and_sizes(device, mode, shape, axis):
     assert_agrees(device, shape, mode, torch.float32, batches=1, axis=axis)
 
 
-@pytest.mark.parametrize("mode", ["fixed", "as it comes"])
+@pytest.mark.parametrize("mode", ["fixed", "default"])
 @pytest.mark.parametrize("reduction", ["sum", "none"])
-def test_sums_and_elements(device, mode, reduction):
+def test_kernels_equal_torch_for_reductions_sum_and_none(device, mode, reduction):
     assert_agrees(device, (20, 3), mode, weighted=True, reduction=reduction)
 
 
-@pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
+@pytest.mark.parametrize("mode", ["fixed", "learned", "default"])
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision_is_computed_in_single(device, mode, dtype):
+def test_half_precision_is_computed_in_float32(device, mode, dtype):
     assert_agrees(device, (40, 2), mode, dtype, batches=1, upstream=100.0)
 
 
 @pytest.mark.parametrize("make", [lambda t: t.mT.contiguous().mT, lambda t: t.repeat(1, 2)[:, :3], lambda t: t.flip(0)])
-def test_strided_predictions_and_targets(device, make):
+def test_kernels_equal_torch_for_strided_predictions_and_targets(device, make):
     x, y = data((16, 3))
     losses = [MKCLoss(3, impl=impl, **FIXED).double() for impl in ("triton", "eager")]
     found = [step(loss.to(device), make(x.to(device)), y.to(device)) for loss in losses]
@@ -121,8 +121,8 @@ def test_the_schedule_equals_that_of_torch(device):
     assert torch.equal(kernel.schedule.share, eager.schedule.share)
 
 
-@pytest.mark.parametrize("mode", ["learned", "as it comes"])
-def test_two_backward_passes_of_one_graph_give_the_same_bits(device, mode):
+@pytest.mark.parametrize("mode", ["learned", "default"])
+def test_repeated_backward_passes_are_bitwise_equal(device, mode):
     loss = MKCLoss(2, impl="triton", **MODES[mode]).to(device)
     x, y = (entry.to(device) for entry in data((30, 2), torch.float32))
     leaves = [x.requires_grad_(), *loss.parameters()]
@@ -132,7 +132,7 @@ def test_two_backward_passes_of_one_graph_give_the_same_bits(device, mode):
     assert all(torch.equal(*pair) for pair in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("mode", ["learned", "as it comes"])
+@pytest.mark.parametrize("mode", ["learned", "default"])
 def test_second_derivatives_equal_torch(device, mode):
     curves = []
     x, y = data((12, 2))
@@ -146,7 +146,7 @@ def test_second_derivatives_equal_torch(device, mode):
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the interpreter computes by NumPy
 @pytest.mark.parametrize("value", [NAN, INF])
-@pytest.mark.parametrize("mode", ["learned", "as it comes"])
+@pytest.mark.parametrize("mode", ["learned", "default"])
 def test_non_finite_values_reach_the_gradient_but_not_the_state(device, mode, value):
     loss = MKCLoss(1, impl="triton", **MODES[mode]).to(device)
     x, y = (entry.to(device) for entry in data((30, 1), torch.float32))
@@ -174,7 +174,7 @@ def test_a_fresh_loss_takes_its_scale_from_the_evaluated_batch(device):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
+@pytest.mark.parametrize("mode", ["fixed", "learned", "default"])
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @compiler
 def test_compiled_training_equals_eager_for_any_batch_size(device, mode, reduction):
@@ -184,13 +184,13 @@ def test_compiled_training_equals_eager_for_any_batch_size(device, mode, reducti
     compiled = torch.compile(own, fullgraph=True, backend="aot_eager")
     for count in (20, 20, 31):
         x, y = (value.to(device) for value in data((count, 3), torch.float32, seed=count))
-        for value, other in zip(step(eager, x, y), step(_Named(compiled, own), x, y), strict=True):
+        for value, other in zip(step(eager, x, y), step(_CallWithParameters(compiled, own), x, y), strict=True):
             torch.testing.assert_close(value, other)
     assert all(torch.equal(a, b) for a, b in zip(eager.buffers(), own.buffers(), strict=True))
 
 
-class _Named:
-    """A compiled loss with the parameters of the loss itself."""
+class _CallWithParameters:
+    """A compiled loss with the parameters of the uncompiled loss."""
 
     def __init__(self, call, loss):
         self.call, self.parameters = call, loss.parameters
@@ -200,8 +200,8 @@ class _Named:
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("mode", ["fixed", "as it comes"])
-def test_operators_are_well_formed(device, mode):
+@pytest.mark.parametrize("mode", ["fixed", "default"])
+def test_operators_pass_opcheck(device, mode):
     from mkc_torch.losses.kernels import operators
     from mkc_torch.losses.kernels.channels import TABLE
     from mkc_torch.losses.kernels.loss import options_of, request_of
@@ -219,7 +219,7 @@ def test_operators_are_well_formed(device, mode):
     torch.library.opcheck(operators.each_loss, (x, y, torch.rand(20, 3, device=device), 1, *own))
 
 
-def test_fake_cuda_tensors_go_through_the_operators(device):
+def test_fake_cuda_tensors_use_the_operators(device):
     loss = MKCLoss(3, impl="triton")
     with FakeTensorMode(allow_non_fake_inputs=True), torch.no_grad():
         own = {name: torch.empty_like(value, device="cuda") for name, value in loss.state_dict().items()}

@@ -30,7 +30,7 @@ def weights(kind, *shape):
     return {"none": None, "weighted": found, "masked": found > 0.2}[kind]
 
 
-def differentiated(loss, tensors, weight, upstream=1.0):
+def value_and_gradients(loss, tensors, weight, upstream=1.0):
     """Value, and gradients by input, target, sigma and d."""
     leaves = [tensor.clone().requires_grad_() for tensor in tensors]
     value = loss(*leaves, weight)
@@ -41,13 +41,13 @@ def differentiated(loss, tensors, weight, upstream=1.0):
 def assert_agrees(device, tensors, weight=None, bound=30.0, upstream=1.0, **options):
     """The kernel on tensors as they are against the formulas on them in float64."""
     dtype = torch.promote_types(tensors[0].dtype, torch.float32)
-    found = differentiated(
+    found = value_and_gradients(
         HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=dtype), impl="triton", **options).to(device),
         [tensor.to(device) for tensor in tensors],
         None if weight is None else weight.to(device),
         upstream,
     )
-    expected = differentiated(
+    expected = value_and_gradients(
         HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=torch.float64), impl="eager", **options),
         [tensor.double() for tensor in tensors],
         weight,
@@ -76,7 +76,7 @@ def test_the_domain_may_end_on_the_head_or_far_beyond(device, bound, most_d, dty
 
 @pytest.mark.parametrize(("shape", "channel_dim"), [((7, 3), -1), ((2, 3, 4, 5), 1), ((3, 400), 0)])
 @pytest.mark.parametrize("reduction", ["none", "mean"])
-def test_bounds_of_channels(device, shape, channel_dim, reduction):
+def test_the_kernel_equals_the_formulas_for_bounds_of_channels(device, shape, channel_dim, reduction):
     bound = torch.tensor([9.0, 40.0, 90.0])
     tensors = data(*shape, dtype=torch.float32)
     assert_agrees(device, tensors, bound=bound, channel_dim=channel_dim, reduction=reduction)
@@ -86,7 +86,7 @@ def test_bounds_of_channels(device, shape, channel_dim, reduction):
     assert_agrees(device, mixed, weight, bound=bound, channel_dim=channel_dim, reduction=reduction)
 
 
-def test_upstream_gradients_per_element_and_mixed_dtypes(device):
+def test_the_kernel_equals_the_formulas_for_upstream_gradients_per_element_and_mixed_dtypes(device):
     x, y, sigma, d = data(40, 3, dtype=torch.bfloat16)
     tensors = [x, y.float(), sigma.float(), d.float()]
     upstream = uniform(-1.0, 1.0, 40, 3, seed=7)
@@ -94,12 +94,12 @@ def test_upstream_gradients_per_element_and_mixed_dtypes(device):
         assert_agrees(device, tensors, reduction="none", upstream=grad)
 
 
-def test_infinite_sigma_gives_the_gaussian(device):
+def test_infinite_sigma_gives_the_gaussian_likelihood(device):
     x, y, _, d = data(6, 3, dtype=torch.float32)
     sigma = torch.full_like(x, INF)
     assert_agrees(device, [x, y, sigma, d], bound=100.0)
     assert_agrees(device, [x, y, sigma, d], bound=5.0)
-    found = differentiated(
+    found = value_and_gradients(
         HeteroscedasticMKCLoss(1e3, impl="triton").to(device), [t.to(device) for t in (x, y, sigma, d)], None
     )
     assert (found[3] == 0).all()
@@ -112,13 +112,13 @@ def test_masked_elements_affect_neither_value_nor_gradient(device, reduction, po
     mask = torch.ones(5, 3, dtype=torch.bool, device=device)
     mask[1, 2] = mask[4, 0] = False
     tensors = [value.to(device) for value in data(5, 3, dtype=torch.float32)]
-    expected = differentiated(loss, tensors, mask)
+    expected = value_and_gradients(loss, tensors, mask)
     for tensor in tensors:
         tensor[~mask] = poison
-    found = differentiated(loss, tensors, mask)
+    found = value_and_gradients(loss, tensors, mask)
     assert all(map(torch.equal, found, expected))
     assert all((value[~mask.cpu()] == 0).all() for value in found[1:])
-    nothing = differentiated(loss, tensors, torch.zeros(5, device=device))
+    nothing = value_and_gradients(loss, tensors, torch.zeros(5, device=device))
     assert all((value == 0).all() for value in nothing)
 
 
@@ -127,7 +127,7 @@ def test_masked_elements_affect_neither_value_nor_gradient(device, reduction, po
 def test_nan_gives_nan(device, which):
     tensors = [entry.to(device) for entry in data(5, 3, dtype=torch.float32)]
     tensors[which][2, 1] = NAN
-    value, *slopes = differentiated(
+    value, *slopes = value_and_gradients(
         HeteroscedasticMKCLoss(100.0, reduction="none", impl="triton").to(device), tensors, None
     )
     for slope in (value, *slopes):
@@ -141,14 +141,14 @@ def test_nan_gives_nan(device, which):
 def test_an_extreme_outlier_leaves_finite_gradients(device, size, sigma):
     tensors = [torch.full((4, 2), v, device=device) for v in (0.0, 0.0, sigma, 0.1)]
     tensors[1][1, 1] = size
-    value, *slopes = differentiated(HeteroscedasticMKCLoss(50.0, impl="triton").to(device), tensors, None)
+    value, *slopes = value_and_gradients(HeteroscedasticMKCLoss(50.0, impl="triton").to(device), tensors, None)
     if sigma < INF:
         assert value.isfinite()
         assert all(slope.isfinite().all() for slope in slopes)
     assert slopes[2].isfinite().all()
 
 
-def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
+def test_repeated_backward_passes_and_second_derivatives_equal_the_formulas(device):
     tensors = data(6, 2, dtype=torch.float64)
     for reduction in ("mean", "none"):
         results = []
@@ -169,7 +169,7 @@ def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
 def test_only_required_gradients_are_computed(device):
     loss = HeteroscedasticMKCLoss(30.0, impl="triton").to(device)
     x, y, sigma, d = (value.to(device) for value in data(5, 3, dtype=torch.float32))
-    expected = differentiated(loss, [x, y, sigma, d], None)
+    expected = value_and_gradients(loss, [x, y, sigma, d], None)
     d.requires_grad_()
     (found,) = torch.autograd.grad(loss(x, y, sigma, d), d)
     assert torch.equal(found.cpu().double(), expected[4])
@@ -203,7 +203,7 @@ def operands(dtype, weighted, device):
 
 @pytest.mark.e2e
 @pytest.mark.parametrize(("dtype", "weighted"), [(torch.float32, "weighted"), (torch.float16, "none")])
-def test_operators_are_well_formed(device, dtype, weighted):
+def test_operators_pass_opcheck(device, dtype, weighted):
     from mkc_torch.losses.kernels import sample_operators as operators
 
     given = operands(dtype, weighted, device)
@@ -226,7 +226,7 @@ def test_compiled_loss_equals_eager(device, reduction, dtype):
     weight = weights("weighted", 20, 3).to(device)
     upstream = 100.0 if dtype == torch.float16 else 1.7
     for given in (None, weight):
-        found, expected = (differentiated(value, tensors, given, upstream) for value in (compiled, loss))
+        found, expected = (value_and_gradients(value, tensors, given, upstream) for value in (compiled, loss))
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
 
 
@@ -239,12 +239,12 @@ def test_impl_compile_equals_impl_eager(monkeypatch):
     monkeypatch.setattr(heteroscedastic, "_compiled", lambda: compiled)
     tensors = data(5, 3)
     found, expected = (
-        differentiated(HeteroscedasticMKCLoss(30.0, impl=impl), tensors, None) for impl in ("compile", "eager")
+        value_and_gradients(HeteroscedasticMKCLoss(30.0, impl=impl), tensors, None) for impl in ("compile", "eager")
     )
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
 
 
-def test_fake_cuda_tensors_go_through_the_operators():
+def test_fake_cuda_tensors_use_the_operators():
     pytest.importorskip("triton")
     with FakeTensorMode():
         loss = HeteroscedasticMKCLoss(30.0, impl="triton")

@@ -14,7 +14,7 @@ from mkc_torch.recording.formats import RecordingError, encoded, read_topics
 from mkc_torch.recording.formats.message_rows import MessageRows
 from mkc_torch.recording.formats.ros_messages import RosReader, parsed_definitions
 from tests.recording.formats import writers
-from tests.recording.formats.test_same_samples import KINDS, chosen, numbers
+from tests.recording.formats.test_same_samples import KINDS, topic_named, values_of
 from tests.recording.formats.writers import TOPIC, samples
 
 GIVEN = samples(50)
@@ -37,7 +37,9 @@ def test_each_instance_of_a_sensor_is_a_topic(ending, write, tmp_path):
     stem = "sensor_mag_{}" if ending == ".ulg" else "MAG[{}]"
     assert [name for name in names if "ag" in name.lower()] == [stem.format(place) for place in range(3)]
     for place in range(3):
-        found = numbers(chosen(tmp_path / f"log{ending}", stem.format(place)), "x" if ending == ".ulg" else "MagX")
+        found = values_of(
+            topic_named(tmp_path / f"log{ending}", stem.format(place)), "x" if ending == ".ulg" else "MagX"
+        )
         # the third decimal of float32 sums differs, the instance does not
         assert np.abs(found - GIVEN.mag[:, 0] - place).max() < 1e-6
 
@@ -78,19 +80,19 @@ def test_a_dataset_that_claims_more_bytes_than_its_file_is_left_out(tmp_path):
     assert "`huge` claims 8,000,000,000,000 bytes" in topic.warnings[0]
 
 
-def test_a_dataflash_log_without_units_has_those_that_never_changed(tmp_path):
+def test_a_dataflash_log_without_units_has_the_default_units(tmp_path):
     writers.dataflash(tmp_path / "log.bin", GIVEN, units=False)
-    topic = chosen(tmp_path / "log.bin", "MAG[0]")
+    topic = topic_named(tmp_path / "log.bin", "MAG[0]")
     assert topic.units["MagX"] == "mGauss"
     assert topic.units["TimeUS"] == "us"
 
 
-def test_a_dataflash_log_by_its_old_name_in_capitals_is_read(tmp_path):
+def test_a_dataflash_log_with_an_extension_in_capitals_is_read(tmp_path):
     writers.dataflash(tmp_path / "00000001.BIN", GIVEN)
-    assert chosen(tmp_path / "00000001.BIN", "MAG[0]")
+    assert topic_named(tmp_path / "00000001.BIN", "MAG[0]")
 
 
-def test_erased_pages_at_the_end_of_a_dataflash_log_are_no_loss(tmp_path):
+def test_erased_pages_at_the_end_of_a_dataflash_log_have_no_warning(tmp_path):
     writers.dataflash(tmp_path / "log.bin", GIVEN)
     with (tmp_path / "log.bin").open("ab") as file:
         file.write(b"\xff" * 300)
@@ -99,15 +101,15 @@ def test_erased_pages_at_the_end_of_a_dataflash_log_are_no_loss(tmp_path):
 
 @pytest.mark.parametrize("encoding", ["ros1", "ros2", "json", "protobuf"])
 @pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
-def test_an_mcap_file_of_any_encoding_and_compression(encoding, compression, tmp_path):
+def test_an_mcap_file_of_any_encoding_and_compression_is_read(encoding, compression, tmp_path):
     writers.mcap_of(tmp_path / "log.mcap", GIVEN, encoding, compression, chunk=1000)
     (topic,) = read_topics(tmp_path / "log.mcap")
     assert topic.name == TOPIC
     assert topic.table.names[:3] == ["header.stamp", "log_time", "publish_time"]
-    assert numbers(topic, "header.stamp").tolist() == (GIVEN.time * 1000).tolist()
-    assert numbers(topic, "log_time").tolist() == (GIVEN.time * 1000 + 77).tolist()
+    assert values_of(topic, "header.stamp").tolist() == (GIVEN.time * 1000).tolist()
+    assert values_of(topic, "log_time").tolist() == (GIVEN.time * 1000 + 77).tolist()
     for place, axis in enumerate("xyz"):
-        assert numbers(topic, f"magnetic_field.{axis}").tolist() == GIVEN.mag[:, place].tolist()
+        assert values_of(topic, f"magnetic_field.{axis}").tolist() == GIVEN.mag[:, place].tolist()
 
 
 @pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
@@ -118,7 +120,7 @@ def test_the_whole_messages_of_the_last_broken_chunk_of_an_mcap_file_are_kept(co
     # a single chunk holds all messages: without its first half, no rows would remain
     (tmp_path / "log.mcap").write_bytes(whole[: len(whole) // 2])
     (topic,) = read_topics(tmp_path / "log.mcap")
-    found = numbers(topic, "magnetic_field.x").tolist()
+    found = values_of(topic, "magnetic_field.x").tolist()
     assert 500 <= len(found) < len(given.time)
     assert found == given.mag[: len(found), 0].tolist()
     assert "cut off" in topic.warnings[0]
@@ -141,11 +143,11 @@ def test_a_ros1_bag_that_was_not_closed_is_read(compression, tmp_path):
     whole = (tmp_path / "log.bag").read_bytes()
     (topic,) = read_topics(tmp_path / "log.bag")
     assert topic.warnings == ("`header.frame_id` holds text and is left out.",)
-    assert numbers(topic, "magnetic_field.z").tolist() == given.mag[:, 2].tolist()
+    assert values_of(topic, "magnetic_field.z").tolist() == given.mag[:, 2].tolist()
     # without the index, which stands at the end, and half of its last chunk
     (tmp_path / "log.bag").write_bytes(whole[: 2 * len(whole) // 3])
     (half,) = read_topics(tmp_path / "log.bag")
-    found = numbers(half, "magnetic_field.x").tolist()
+    found = values_of(half, "magnetic_field.x").tolist()
     assert 500 <= len(found) < len(given.time)
     assert found == given.mag[: len(found), 0].tolist()
     assert "cut off" in " ".join(half.warnings)
@@ -153,12 +155,12 @@ def test_a_ros1_bag_that_was_not_closed_is_read(compression, tmp_path):
 
 @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
 @pytest.mark.parametrize("version", [8, 9])
-def test_a_ros2_bag_with_and_without_definitions_in_it(storage, version, tmp_path):
+def test_a_ros2_bag_with_and_without_definitions_is_read(storage, version, tmp_path):
     writers.rosbag2(tmp_path / "bag", GIVEN, storage, version)
     (topic,) = read_topics(tmp_path / "bag")
     assert topic.units["magnetic_field.x"] == "T"
     assert topic.units["header.stamp"] == topic.units["log_time"] == "ns"
-    assert numbers(topic, "magnetic_field.x").tolist() == GIVEN.mag[:, 0].tolist()
+    assert values_of(topic, "magnetic_field.x").tolist() == GIVEN.mag[:, 0].tolist()
 
 
 def test_reading_a_ros2_bag_creates_and_changes_no_files(tmp_path):
@@ -181,14 +183,14 @@ def test_a_database_that_is_not_a_bag_is_rejected_even_with_an_endless_view(tmp_
         read_topics(tmp_path / "log.db3")
 
 
-def ros_oracle(store, text, name, message, ros1):
-    """The bytes of a message by rosbags, read by us."""
+def rosbags_message_read(store, text, name, message, ros1):
+    """A message serialised by rosbags and read by the package."""
     data = bytes(store.serialize_ros1(message, name) if ros1 else store.serialize_cdr(message, name))
     return RosReader(name, parsed_definitions(text, name), ros1).read(data)
 
 
 @pytest.mark.parametrize("ros1", [True, False])
-def test_messages_of_all_kinds_of_fields_are_what_rosbags_wrote(ros1):
+def test_messages_of_all_field_types_equal_those_written_by_rosbags(ros1):
     from rosbags.typesys import Stores, get_typestore
 
     line = "=" * 80
@@ -206,7 +208,7 @@ def test_messages_of_all_kinds_of_fields_are_what_rosbags_wrote(ros1):
         a=-3, b=0.1, c=200, s="höhe", d=np.array([1, -2, 3], np.int16), e=np.array([0.5, 0.25]), f=True, t=stamp,
         p=[part(k=1, x=2.5), part(k=2, x=3.5)], q=[part(k=3, x=4.5)], g=2**63 + 1, w=["a", "bc"], h=0.5,
     )  # fmt: skip
-    assert ros_oracle(store, text, name, message, ros1) == {
+    assert rosbags_message_read(store, text, name, message, ros1) == {
         "a": -3, "b": 0.1, "c": 200, "s": "höhe", "d": (1, -2, 3), "e": (0.5, 0.25), "f": True, "t": 7_000_000_009,
         "p[0].k": 1, "p[0].x": 2.5, "p[1].k": 2, "p[1].x": 3.5, "g": 2**63 + 1, "w": "", "h": 0.5,
     }  # fmt: skip
@@ -231,20 +233,20 @@ def test_message_arrays_that_change_length_are_left_out_with_a_warning():
     rows.add({"a": 2.5, "l": (3, 4), "s": "y", "n": 2**70})
     topic = rows.topic(("n",), "a", ())
     assert topic.table.names == ["n", "a"]
-    assert numbers(topic, "a").tolist() == [1.0, 2.0, 2.5]
-    assert np.isnan(numbers(topic, "n")[1])
-    assert numbers(topic, "n")[2] == 2.0**70
+    assert values_of(topic, "a").tolist() == [1.0, 2.0, 2.5]
+    assert np.isnan(values_of(topic, "n")[1])
+    assert values_of(topic, "n")[2] == 2.0**70
     assert topic.units == {"a": "m"}
     assert "`l`: an array of changing length" in topic.warnings[0]
     assert "`s` holds text" in topic.warnings[1]
 
 
-def test_messages_out_of_the_order_of_the_log_are_put_into_it():
+def test_messages_out_of_order_are_sorted_by_log_time():
     rows = MessageRows("t", {})
     for time in (3, 1, 2):
         rows.add({"log_time": time, "a": 10 * time})
     topic = rows.topic(("log_time",), "log_time", ())
-    assert numbers(topic, "a").tolist() == [10, 20, 30]
+    assert values_of(topic, "a").tolist() == [10, 20, 30]
 
 
 def test_groups_of_an_hdf5_file_are_topics_with_units_and_warnings(tmp_path):
@@ -264,16 +266,16 @@ def test_groups_of_an_hdf5_file_are_topics_with_units_and_warnings(tmp_path):
     assert set(topics) == {"mag", "gyro", "table"}
     mag = topics["mag"]
     assert mag.table.names == ["t", "field_x", "field_y", "field_z", "when"]
-    assert numbers(mag, "field_y").tolist() == [4.0, 5.0, 6.0, 7.0]
+    assert values_of(mag, "field_y").tolist() == [4.0, 5.0, 6.0, 7.0]
     assert mag.units == {"field_x": "T", "field_y": "T", "field_z": "T"}
     warnings = " ".join(mag.warnings)
     assert "`rate`: single values" in warnings
     assert "`name` holds text" in warnings
     assert "`elsewhere` is a link to elsewhere" in warnings
-    assert numbers(topics["table"], "x").tolist() == [2.5, 3.5]
+    assert values_of(topics["table"], "x").tolist() == [2.5, 3.5]
 
 
-def test_structs_cells_and_columns_of_other_lengths_of_a_matlab_file(tmp_path):
+def test_structs_and_columns_of_other_lengths_of_a_matlab_file_are_topics_and_cells_are_left_out(tmp_path):
     io = pytest.importorskip("scipy.io")
     times = np.arange(5.0)
     cells = np.empty(2, dtype=object)
@@ -314,7 +316,7 @@ def test_a_formula_of_an_mdf_file_is_not_executed(tmp_path):
         file.save(tmp_path / "log.mf4")
     (topic,) = read_topics(tmp_path / "log.mf4")
     assert topic.table.names == ["time", "b"]
-    assert numbers(topic, "b").tolist() == (2 * time + 1).tolist()
+    assert values_of(topic, "b").tolist() == (2 * time + 1).tolist()
     assert "`a`: converted by a formula" in topic.warnings[0]
 
 
@@ -344,6 +346,6 @@ def test_without_its_package_a_format_names_the_extra(kind, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("ending", [".ulg", ".bin", ".mcap", ".h5"])
-def test_logs_are_read_and_not_written(ending, tmp_path):
+def test_writing_a_log_format_is_refused(ending, tmp_path):
     with pytest.raises(RecordingError, match="can be read but not written"):
         encoded(tmp_path / f"log{ending}", {"a": np.zeros(2)})

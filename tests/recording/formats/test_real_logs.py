@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("polars")
 
 from mkc_torch.recording.formats import read_topics
-from tests.recording.formats.test_damage import rows_or_sentence
-from tests.recording.formats.test_same_samples import numbers
+from tests.recording.formats.test_damage import rows_or_message
+from tests.recording.formats.test_same_samples import values_of
 from tests.recording.formats.writers import dataflash, dataflash_text, samples
 from tests.shared_data import shared_data
 
@@ -31,35 +31,35 @@ def table_of(name):
     return {key: np.array([float(row[key]) for row in rows]) for key in ("time", "mag_x", "mag_y", "mag_z")}
 
 
-def as_measured(topic, axis):
-    """In µT; the log's values have the autopilot's offsets in them."""
-    columns = [numbers(topic, f"{name}{axis}").astype(float) for name in ("Mag", "Ofs", "MOfs")]
+def field_without_offsets(topic, axis):
+    """The field in µT, without the autopilot's offsets that the log's values include."""
+    columns = [values_of(topic, f"{name}{axis}").astype(float) for name in ("Mag", "Ofs", "MOfs")]
     return (columns[0] - columns[1] - columns[2]) / 10
 
 
-def test_a_compass_of_a_flight_is_the_table_made_of_it_row_for_row(flight):
+def test_a_compass_of_a_flight_equals_its_table_row_by_row(flight):
     topic, table = flight["MAG"], table_of("quadrotor_compass1")
     assert topic.warnings == ()
     assert topic.units["TimeMS"] == "ms"
     assert topic.units["MagX"] == "mGauss"
     count = len(table["time"])
     assert count == 2219
-    time = numbers(topic, "TimeMS").astype(float) / 1e3
+    time = values_of(topic, "TimeMS").astype(float) / 1e3
     assert (time[:count] - time[0]).round(6).tolist() == table["time"].tolist()
     for axis in "XYZ":
-        assert as_measured(topic, axis)[:count].round(6).tolist() == table[f"mag_{axis.lower()}"].tolist()
+        assert field_without_offsets(topic, axis)[:count].round(6).tolist() == table[f"mag_{axis.lower()}"].tolist()
 
 
-def test_another_compass_is_its_table_which_was_made_at_the_times_of_the_first(flight):
+def test_another_compass_equals_its_table_at_the_times_of_the_first(flight):
     topic, table = flight["MAG3"], table_of("quadrotor_compass3")
-    first, own = (numbers(flight[name], "TimeMS").astype(float) for name in ("MAG", "MAG3"))
+    first, own = (values_of(flight[name], "TimeMS").astype(float) for name in ("MAG", "MAG3"))
     count = len(table["time"])
     for axis in "XYZ":
-        there = np.interp(first[:count], own, as_measured(topic, axis))
+        there = np.interp(first[:count], own, field_without_offsets(topic, axis))
         assert np.abs(there - table[f"mag_{axis.lower()}"]).max() < 0.0051  # two decimals
 
 
-def of_pymavlink(path, name):
+def columns_by_pymavlink(path, name):
     """The columns of a message as pymavlink reads them."""
     reader = pytest.importorskip("pymavlink.DFReader")
     # pymavlink prints what it skips
@@ -75,32 +75,32 @@ def of_pymavlink(path, name):
 
 
 @pytest.mark.parametrize("name", ["MAG2", "IMU", "ATT", "GPS", "BARO"])
-def test_a_flight_is_what_pymavlink_reads(name, flight):
-    expected = of_pymavlink(shared_data(LOG), name)
+def test_a_flight_equals_the_reading_by_pymavlink(name, flight):
+    expected = columns_by_pymavlink(shared_data(LOG), name)
     topic = flight[name]
     assert topic.table.names == list(expected)
     for column, values in expected.items():
-        assert numbers(topic, column).astype(np.float64).tolist() == [float(value) for value in values]
+        assert values_of(topic, column).astype(np.float64).tolist() == [float(value) for value in values]
 
 
 @pytest.mark.parametrize(("write", "ending"), [(dataflash, ".bin"), (dataflash_text, ".log")])
-def test_a_log_of_several_instances_is_what_pymavlink_reads(write, ending, tmp_path):
+def test_a_log_of_several_instances_equals_the_reading_by_pymavlink(write, ending, tmp_path):
     path = tmp_path / f"log{ending}"
     write(path, samples(40)) if ending == ".log" else write(path, samples(40), 2)
     topics = {topic.name: topic for topic in read_topics(path)}
-    expected = of_pymavlink(path, "MAG")
+    expected = columns_by_pymavlink(path, "MAG")
     names = ["MAG[0]", "MAG[1]"] if ending == ".bin" else ["MAG[0]"]
     assert sorted(topics) == ["BARO", *names]
     for place, name in enumerate(names):
         for column in ("TimeUS", "MagX", "MagZ"):
             theirs = [float(v) for v, i in zip(expected[column], expected["I"], strict=True) if int(i) == place]
-            assert numbers(topics[name], column).astype(float).tolist() == theirs
-    assert numbers(topics["BARO"], "Temp").tolist() == [25.31] * 40
+            assert values_of(topics[name], column).astype(float).tolist() == theirs
+    assert values_of(topics["BARO"], "Temp").tolist() == [25.31] * 40
     assert topics["MAG[0]"].units == {"TimeUS": "µs", "MagX": "mGauss", "MagY": "mGauss", "MagZ": "mGauss"}
 
 
 def files_of_package(package, *folder):
-    """The files that a package's own tests read, written by programs of all ages on machines of all kinds."""
+    """Files of a package's own tests, written by old and new programs on various machines."""
     place = Path(pytest.importorskip(package).__file__).parent.joinpath(*folder)
     found = sorted(path for path in place.glob("*") if path.suffix in (".mat", ".h5"))
     if not found:
@@ -110,16 +110,16 @@ def files_of_package(package, *folder):
 
 def test_files_of_matlab_from_version_4_on_are_read_or_refused():
     files = files_of_package("scipy", "io", "matlab", "tests", "data")
-    outcomes = {path.name: rows_or_sentence(path)[0] for path in files}
+    outcomes = {path.name: rows_or_message(path)[0] for path in files}
     assert len(files) >= 100
     for version in ("4.2c_SOL2", "6.1_SOL2", "6.5.1_GLNX86", "7.1_GLNX86", "7.4_GLNX86"):
         (topic,) = outcomes[f"testdouble_{version}.mat"]
-        assert np.allclose(numbers(topic, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
+        assert np.allclose(values_of(topic, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
     (whole,) = outcomes["testhdf5_7.4_GLNX86.mat"]  # version 7.3, by MATLAB itself
-    assert np.allclose(numbers(whole, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
+    assert np.allclose(values_of(whole, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
     assert sum(map(bool, outcomes.values())) >= 25
 
 
-def test_files_of_hdf5_by_others_give_rows_or_a_sentence():
-    read = [rows_or_sentence(path)[0] for path in files_of_package("h5py", "tests", "data_files")]
+def test_hdf5_files_of_other_programs_give_rows_or_a_message():
+    read = [rows_or_message(path)[0] for path in files_of_package("h5py", "tests", "data_files")]
     assert any(read)

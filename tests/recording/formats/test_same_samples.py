@@ -43,39 +43,39 @@ KINDS = {
 }
 
 
-def numbers(topic, name):
+def values_of(topic, name):
     return topic.table.series[topic.table.names.index(name)].to_numpy()
 
 
-def chosen(path, name):
+def topic_named(path, name):
     return next(topic for topic in read_topics(path) if topic.name == name)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_numbers_times_and_units_are_those_of_the_csv(kind, tmp_path):
+def test_numbers_times_and_units_equal_those_of_the_csv(kind, tmp_path):
     ending, write, name, columns, time, factor, time_unit, unit = KINDS[kind]
     write(tmp_path / f"recording{ending}", GIVEN)
     writers.csv(tmp_path / "recording.csv", GIVEN)
     plain = Recording.read(tmp_path / "recording.csv")
-    topic = chosen(tmp_path / f"recording{ending}", name)
+    topic = topic_named(tmp_path / f"recording{ending}", name)
     assert topic.table.names[0] == time
     for mine, theirs in zip(columns, MAG, strict=True):
-        assert numbers(topic, mine).astype(np.float64).tolist() == plain[theirs].tolist()
+        assert values_of(topic, mine).astype(np.float64).tolist() == plain[theirs].tolist()
     expected = plain["time"].numpy().astype(np.int64) * factor if factor >= 1 else plain["time"].numpy() / 1e6
-    assert numbers(topic, time).tolist() == expected.tolist()
+    assert values_of(topic, time).tolist() == expected.tolist()
     assert topic.units.get(time, "") == time_unit
     assert [topic.units.get(column, "") for column in columns] == [unit] * 3
     assert not [sentence for sentence in topic.warnings if "damaged" in sentence]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_calibration_is_that_of_the_csv_to_the_last_digit(kind, tmp_path):
+def test_the_calibration_equals_that_of_the_csv_to_the_last_digit(kind, tmp_path):
     ending, write, name, columns, *_ = KINDS[kind]
     write(tmp_path / f"recording{ending}", GIVEN)
     writers.csv(tmp_path / "recording.csv", GIVEN)
     plain = Recording.read(tmp_path / "recording.csv")
-    topic = chosen(tmp_path / f"recording{ending}", name)
-    mine = {new: numbers(topic, old).astype(np.float64) for new, old in zip(MAG, columns, strict=True)}
+    topic = topic_named(tmp_path / f"recording{ending}", name)
+    mine = {new: values_of(topic, old).astype(np.float64) for new, old in zip(MAG, columns, strict=True)}
     same = Recording({"time": plain["time"], **mine}, name=plain.name)
     found, expected = calibrate(same), calibrate(plain)
     assert found.center == expected.center
