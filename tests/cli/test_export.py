@@ -22,7 +22,7 @@ from mkc_torch.report.calibration import page
 from tests.calibration.exports import formulas
 from tests.calibration.test_calibrate import noisy_ellipsoid
 from tests.cli.test_cli import mkc, refused, table
-from tests.diagnosis.files.test_sensor_correction import CABLE, WARMTH, model_of
+from tests.diagnosis.files.test_sensor_correction import CABLE, TEMPERATURE, model_of
 
 KINDS = tuple(kind for kind in EVERY_KIND if kind != "imu-calib")
 """Exports of a magnetometer."""
@@ -50,7 +50,7 @@ def model(tmp_path):
     folder = tmp_path / "FLIGHT"
     folder.mkdir()
     path = folder / "model.json"
-    path.write_text(model_of([CABLE, WARMTH], [(0.3, -0.2, 0.4), (0.5, 0.1, -0.2)]).to_json(), encoding="utf-8")
+    path.write_text(model_of([CABLE, TEMPERATURE], [(0.3, -0.2, 0.4), (0.5, 0.1, -0.2)]).to_json(), encoding="utf-8")
     return path
 
 

@@ -38,7 +38,7 @@ def contaminated(values, size, seed):
     return values + size * (1.0 + 29.0 * bad) * random.standard_normal(values.shape)
 
 
-def swung(hidden, seed=0):
+def pendulum_recording(hidden, seed=0):
     """600 samples of a damped pendulum's angle, with hidden physics in its equation."""
     time = np.arange(600) * 0.02
 
@@ -56,7 +56,7 @@ def value(finding, name):
     return match.value, match.standard_error
 
 
-def explained(diagnosis, effect):
+def only_confirmed_finding(diagnosis, effect):
     """Return the only finding, with the expected name and confirmed by held-out blocks."""
     assert diagnosis.verdict == "explained"
     (finding,) = diagnosis.findings
@@ -71,8 +71,8 @@ def explained(diagnosis, effect):
 @pytest.mark.parametrize(("size", "seed"), [(0.2, 0), pytest.param(0.05, 2, marks=pytest.mark.slow)])
 def test_air_drag_is_named_and_sized(size, seed):
     """A body whose flow is laminar at small speeds."""
-    recording = swung(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
-    finding = explained(diagnose(Pendulum(), recording, **QUICK), "quadratic_drag")
+    recording = pendulum_recording(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
+    finding = only_confirmed_finding(diagnose(Pendulum(), recording, **QUICK), "quadratic_drag")
     drag, error = value(finding, "drag")
     assert drag == pytest.approx(size, abs=0.015)
     assert 0.0 < error < 0.01
@@ -83,8 +83,10 @@ def test_air_drag_is_named_and_sized(size, seed):
 @pytest.mark.slow
 def test_dry_friction_is_named_and_sized():
     """The jump is smoothed by another function than the catalogue's."""
-    diagnosis = diagnose(Pendulum(), swung(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK)
-    finding = explained(diagnosis, "coulomb_friction")
+    diagnosis = diagnose(
+        Pendulum(), pendulum_recording(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK
+    )
+    finding = only_confirmed_finding(diagnosis, "coulomb_friction")
     assert value(finding, "friction")[0] == pytest.approx(0.3, abs=0.03)
     assert finding.held_out.rmse_after == pytest.approx(NOISE, rel=0.25)
     assert finding.alternatives[0].effect == "stribeck_friction"
@@ -93,7 +95,7 @@ def test_dry_friction_is_named_and_sized():
 @pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_alone_has_no_findings(seed):
-    diagnosis = diagnose(Pendulum(), swung(lambda _, __: 0.0, seed), **QUICK)
+    diagnosis = diagnose(Pendulum(), pendulum_recording(lambda _, __: 0.0, seed), **QUICK)
     assert diagnosis.verdict == "adequate"
     assert diagnosis.findings == ()
     assert diagnosis.corrected.rmse == pytest.approx(NOISE, rel=0.25)
@@ -133,7 +135,7 @@ def filled(leak, seed=0):
 
 @pytest.mark.e2e
 def test_a_pipe_between_two_tanks_is_named_and_sized():
-    finding = explained(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
+    finding = only_confirmed_finding(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")
     assert exchange == pytest.approx(0.15, abs=0.03)  # the outflow of one tank is the inflow of the other
     assert error < 0.03
@@ -203,7 +205,7 @@ def without_small_ones(command):
 )
 def test_backlash_and_a_dead_zone_are_separable(hidden, name, size):
     diagnosis = diagnose(Servo(), commanded(hidden), effects=among("backlash", "dead_zone"), **QUICK)
-    finding = explained(diagnosis, name)
+    finding = only_confirmed_finding(diagnosis, name)
     assert value(finding, "share")[0] == pytest.approx(1.0, abs=0.1)
     assert value(finding, size)[0] == pytest.approx(0.14, abs=0.01)
     assert all(alternative.separable for alternative in finding.alternatives)
@@ -219,7 +221,7 @@ def test_a_hysteretic_spring_is_named_and_sized():
 
     recording = measured(rate, [1.2, 0.0, 0.0], np.arange(300) * 0.02, NOISE, seen=("angle",))
     rivals = among("bouc_wen_hysteresis", "coulomb_friction")
-    finding = explained(diagnose(Pendulum(), recording, effects=rivals, **QUICK), "bouc_wen_hysteresis")
+    finding = only_confirmed_finding(diagnose(Pendulum(), recording, effects=rivals, **QUICK), "bouc_wen_hysteresis")
     assert value(finding, "stiffness")[0] == pytest.approx(2.0, abs=0.5)
     assert value(finding, "yield_deflection")[0] == pytest.approx(0.25, abs=0.1)
     assert finding.channels == ("rate of speed",)
@@ -248,7 +250,7 @@ def test_added_mass_is_named_and_sized():
 
     recording = measured(rate, [0.5, 0.0], time, NOISE, seen=("heave",), force=force)
     rivals = among("added_mass", "cubic_stiffness")
-    finding = explained(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
+    finding = only_confirmed_finding(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
     share, error = value(finding, "share")
     assert share == pytest.approx(0.1 / 1.1, abs=0.01)
     assert 0.0 < error < 0.01
@@ -323,7 +325,7 @@ def test_a_submerged_body_has_a_constant_force():
 
     recording = measured(rate, [5.0, 0.0], np.arange(120) * 0.02, NOISE, seen=("height",))
     rivals = among("buoyancy", "constant_force")
-    finding = explained(diagnose(Sinking(), recording, effects=rivals, **QUICK), "constant_force")
+    finding = only_confirmed_finding(diagnose(Sinking(), recording, effects=rivals, **QUICK), "constant_force")
     assert [(a.effect, a.separable) for a in finding.alternatives] == [("buoyancy", False)]
 
 

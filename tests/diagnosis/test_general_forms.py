@@ -8,7 +8,14 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.simulation import Dynamics, Parameter
-from tests.diagnosis.test_dynamics_diagnosis import QUICK, Pendulum, explained, measured, swung, value
+from tests.diagnosis.test_dynamics_diagnosis import (
+    QUICK,
+    Pendulum,
+    measured,
+    only_confirmed_finding,
+    pendulum_recording,
+    value,
+)
 
 pytestmark = pytest.mark.e2e
 
@@ -44,7 +51,7 @@ def test_convection_is_named_with_its_exponent():
         away = y[0] - room
         return [(power - 0.3 * away - 0.04 * abs(away) ** 1.4 * np.sign(away)) / 50.0]
 
-    finding = explained(diagnose(Body(), heated(rate, [20.0], 0.05), **QUICK), "power_law")
+    finding = only_confirmed_finding(diagnose(Body(), heated(rate, [20.0], 0.05), **QUICK), "power_law")
     exponent, error = value(finding, "exponent")
     assert exponent == pytest.approx(1.4, abs=3.0 * error)
     assert error < 0.1
@@ -58,7 +65,7 @@ def test_a_wall_that_takes_up_heat_is_named_and_sized():
         flow = 0.5 * (y[1] - y[0])
         return [(power - 0.4 * (y[0] - room) + flow) / 50.0, -flow / 20.0]
 
-    finding = explained(diagnose(Body(), heated(rate, [20.0, 20.0], 0.05), **QUICK), "hidden_lag")
+    finding = only_confirmed_finding(diagnose(Body(), heated(rate, [20.0, 20.0], 0.05), **QUICK), "hidden_lag")
     assert value(finding, "share")[0] == pytest.approx(0.4, abs=0.04)
     assert value(finding, "time_constant")[0] == pytest.approx(40.0, abs=4.0)
 
@@ -86,7 +93,7 @@ def test_a_flexible_joint_is_named_with_its_period():
         return [y[1], np.interp(t, time, torque) - 6.0 * y[0] - 0.3 * y[1] + spring, y[3], -spring / 0.2]
 
     recording = measured(rate, [0.3, 0.0, 0.3, 0.0], time, 0.005, seen=("angle",), torque=torque)
-    finding = explained(diagnose(Joint(), recording, **QUICK), "hidden_mode")
+    finding = only_confirmed_finding(diagnose(Joint(), recording, **QUICK), "hidden_mode")
     assert value(finding, "share")[0] == pytest.approx(0.2, abs=0.02)
     assert value(finding, "period")[0] == pytest.approx(2.0 * math.pi / 10.0, rel=0.02)
     assert value(finding, "damping")[0] == pytest.approx(0.1 / (2.0 * 0.2 * 10.0), abs=0.02)
@@ -104,4 +111,4 @@ class Free(Pendulum):
 @pytest.mark.parametrize("name", ["linear_drag", "quadratic_drag"])
 def test_whole_powers_keep_their_names(name):
     drags = {"linear_drag": lambda _, v: -0.06 * v, "quadratic_drag": lambda _, v: -0.12 * v * abs(v)}
-    explained(diagnose(Free(), swung(drags[name]), **QUICK), name)
+    only_confirmed_finding(diagnose(Free(), pendulum_recording(drags[name]), **QUICK), name)

@@ -98,16 +98,18 @@ def test_the_estimate_follows_a_slow_disturbance_better_than_a_white_one(disturb
 def test_the_first_sentence_states_whether_it_is_white(disturbance):
     first = forcing(disturbance, 1)[0].sentences[0]
     if disturbance == "white":
-        assert first == "The disturbance of the rate of rate is white."
+        assert "rate of rate is white" in first
     else:
         lasting = f"{TRUTH[disturbance].lasting:.2g} s"
-        assert first == f"The disturbance of the rate of rate is not white: its correlation time is about {lasting}."
+        assert "rate of rate is not white" in first
+        assert f"correlation time is about {lasting}" in first
 
 
 @pytest.mark.parametrize("disturbance", ["white", "slow"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_independent_disturbance_is_reported_as_uncorrelated_with_the_input(disturbance, seed):
-    assert forcing(disturbance, seed)[0].sentences[1:] == ("It is uncorrelated with torque at all lags.",)
+    (text,) = forcing(disturbance, seed)[0].sentences[1:]
+    assert "uncorrelated with torque" in text
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -8,7 +8,7 @@ from mkc_torch.diagnosis.settings import NoiseSettings
 from tests.diagnosis.swing import fitted_swing
 
 
-def test_noise_of_the_open_loop_is_not_estimated_where_no_fit_is_likely_enough(monkeypatch):
+def test_the_noise_of_the_open_loop_is_estimated_only_above_a_minimum_likelihood(monkeypatch):
     fit, estimates = fitted_swing("white").fit, []
     monkeypatch.setattr(process_noise, "estimate_noise", lambda *a: estimates.append(a) or estimate_noise(*a))
     counts = []

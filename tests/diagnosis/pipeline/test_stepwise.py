@@ -41,7 +41,7 @@ def located(beyond, with_noise=False):
         (False, -0.5, 1.0, 100.0, False),
     ],
 )
-def test_when_a_candidate_counts(first, mean, spread, beyond, counts):
+def test_a_candidate_counts_by_its_held_out_gain_or_if_far_beyond_all_surrogates(first, mean, spread, beyond, counts):
     assert (
         holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, ConfirmationSettings(), first=first)
         is counts

@@ -47,7 +47,7 @@ def burst_warnings(diagnosis):
 
 
 @pytest.mark.e2e
-def test_a_single_burst_among_others_is_no_finding():
+def test_an_effect_that_explains_a_single_burst_is_not_a_finding():
     """A pole near the path would explain the mild burst only."""
     diagnosis = diagnosis_of(bursts(MILD | OTHERS))
     assert diagnosis.verdict == "unexplained"  # bursts are not white noise
@@ -74,7 +74,7 @@ def stretch():
     return trace, counts, torch.ones(1000, 2, 1, dtype=torch.float64)
 
 
-def test_the_stretch_contains_the_evidence(stretch):
+def test_the_stretch_contains_nearly_all_of_the_gain(stretch):
     trace, counts, nuisance = stretch
     first, end = localised_stretch(trace, counts, trace, nuisance, Settings())
     assert first <= 400
@@ -104,6 +104,6 @@ def test_parameters_of_the_simulation_are_projected_out(stretch):
     assert localised_stretch(offset, counts, offset, nuisance[..., :0], Settings()) is None
 
 
-def test_an_anticorrelated_trace_is_no_evidence(stretch):
+def test_an_anticorrelated_trace_has_no_stretch(stretch):
     trace, counts, nuisance = stretch
     assert localised_stretch(-trace, counts, trace, nuisance, Settings()) is None

@@ -10,7 +10,7 @@ from mkc_torch.effects.context import Context
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import DEGREE, UnknownRate
-from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, swung
+from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, pendulum_recording
 
 REACH = 1.5
 GAMMA = torch.tensor([0.3, -0.7, 0.2, 0.5], dtype=torch.float64)
@@ -53,7 +53,7 @@ def test_code_equals_the_curve(context, of):
 @pytest.fixture(scope="module")
 def diagnosis():
     """A force to one side that grows with the square of the speed, in both directions of the pendulum."""
-    recording = swung(lambda _, speed: 0.12 * speed**2)
+    recording = pendulum_recording(lambda _, speed: 0.12 * speed**2)
     # a catalogue of forces along the motion only
     effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
     return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
