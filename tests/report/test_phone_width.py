@@ -18,7 +18,7 @@ from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.blind_proof import test_scenarios_score as scenario_score
-from tests.blind_proof.test_score import NOTHING, answer, finding, key, score
+from tests.blind_proof.test_score import ADEQUATE, answer, finding, key, score
 from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -120,7 +120,7 @@ def others():
     yield "refusal", refusal_report(flat, refused.value)
     keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
     settings = scenario_score.SETTINGS | {"hidden": 3, LONG: LONG}
-    result = score(keys, {"a": answer(finding("hard_iron_step")), "b": NOTHING, "c": answer(finding("offset_drift"))})
+    result = score(keys, {"a": answer(finding("hard_iron_step")), "b": ADEQUATE, "c": answer(finding("offset_drift"))})
     yield "proof", proof_page(ProofScore((), result, tuple(result.cases)), {LONG: result}, settings)
     yield "scenarios", proof_page(scenario_score.all_kinds(), {}, settings)
 
