@@ -21,7 +21,7 @@ TANK = Model(
     ("inflow",),
     units={"level": "m", "inflow": "m/s"},
 )
-"""That of tests/cli/test_own_simulation.py."""
+"""The tank of tests/cli/test_own_simulation.py."""
 
 
 @pytest.mark.slow
