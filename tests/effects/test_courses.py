@@ -28,7 +28,7 @@ def driven(values, unit):
     return Context(time, values.unsqueeze(-1), (unit,), values.new_zeros(len(values), 3), "µT", ("x", "y", "z"))
 
 
-def test_a_step_is_constant_from_its_onset_on():
+def test_a_step_is_constant_after_its_onset():
     gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
     change = STEP.change(gamma, {"onset": 40.0}, timed())
     before = TIME < 40.0

@@ -47,7 +47,7 @@ def test_derivative_at_no_gap_is_the_direction_of_motion():
         assert not bool(slope[:, k, 1 - k].any())
 
 
-def test_play_and_a_delay_act_in_series():
+def test_play_and_a_delay_have_the_residual_of_both_in_series():
     simulator, recording = arm()
     prepared = simulator.prepare(recording)
     model = JointModel(prepared, terms(prepared, "backlash", "delay"))

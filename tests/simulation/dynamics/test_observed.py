@@ -108,7 +108,7 @@ class TestObserved:
         assert float(left.std()) < 0.5 * float(prepared.residual(theta, {}).std())
         torch.testing.assert_close(corrected.residual(theta, {}), corrected.observer.whitened(left))
 
-    def test_answers_do_not_depend_on_the_trajectory_they_start_from(self):
+    def test_residuals_do_not_depend_on_the_initial_trajectory(self):
         prepared, theta = forced_oscillator()
         corrected = prepared.observed(observer_for(prepared, theta, *DISTURBANCES))
         near = corrected.answer(1.01 * theta, {}).nearby
