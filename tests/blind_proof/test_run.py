@@ -212,7 +212,7 @@ def test_draws_do_not_depend_on_the_number_of_processes(name, tmp_path):
     assert (tmp_path / "1" / "key_hash.txt").read_text() == (tmp_path / "2" / "key_hash.txt").read_text()
 
 
-def test_a_folder_in_use_an_unknown_scenario_and_a_run_of_nothing_are_rejected(tmp_path):
+def test_a_folder_in_use_an_unknown_scenario_and_an_empty_run_are_rejected(tmp_path):
     with pytest.raises(ValueError, match=r"held .* white, coloured, wander"):
         PROOFS["magnetometer_scenarios"].only(["held"])
     with pytest.raises(ValueError, match="both 0"):

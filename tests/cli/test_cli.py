@@ -14,33 +14,16 @@ import torch
 pytest.importorskip("typer")
 pytest.importorskip("polars")
 
-from typer.testing import CliRunner
 
 from mkc_torch._support import files as _files
 from mkc_torch.calibration.calibrate import Calibration
-from mkc_torch.cli.app import app
 from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
+from tests.cli.commands import assert_refused, mkc
 from tests.shared_data import shared_data
 
 AXES = ("mag_x", "mag_y", "mag_z")
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def assert_refused(result, *words, code=1):
-    """Assert a failure in a line that contains the words, without a traceback."""
-    assert result.exit_code == code, result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    if code == 1:
-        assert len(result.stderr.strip().splitlines()) == 1
-    flat = " ".join(result.stderr.replace("│", " ").split())
-    for word in words:
-        assert word in flat, flat
 
 
 def table(path, points, **columns):
@@ -249,7 +232,7 @@ def test_results_are_written_to_results_by_default(good_table, tmp_path, monkeyp
     result = mkc("calibrate", good_table)
     assert result.exit_code == 0
     assert (tmp_path / "results" / "good" / "calibration.json").exists()
-    assert f"mkc apply results/good/calibration.json {good} --output corrected.csv" in result.output
+    assert f"mkc apply results/good/calibration.json {good_table} --output corrected.csv" in result.output
 
 
 def test_a_doubtful_calibration_exits_with_three(tmp_path):
@@ -410,7 +393,7 @@ def test_text_of_the_user_is_printed_without_markup(demo, tmp_path):
     assert str(tmp_path / "out" / "no:X:[b]file" / "report.html") in result.stdout
 
 
-def test_apply_refuses_what_it_cannot_use(demo, tmp_path):
+def test_apply_refuses_unusable_files(demo, tmp_path):
     folder, _ = demo
     c, rec, out = folder / "calibration.json", folder / "recording.csv", ("--output", tmp_path / "o.csv")
     assert_refused(mkc("apply", tmp_path / "none.json", rec, *out), "none.json: there is no such file")

@@ -14,16 +14,15 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 pytest.importorskip("jsonschema")
 
-from typer.testing import CliRunner
 
 from mkc_torch._support import files as _files
 from mkc_torch.cli import diagnosis_files
-from mkc_torch.cli.app import app
 from mkc_torch.cli.console import ConsoleStyle
 from mkc_torch.cli.diagnose import _waited_for
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.recording import Recording, write_table
+from tests.cli.commands import assert_refused, mkc
 from tests.diagnosis.factory import make_diagnosis
 from tests.started import started
 
@@ -33,25 +32,8 @@ QUICK = ("--simulation", "magnetometer", "--surrogates", "19")
 QUIET, STEPPED = 3, 1
 
 
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
 def diagnose_magnetometer(*arguments):
     return mkc("diagnose", *arguments, *QUICK)
-
-
-def assert_refused(result, *words, code=1, lines=1):
-    """Assert a failure in so many lines that contain the words, without a traceback."""
-    assert result.exit_code == code, result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    if code == 1:
-        # a busy machine reports progress too
-        assert len([line for line in result.stderr.strip().splitlines() if "mkc: after " not in line]) == lines
-    flat = " ".join(result.stderr.replace("│", " ").split())
-    for word in words:
-        assert word in flat, flat
 
 
 def sensor_columns(seed, *, step=0.0, count=500, start=0.0):

@@ -12,13 +12,14 @@ from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import SECTIONS, Row, Section
+from tests.cli.commands import flat
 from tests.diagnosis.factory import (
     graded,
     make_diagnosis,
     make_environment,
-    make_follows,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 
@@ -28,10 +29,6 @@ def summary_text(diagnosis, files=(), *, width=100, terminal=False, paths=None):
     console = Console(file=stream, width=width, force_terminal=terminal, highlight=False)
     show(console, diagnosis, [Path(file) for file in files], paths)
     return stream.getvalue()
-
-
-def flat(text):
-    return " ".join(text.split())
 
 
 def test_the_summary_of_a_finding_has_size_evidence_advice_and_files():
@@ -196,15 +193,21 @@ def test_the_summary_of_a_poor_fit_names_no_physics():
 
 def test_nearest_and_unconfirmed_findings_are_not_listed_as_named():
     made = make_diagnosis(1, verdict="unexplained")
-    for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "unconfirmed"), "not conf")):
+    for change, grade in (
+        (with_another_shape, "nearest in the catalogue"),
+        (lambda f: graded(f, "unconfirmed"), "not conf"),
+    ):
         text = flat(summary_text(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
         assert f"named nothing confirmed; hard-iron step: {grade}" in text
         assert "unexplained unnamed structure" in text
-    shape = flat(summary_text(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
+    shape = flat(summary_text(dataclasses.replace(made, findings=(with_another_shape(made.findings[0]),)), width=200))
     assert "gains 163 nats (p = 0.002 if the name is right); 0.0071 |x|^1.52 sign(x)" in shape
 
 
 def test_each_output_has_its_own_unit():
-    followed = (make_follows(), make_follows("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"))
+    followed = (
+        make_goodness_of_fit(),
+        make_goodness_of_fit("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"),
+    )
     text = flat(summary_text(make_diagnosis(0, environment=make_environment(goodness_of_fit=followed)), width=200))
     assert "rate: residual 0.0300 rad/s; noise floor 0.0200 rad/s (resolution of the recording)" in text

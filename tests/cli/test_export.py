@@ -21,7 +21,8 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import page
 from tests.calibration.exports import formulas
 from tests.calibration.test_calibrate import noisy_ellipsoid
-from tests.cli.test_cli import assert_refused, mkc, table
+from tests.cli.commands import assert_refused, mkc
+from tests.cli.test_cli import table
 from tests.diagnosis.files.test_sensor_correction import CABLE, TEMPERATURE, model_of
 
 KINDS = tuple(kind for kind in EVERY_KIND if kind != "imu-calib")

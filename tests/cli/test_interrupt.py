@@ -14,7 +14,8 @@ pytest.importorskip("polars")
 
 from mkc_torch.cli import console
 from tests.calibration.test_calibrate import noisy_ellipsoid
-from tests.cli.test_cli import mkc, table
+from tests.cli.commands import mkc
+from tests.cli.test_cli import table
 from tests.started import started
 
 SLOW_IMPORT = """

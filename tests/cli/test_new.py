@@ -7,14 +7,9 @@ import pytest
 
 pytest.importorskip("typer")
 
-from typer.testing import CliRunner
 
-from mkc_torch.cli.app import app
 from mkc_torch.simulation import load_simulation
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(item) for item in arguments])
+from tests.cli.commands import mkc
 
 
 @pytest.mark.parametrize(("command", "kind"), [("new-simulation", "Dynamics"), ("new-effect", "GainEffect")])

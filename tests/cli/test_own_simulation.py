@@ -10,14 +10,13 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 pytest.importorskip("jsonschema")
 
-from typer.testing import CliRunner
 
-from mkc_torch.cli.app import app
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.simulation import SimulationFileError, load_simulation
+from tests.cli.commands import flat, mkc
 
 STATIC = """
 from mkc_torch.simulation import Static
@@ -47,14 +46,6 @@ class Tank(Dynamics):
 
 # what a reader of a report on anything but a magnetometer has to be spared
 MAGNETOMETER_WORDS = ("magnetometer", "µT", "sensor axes", "field on the axis", "corrected field")
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def flat(text):
-    return " ".join(text.split())
 
 
 def thermistor_table(path, *, count=250):

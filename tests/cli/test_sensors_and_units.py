@@ -9,25 +9,15 @@ import torch
 pytest.importorskip("typer")
 pytest.importorskip("polars")
 
-from typer.testing import CliRunner
 
 from mkc_torch.calibration.calibrate import Calibration
-from mkc_torch.cli.app import app
 from mkc_torch.cli.diagnose import _sensor, _units
 from mkc_torch.cli.units_option import parsed_units
 from mkc_torch.recording.recording import Recording, write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
-from tests.cli.test_cli import assert_refused
+from tests.cli.commands import assert_refused, flat, mkc
 
 COUNT = 300
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def flat(text):
-    return " ".join(text.split())
 
 
 def calibration(folder):

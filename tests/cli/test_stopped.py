@@ -20,8 +20,8 @@ from mkc_torch.cli.console import progress
 from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.diagnosis.pipeline.partial import PartialResult
 from mkc_torch.diagnosis.result import Stop
-from tests.cli.test_cli import mkc
-from tests.cli.test_diagnose import STEPPED, assert_refused, quiet_table, sensor_columns
+from tests.cli.commands import assert_refused, mkc
+from tests.cli.test_diagnose import STEPPED, quiet_table, sensor_columns
 from tests.diagnosis.factory import make_diagnosis
 from tests.started import started
 
@@ -75,7 +75,7 @@ def test_a_time_limit_before_the_first_fit_writes_nothing_and_exits_with_1(tmp_p
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("how", [("--together",), ("--simulator-output",)])
-def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, monkeypatch, how):
+def test_a_time_limit_stops_joint_diagnoses_and_those_of_simulator_outputs(tmp_path, monkeypatch, how):
     paths = [quiet_table(tmp_path / "a.csv"), quiet_table(tmp_path / "b.csv", **sensor_columns(STEPPED))]
     stopped_in_the_search(monkeypatch)
     limit = ("--output", tmp_path / "out", "--time-limit", "3600", "--surrogates", "19")

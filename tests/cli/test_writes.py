@@ -13,12 +13,11 @@ pytest.importorskip("typer")
 pytest.importorskip("polars")
 
 import torch
-from typer.testing import CliRunner
 
 from mkc_torch.cli import diagnosis_files
-from mkc_torch.cli.app import app
 from mkc_torch.recording.recording import write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
+from tests.cli.commands import mkc
 from tests.diagnosis.factory import make_diagnosis
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no fork")
@@ -26,10 +25,6 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no fork")
 ROOT = Path(__file__).resolve().parents[2]
 AXES = ("mag_x", "mag_y", "mag_z")
 ENDS = {".json": "}\n", ".html": "</html>", ".py": "\n", ".csv": "\n"}
-
-
-def mkc(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits, size_of
 from mkc_torch.simulation import Magnetometer, Static
 from mkc_torch.simulation.ports import Port
-from tests.diagnosis.factory import make_follows
+from tests.diagnosis.factory import make_goodness_of_fit
 
 N = 4000
 TIME = torch.arange(N, dtype=torch.float64) / 50.0
@@ -142,8 +142,8 @@ def test_without_a_recorded_column_for_each_output_there_is_no_goodness_of_fit()
 
 
 def test_an_output_of_unknown_share_is_a_poor_fit():
-    known = make_follows(explained=0.95)
-    assert poor_fits((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
+    known = make_goodness_of_fit(explained=0.95)
+    assert poor_fits((known, make_goodness_of_fit(explained=torch.nan)), 0.5)[0] is not known
     assert poor_fits((known,), 0.95) == ()
 
 
@@ -159,7 +159,11 @@ def test_a_floor_below_the_resolution_of_the_sampling_is_unknown():
 
 
 def test_pooled_shares_count_negative_shares_as_zero():
-    known = (make_follows(explained=0.8), make_follows(explained=0.4), make_follows(explained=-3.0))
+    known = (
+        make_goodness_of_fit(explained=0.8),
+        make_goodness_of_fit(explained=0.4),
+        make_goodness_of_fit(explained=-3.0),
+    )
     assert pooled(known) == pytest.approx(0.4)
     assert pooled(known, -1.0) == pytest.approx(0.2 / 3.0)
     assert pooled(()) == 0.0

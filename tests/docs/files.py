@@ -33,9 +33,9 @@ def write_examples(folder: Path) -> None:
         "FLIGHT": concealed_recording(0).columns,
         "BENCH": concealed_recording(2).columns,
         "NEW": concealed_recording(1).columns,
-        "VEHICLE": vehicle(),
-        "SIDES": sides(),
-        "SUPPLY": supplied(),
+        "VEHICLE": vehicle_recording(),
+        "SIDES": accelerometer_recording(),
+        "SUPPLY": supply_recording(),
         "RUNS": joined(pendulum(0), pendulum(1)),
         "NEW_RUN": pendulum(2),
         "SIM": simulated,
@@ -48,7 +48,7 @@ def write_examples(folder: Path) -> None:
         make_fmu(folder / "pendulum.fmu", PENDULUM)
 
 
-def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
+def vehicle_recording(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
     """A magnetometer and a gyroscope that tilt by ten degrees and rotate about the vertical."""
     draw = torch.Generator().manual_seed(0)
     time = torch.arange(samples, dtype=torch.float64) / rate
@@ -65,7 +65,7 @@ def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
     return {"time": time, **dict(zip(names, columns, strict=True))}
 
 
-def sides() -> dict[str, Tensor]:
+def accelerometer_recording() -> dict[str, Tensor]:
     """An accelerometer, turned in all directions."""
     draw = torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(400, 3, generator=draw, dtype=torch.float64), dim=-1)
@@ -74,7 +74,7 @@ def sides() -> dict[str, Tensor]:
     return dict(zip(("accel_x", "accel_y", "accel_z"), force.unbind(-1), strict=True))
 
 
-def supplied() -> dict[str, Tensor]:
+def supply_recording() -> dict[str, Tensor]:
     """A sensor whose offset follows a voltage."""
     columns = dict(concealed_recording(3).columns)
     voltage = 12.0 + torch.sin(0.23 * columns["time"]) + 0.5 * torch.sin(1.1 * columns["time"])

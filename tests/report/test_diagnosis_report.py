@@ -54,13 +54,13 @@ def page_of_three_findings():
     return page_of(3, channels=3)
 
 
-def test_page_is_well_formed_with_unique_ids(page_of_three_findings):
+def test_the_page_is_well_formed_with_unique_ids(page_of_three_findings):
     tags = parse_page(page_of_three_findings)
     assert len(tags.ids) == len(set(tags.ids))
     assert page_of_three_findings.count("<figure") == 4
 
 
-def test_page_loads_nothing(page_of_three_findings):
+def test_the_page_loads_nothing(page_of_three_findings):
     assert "<script" not in page_of_three_findings
     assert "@import" not in page_of_three_findings
     sources = re.findall(r'(?:href|src)="([^"]*)"', page_of_three_findings) + re.findall(

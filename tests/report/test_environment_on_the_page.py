@@ -17,15 +17,15 @@ from mkc_torch.report.diagnosis import environment, unseen
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.diagnosis.factory import (
-    LOST,
+    POOR_FITS,
     PROCESS_NOISE,
     graded,
     make_diagnosis,
+    make_disturbance,
     make_environment,
-    make_follows,
-    make_forcing,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 from tests.report.test_calibration_report import parse_page, text_of
@@ -54,7 +54,7 @@ def box_of(page):
 
 
 def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
-    followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
+    followed = (make_goodness_of_fit(), make_goodness_of_fit("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
     quiet = make_diagnosis(
         0, samples=200, environment=make_environment(goodness_of_fit=followed, process_noise=(), disturbance=())
     )
@@ -69,7 +69,7 @@ def test_the_box_has_the_goodness_of_fit_of_each_output_in_its_unit():
 
 
 def test_an_output_of_small_variation_has_no_explained_share():
-    still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
+    still = make_goodness_of_fit(residual=0.0051, variation=0.006, explained=0.2)
     (line,) = environment.output_lines(
         make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=(still,)))
     )
@@ -78,7 +78,7 @@ def test_an_output_of_small_variation_has_no_explained_share():
 
 
 def test_the_table_has_all_of_many_outputs():
-    many = tuple(make_follows(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
+    many = tuple(make_goodness_of_fit(f"motor_{i}", "rad/s", rmse_of_last_value=math.nan) for i in range(9))
     page = diagnosis_report(
         make_diagnosis(
             0, samples=100, environment=make_environment(goodness_of_fit=many, process_noise=(), disturbance=())
@@ -132,7 +132,7 @@ def test_the_disturbance_is_the_first_picture_with_size_and_correlation_time():
 @pytest.mark.parametrize("samples", [1, 2, 5000])
 @pytest.mark.parametrize("curves", [0, 1, 12])
 def test_disturbances_of_any_length_and_number_of_curves_have_a_page(samples, curves):
-    forcing = make_forcing(samples)
+    forcing = make_disturbance(samples)
     forcing = dataclasses.replace(forcing, curves=tuple(forcing.curves[i % 3] for i in range(curves)))
     page = diagnosis_report(disturbed(disturbance=(forcing,)))
     assert page.count("<figure") == 2
@@ -151,7 +151,7 @@ def test_drift_of_a_sensor_is_reported_as_drift():
     slow = dataclasses.replace(
         PROCESS_NOISE, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002
     )
-    text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_forcing(200, slow),))))
+    text = text_of(diagnosis_report(disturbed(process_noise=(slow,), disturbance=(make_disturbance(200, slow),))))
     assert "A drift of angle adds to the sensor's noise, and no physics" in text
     assert "Drift of angle in addition to its white noise: 0.0120 ± 0.0020 rad, correlation time 0.7 s." in text
     assert "Drift of angle" in text
@@ -160,7 +160,7 @@ def test_drift_of_a_sensor_is_reported_as_drift():
 def test_two_drifts_of_an_output_share_a_sentence_and_have_numbered_headings():
     slow = dataclasses.replace(PROCESS_NOISE, place="angle", at_rate=False, unit="rad", correlation_time=29.0)
     fast = dataclasses.replace(slow, correlation_time=1.5)
-    drifts = tuple(make_forcing(200, process) for process in (slow, fast))
+    drifts = tuple(make_disturbance(200, process) for process in (slow, fast))
     text = text_of(diagnosis_report(disturbed(process_noise=(slow, fast), disturbance=drifts)))
     assert text.count("in addition to its white noise") == 1
     assert "correlation time 29 s; and" in text
@@ -176,7 +176,7 @@ def test_a_form_that_is_kept_at_a_small_p_value_has_a_reason():
 
 
 def test_an_effect_of_another_shape_is_nearest_and_its_free_curve_is_shown():
-    made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), nearest)
+    made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), with_another_shape)
     page = diagnosis_report(made)
     headline = top.headline(made)
     assert headline.startswith("The residual has structure that no effect in the catalogue explains")
@@ -192,7 +192,7 @@ def test_an_effect_of_another_shape_is_nearest_and_its_free_curve_is_shown():
     parse_page(page)
     # of another driver than the named form: the free curve alone
     curve = dataclasses.replace(made.findings[0].curve, driver="difference")
-    alone = with_first(made, lambda f: nearest(f, curve=curve, formula=""))
+    alone = with_first(made, lambda f: with_another_shape(f, curve=curve, formula=""))
     assert "Free curve, 95 % band" in text_of(diagnosis_report(alone))
 
 
@@ -295,7 +295,9 @@ def test_statistics_are_in_closed_details():
 
 def test_the_noise_floor_is_drawn_with_the_residual():
     made = make_diagnosis(
-        0, samples=200, environment=make_environment(goodness_of_fit=(make_follows("norm", "µT"),), process_noise=())
+        0,
+        samples=200,
+        environment=make_environment(goodness_of_fit=(make_goodness_of_fit("norm", "µT"),), process_noise=()),
     )
     page = diagnosis_report(made)
     assert "Dotted: the sensor's noise floor." in text_of(page)
@@ -318,9 +320,9 @@ def test_nats_are_explained_once_before_their_first_use():
 def test_names_in_the_environment_are_escaped():
     bad = "<b>x</b> & $a$"
     noise = dataclasses.replace(PROCESS_NOISE, place=bad, unit=bad)
-    forcing = dataclasses.replace(make_forcing(50, noise), sentences=(bad,))
+    forcing = dataclasses.replace(make_disturbance(50, noise), sentences=(bad,))
     hostile = make_environment(
-        goodness_of_fit=(make_follows(bad, bad),),
+        goodness_of_fit=(make_goodness_of_fit(bad, bad),),
         process_noise=(noise,),
         input_hold={bad: "linear"},
         disturbance=(forcing,),
@@ -334,7 +336,7 @@ def test_names_in_the_environment_are_escaped():
 
 def test_a_poor_fit_with_verdict_adequate_is_reported_as_a_poor_fit():
     lost = make_diagnosis(
-        0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=(), disturbance=())
+        0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=(), disturbance=())
     )
     assert top.tone(lost) == "open"
     assert "does not fit the recording" in top.headline(lost)

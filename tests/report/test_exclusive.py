@@ -23,8 +23,8 @@ from mkc_torch.diagnosis.result import Alternative, Diagnosis, DivergedBlock, Ef
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_follows
-from tests.diagnosis.swing import Pendulum, UpsideDown, swung
+from tests.diagnosis.factory import PROCESS_NOISE, make_diagnosis, make_goodness_of_fit
+from tests.diagnosis.swing import Pendulum, UpsideDown, pendulum_recording
 from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_rows, terminal_rows
 
 END = 3.98  # s, of the factory's 200 samples
@@ -99,7 +99,11 @@ def diagnoses(draw):
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not process_noise else st.floats(1.0, 20.0))
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))
-    fit = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
+    fit = (
+        make_goodness_of_fit(residual=0.36, explained=0.12)
+        if lost
+        else make_goodness_of_fit(residual=noise, floor_source=source)
+    )
     known = FitAssessment((fit,), (), SimpleNamespace(selected=SimpleNamespace(disturbances=process_noise)), lost=lost)
     if lost:
         found = []
@@ -138,10 +142,10 @@ def test_no_page_of_any_diagnosis_contradicts_itself(case):
 
 
 RECORDINGS = {
-    "nothing hidden": lambda: diagnose(Pendulum(), swung("none", N=300)[0], surrogates=39),
-    "drag hidden": lambda: diagnose(Pendulum(), swung("none", N=300, drag=0.3)[0], surrogates=39),
-    "slow process noise": lambda: diagnose(Pendulum(), swung("slow", N=300)[0], surrogates=39),
-    "gravity of the wrong sign": lambda: diagnose(UpsideDown(), swung("none", N=300)[0], surrogates=39),
+    "nothing hidden": lambda: diagnose(Pendulum(), pendulum_recording("none", N=300)[0], surrogates=39),
+    "drag hidden": lambda: diagnose(Pendulum(), pendulum_recording("none", N=300, drag=0.3)[0], surrogates=39),
+    "slow process noise": lambda: diagnose(Pendulum(), pendulum_recording("slow", N=300)[0], surrogates=39),
+    "gravity of the wrong sign": lambda: diagnose(UpsideDown(), pendulum_recording("none", N=300)[0], surrogates=39),
     "loudspeaker": lambda: diagnose(Magnetometer(), demonstration.simulated_recording()[0], surrogates=39),
 }
 

@@ -19,7 +19,13 @@ from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
 from tests.blind_proof import test_scenarios_score as scenario_score
 from tests.blind_proof.test_score import ADEQUATE, answer, finding, key, score
-from tests.diagnosis.factory import make_diagnosis, make_environment, make_follows, make_unfit, nearest
+from tests.diagnosis.factory import (
+    make_diagnosis,
+    make_environment,
+    make_goodness_of_fit,
+    make_unfit,
+    with_another_shape,
+)
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -87,7 +93,7 @@ def long_names():
     made = make_diagnosis(3, samples=200, channels=4, recording=LONG, simulation=LONG, warnings=(LONG,))
     findings = tuple(dataclasses.replace(f, drivers=(LONG,), equation=LONG, explanation=LONG) for f in made.findings)
     environment = make_environment(
-        goodness_of_fit=(make_follows(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"}
+        goodness_of_fit=(make_goodness_of_fit(LONG, LONG),), reasons=(LONG,), input_hold={LONG: "held"}
     )
     return dataclasses.replace(made, findings=findings, advice=(LONG,), environment=environment)
 
@@ -95,7 +101,7 @@ def long_names():
 def first_nearest():
     made = make_diagnosis(2, samples=200, channels=4, verdict="unexplained")
     first, *rest = made.findings
-    return dataclasses.replace(made, findings=(nearest(first), *rest))
+    return dataclasses.replace(made, findings=(with_another_shape(first), *rest))
 
 
 PAGES = {

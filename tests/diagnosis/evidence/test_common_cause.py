@@ -165,7 +165,7 @@ def test_independently_drifting_axes_are_noise(seed):
     assert "unknown" not in [finding.effect for finding in found.findings]
 
 
-def test_the_course_spans_one_and_ends_at_zero():
+def test_the_course_of_an_unrecorded_cause_is_a_cosine_series_that_ends_at_zero():
     context = make_context(Unrecorded(), N=200)
     course = Unrecorded().waveform({f"{COURSE}1": 0.3, f"{COURSE}4": -0.2}, context)
     phase = torch.pi * (torch.arange(200, dtype=torch.float64) + 0.5) / 200

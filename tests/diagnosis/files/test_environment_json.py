@@ -16,11 +16,11 @@ from tests.diagnosis.factory import (
     PROCESS_NOISE,
     graded,
     make_diagnosis,
+    make_disturbance,
     make_environment,
-    make_follows,
-    make_forcing,
+    make_goodness_of_fit,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 
@@ -58,8 +58,8 @@ def test_a_diagnosis_without_an_environment_is_written():
 
 
 def test_goodness_of_fit_is_written_in_the_unit_of_each_output():
-    unknown = make_follows("rate", "rad/s", rmse_of_last_value=math.nan, floor_source="quantisation")
-    content = written(disturbed(goodness_of_fit=(make_follows(), unknown)))
+    unknown = make_goodness_of_fit("rate", "rad/s", rmse_of_last_value=math.nan, floor_source="quantisation")
+    content = written(disturbed(goodness_of_fit=(make_goodness_of_fit(), unknown)))
     assert content["goodness_of_fit"]["angle"] == {
         "unit": "rad", "residual": 0.0049, "variation": 0.35, "explained": pytest.approx(0.9998, abs=1e-4),
         "noise_floor": 0.005, "floor_source": "declared", "rmse_of_mean": 0.35, "rmse_of_last_value": 0.021,
@@ -81,7 +81,7 @@ def test_process_noise_and_input_hold_are_written():
 
 @pytest.mark.parametrize(("samples", "points"), [(300, 300), (500, 500), (501, 251), (40_000, 500)])
 def test_a_long_disturbance_is_decimated(samples, points):
-    (forcing,) = written(disturbed(disturbance=(make_forcing(samples),)))["disturbance"]
+    (forcing,) = written(disturbed(disturbance=(make_disturbance(samples),)))["disturbance"]
     assert len(forcing["time"]) == len(forcing["value"]) == len(forcing["band"]) == points
     assert forcing["state"] == "rate"
     assert forcing["time"][:3] == [0.0, *forcing["time"][1:3]]
@@ -127,7 +127,7 @@ def test_grades_shapes_and_sizes_of_each_output_are_written():
         (DivergedBlock(7, before=True, after=False),), 25,
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)
-    finding = nearest(with_evidence(made.findings[0], prediction.held_out_gain_result(held, "")))
+    finding = with_another_shape(with_evidence(made.findings[0], prediction.held_out_gain_result(held, "")))
     (stored,) = written(dataclasses.replace(made, findings=(finding,)))["findings"]
     assert stored["grade"] == "nearest"
     assert stored["shape"] == {"free_curve_gain": 163.0, "p_value": 0.002, "formula": "0.0071 |x|^1.52 sign(x)"}

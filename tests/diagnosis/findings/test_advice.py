@@ -11,12 +11,12 @@ from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
 from mkc_torch.report.diagnosis.findings import finding_name
 from tests.diagnosis.factory import (
-    LOST,
+    POOR_FITS,
     PROCESS_NOISE,
     make_diagnosis,
     make_environment,
     make_unfit,
-    nearest,
+    with_another_shape,
     with_evidence,
 )
 
@@ -86,7 +86,7 @@ def test_advice_excludes_a_finding_of_another_shape_from_the_simulation(formula,
     heat = dataclasses.replace(
         made.findings[0], effect="thermal_loss", advice="Add radiation with this coefficient.", alternatives=()
     )
-    (only,) = advice_of(dataclasses.replace(made, findings=(nearest(heat, formula=formula),)))
+    (only,) = advice_of(dataclasses.replace(made, findings=(with_another_shape(heat, formula=formula),)))
     assert only.startswith("Do not add thermal_loss to the simulation: the recording shows another shape.")
     assert text in only
     assert "Add radiation" not in only
@@ -98,7 +98,7 @@ def test_advice_on_an_unfit_simulation_is_to_correct_it_first():
 
 
 def test_a_poor_fit_never_advises_using_the_simulation():
-    lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=LOST, process_noise=()))
+    lost = make_diagnosis(0, samples=50, environment=make_environment(goodness_of_fit=POOR_FITS, process_noise=()))
     assert lost.verdict == "adequate"
     assert "Use the simulation as it is" not in " ".join(lost.advice)
     followed = make_diagnosis(0, samples=50, environment=make_environment(process_noise=()))

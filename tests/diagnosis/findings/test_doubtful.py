@@ -20,7 +20,7 @@ def test_a_confirmed_result_has_no_doubts():
 
 
 @pytest.mark.parametrize(("verdict", "doubt"), [("unfit", "unfit"), ("unexplained", "unexplained")])
-def test_a_verdict_that_explains_nothing_is_a_doubt(verdict, doubt):
+def test_the_verdicts_unfit_and_unexplained_are_doubts(verdict, doubt):
     assert diagnosis_doubts(make_diagnosis(0, verdict=verdict)) == (doubt,)
 
 

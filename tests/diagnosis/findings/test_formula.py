@@ -28,7 +28,7 @@ def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", uni
         (lambda x: 2.0 * x, (-9.0, -1.0), "2 speed m/s² (RMS error 0 %)"),
     ],
 )
-def test_known_functions_are_found(make, range_, text):
+def test_formulas_of_known_functions_are_found(make, range_, text):
     assert formulas(curve(make, *range_)) == (f"δ(rate of speed) = {text}",)
 
 

@@ -103,7 +103,7 @@ def test_a_constant_column_with_gaps_is_not_a_driver():
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (-2.0, 7.0), (1e-6, 300.0)])
-def test_copies_are_one_driver(gain, offset):
+def test_copies_of_a_column_are_a_single_driver(gain, offset):
     result = drivers_of({"load": WAVES[0], "rpm": WAVES[1], "power": gain * WAVES[0] + offset})
     assert [(d.columns, d.copies) for d in result.drivers] == [(("load",), ("power",)), (("rpm",), ())]
     (warning,) = result.warnings

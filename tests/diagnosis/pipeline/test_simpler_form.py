@@ -70,7 +70,7 @@ def fit_of(recording, *effects, start=0.3):
     return fit, held_out(fit, blocks), blocks
 
 
-def always(_fit, _evidence):
+def accept_all(_fit, _evidence):
     return True
 
 
@@ -79,7 +79,7 @@ def always(_fit, _evidence):
 def test_equal_sensor_lags_are_simplified_to_a_shared_lag(seed):
     fit, evidence, blocks = fit_of(bodies_recording(share=(1.0, 1.0), seed=seed), EFFECTS["sensor_lag"])
     assert fit.model.sizes == (2,)
-    simple, after = simplified(fit, evidence, blocks, always, NamingSettings())
+    simple, after = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (1,)
     lag = simple.model.terms[0].shape["lag"]  # fitted again
     assert lag != 0.5
@@ -91,7 +91,7 @@ def test_equal_sensor_lags_are_simplified_to_a_shared_lag(seed):
 @pytest.mark.e2e
 def test_different_sensor_lags_keep_separate_shares():
     fit, evidence, blocks = fit_of(bodies_recording(share=(1.0, 0.0)), EFFECTS["sensor_lag"])
-    kept, after = simplified(fit, evidence, blocks, always, NamingSettings())
+    kept, after = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert kept is fit
     assert after is evidence
     assert fit.parameters[-2:].tolist() == pytest.approx([1.0, 0.0], abs=0.2)
@@ -101,7 +101,7 @@ def test_different_sensor_lags_keep_separate_shares():
 @pytest.mark.parametrize(("exchange", "size"), [((0.2, 0.2), 1), ((0.3, 0.1), 2)])
 def test_a_symmetric_exchange_is_simplified_to_a_shared_coefficient(exchange, size):
     fit, evidence, blocks = fit_of(bodies_recording(exchange), EFFECTS["coupling"], start=0.1)
-    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
+    simple, _ = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (size,)
     assert simple.parameters[-size:].tolist() == pytest.approx(list(exchange[:size]), abs=0.02)
 
@@ -124,20 +124,20 @@ def test_an_earlier_effect_is_simplified_in_the_presence_of_a_later_one():
     fit, evidence, blocks = fit_of(
         bodies_recording((0.3, 0.1), (1.0, 1.0)), EFFECTS["sensor_lag"], EFFECTS["coupling"], start=0.2
     )
-    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
+    simple, _ = simplified(fit, evidence, blocks, accept_all, NamingSettings())
     assert simple.model.sizes == (1, 2)
     assert simple.parameters[simple.model.base :].tolist() == pytest.approx([1.0, 0.3, 0.1], abs=0.1)
 
 
 def test_an_effect_without_a_simpler_form_is_unchanged():
     fit, evidence, blocks = fit_of(bodies_recording(), EFFECTS["linear_drag"], start=0.0)
-    assert simplified(fit, evidence, blocks, always, NamingSettings()) == (fit, evidence)
+    assert simplified(fit, evidence, blocks, accept_all, NamingSettings()) == (fit, evidence)
 
 
 @pytest.mark.e2e
 def test_a_model_with_a_simpler_form_is_restored_from_json():
     recording = bodies_recording((0.2, 0.2))
-    simple, _ = simplified(*fit_of(recording, EFFECTS["coupling"], start=0.1), always, NamingSettings())
+    simple, _ = simplified(*fit_of(recording, EFFECTS["coupling"], start=0.1), accept_all, NamingSettings())
     model = model_of(estimate(simple, NoiseSettings()), Bodies())
     again = DiagnosedModel.from_json(model.to_json(), simulation=Bodies())
     torch.testing.assert_close(again(recording)["left"], model(recording)["left"])
@@ -185,7 +185,7 @@ def test_load_dependent_friction_without_load_dependence_is_simplified_to_dry_fr
     base = fitted(JointModel(prepared), prepared.start())
     fit = fitted(base.model.with_term(term), torch.cat([base.parameters, torch.zeros(2).double()]), base.bound)
     blocks = blocks_of(N, 1, ConfirmationSettings())
-    simple, _ = simplified(fit, held_out(fit, blocks), blocks, always, NamingSettings())
+    simple, _ = simplified(fit, held_out(fit, blocks), blocks, accept_all, NamingSettings())
     (found,) = simple.model.terms
     assert (found.effect.id, found.port) == ("coulomb_friction", "rate of speed")
     assert found.key in {t.key for t in candidate_terms(prepared, (), DYNAMICS)}

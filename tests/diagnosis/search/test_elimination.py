@@ -13,13 +13,13 @@ from mkc_torch.diagnosis.search import own_noise
 from mkc_torch.diagnosis.search.own_noise import needless_terms, priced, without
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import DYNAMICS
-from tests.diagnosis.swing import candidates, fitted_swing
+from tests.diagnosis.swing import candidates, fitted_pendulum
 
 
 @functools.cache
 def with_effects(*names):
     """A pendulum with hidden quadratic drag, fitted with these effects."""
-    base = fitted_swing("slow", drag=0.4).fit
+    base = fitted_pendulum("slow", drag=0.4).fit
     terms = candidates(base, DYNAMICS)
     model, start = base.model, base.parameters
     for name in names:

@@ -21,7 +21,7 @@ MILD, OTHERS = {400: -1.0}, {1200: 12.0, 1900: -9.0}
 """First sample of a burst, and its size along the field in µT."""
 
 
-def in_the_body(field):
+def in_sensor_frame(field):
     return turns(TIME).inv().apply(field)
 
 
@@ -29,13 +29,13 @@ def bursts(sizes, length=40):
     added = np.zeros((N, 3))
     for begin, size in sizes.items():
         added[begin : begin + length] = size * FIELD / np.linalg.norm(FIELD)
-    return in_the_body(added)
+    return in_sensor_frame(added)
 
 
 def pole(place, strength=0.02):
     """Return the field of a magnetic pole, strength in µT·m², along the path."""
     away = place - np.stack(list(POSITION.values()), -1)
-    return in_the_body(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
+    return in_sensor_frame(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
 
 
 def diagnosis_of(sensor):

@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.search.with_process_noise import (
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.swing import Pendulum, at_the_truth, candidates, fitted_swing, swung
+from tests.diagnosis.swing import Pendulum, candidates, fitted_pendulum, pendulum_at_truth, pendulum_recording
 
 diagnose_module = importlib.import_module("mkc_torch.diagnosis.diagnose")
 search_module = importlib.import_module("mkc_torch.diagnosis.pipeline.search")
@@ -42,7 +42,7 @@ def located(fit, draws=39, level=0.05):
 
 @pytest.mark.e2e
 def test_hidden_drag_is_named_and_sized_under_process_noise():
-    base = fitted_swing("slow", drag=0.4).fit
+    base = fitted_pendulum("slow", drag=0.4).fit
     terms, found = candidates(base, DYNAMICS), located(base)
     assert found.p_value == pytest.approx(1.0 / 40.0)
     assert (found.term.effect.id, found.term.port) == ("quadratic_drag", "rate of rate")
@@ -64,7 +64,7 @@ def test_hidden_drag_is_named_and_sized_under_process_noise():
 
 @pytest.mark.parametrize("seed", [2])
 def test_process_noise_alone_gives_no_finding(seed):
-    found = located(at_the_truth("white", seed))
+    found = located(pendulum_at_truth("white", seed))
     assert found.p_value > 0.05
     assert found.compared == ()
 
@@ -72,7 +72,7 @@ def test_process_noise_alone_gives_no_finding(seed):
 def test_a_diverging_trajectory_raises(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.with_process_noise.joint_likelihood", lambda *_, **__: None)
     with pytest.raises(NoFitError, match="no finite trajectory"):
-        located(at_the_truth("white", 1))
+        located(pendulum_at_truth("white", 1))
 
 
 def test_candidates_far_behind_are_not_refitted():
@@ -84,7 +84,7 @@ def test_candidates_far_behind_are_not_refitted():
 
 @pytest.mark.e2e
 def test_candidates_without_a_refit_stay_in_the_ranking():
-    base = fitted_swing("slow", drag=0.4).fit
+    base = fitted_pendulum("slow", drag=0.4).fit
     strict = dataclasses.replace(
         FEW_REFITS, search=dataclasses.replace(FEW_REFITS.search, behind=0.0, behind_share=0.0)
     )
@@ -98,7 +98,7 @@ def test_candidates_without_a_refit_stay_in_the_ranking():
 
 
 def test_a_candidate_less_likely_than_the_baseline_is_refitted_from_the_noise_of_the_baseline():
-    base, settings = fitted_swing("slow", drag=0.0).fit, Settings()
+    base, settings = fitted_pendulum("slow", drag=0.0).fit, Settings()
     drag = next(term for term in candidates(base, DYNAMICS) if term.effect.id == "quadratic_drag")
     model = JointModel(base.model.prepared.open_loop(), (drag,), base.model.near)
     missed = fitted(model, torch.cat([base.parameters, torch.zeros(1).double()]))
@@ -166,7 +166,9 @@ def test_the_search_is_repeated_under_a_more_likely_noise(monkeypatch):
 
     monkeypatch.setattr(search_module, "first_step", first_step)
     messages = []
-    found = diagnose_module.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=messages.append)
+    found = diagnose_module.diagnose(
+        Pendulum(), pendulum_recording("white", 2, 200)[0], surrogates=19, progress=messages.append
+    )
     assert sum("more likely noise" in line for line in messages) == 1
     assert len(bases) == 2
     assert bases[1] is not bases[0]

@@ -27,7 +27,7 @@ def context():
     return Context(angle, angle.new_zeros(41, 0), (), signal, "rad/s²", ("speed",), names, parts, {"position": "rad"})
 
 
-def along(context, of):
+def argument_of_curve(context, of):
     return context.part("own") - context.part("surroundings") if of == "difference" else context.part(of)
 
 
@@ -35,7 +35,7 @@ def along(context, of):
 def test_curve_is_a_legendre_series_and_constant_beyond_its_reach(context, of):
     effect = UnknownRate(of)
     found = effect.change(GAMMA, {f"reach_of_{of}": REACH}, context)[:, 0]
-    inside = np.clip(along(context, of).numpy() / REACH, -1.0, 1.0)
+    inside = np.clip(argument_of_curve(context, of).numpy() / REACH, -1.0, 1.0)
     expected = np.polynomial.legendre.legval(inside, [0.0, *GAMMA.tolist()])
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12, atol=1e-14)
     assert len(GAMMA) == DEGREE

@@ -111,7 +111,7 @@ class TestFit:
         coarse, _ = fitted_parameters(instance(Pendulum, step=0.5), table(time=time, angle=swings(time)[0]))
         assert abs(coarse["stiffness"] - STIFFNESS) > 0.1
 
-    def test_the_user_s_step_sets_the_grid(self):
+    def test_the_step_of_the_user_sets_the_grid(self):
         recording = table(time=TIME, angle=TRUTH[0])
         assert len(instance(Pendulum, step=0.02).prepare(recording).grid.time) == 500
         assert len(instance(Pendulum, step=0.005).prepare(recording).grid.time) == 4 * 499 + 1
@@ -149,7 +149,7 @@ class TestFit:
         assert values["stiffness"] <= 8.5
         assert values["damping"] >= 0.2
 
-    def test_unmeasured_states_start_at_the_user_s_initial_value(self):
+    def test_unmeasured_states_start_at_the_initial_value_of_the_user(self):
         other = instance(Pendulum, initial={"angle": 0.7})
         start = other.prepare(table(time=TIME, speed=TRUTH[1])).start()
         assert float(start[2]) == 0.7
@@ -531,7 +531,7 @@ class Block(Dynamics):
         return {"place": x.speed, "speed": spring - x.speed - p.friction * torch.tanh(x.speed / 0.0005)}
 
 
-def dragged(pull):
+def sticking_positions(pull):
     """The place of a block that sticks fully, by short steps; the pull is held between samples."""
     place, speed, places = 0.0, 0.0, []
     for now in pull:
@@ -548,7 +548,7 @@ def test_a_sticking_simulation_is_solved_over_a_horizon_of_small_strides(monkeyp
     """Friction is nearly a jump: no trajectory is found from the guess, but the correction needs a trajectory."""
     time = np.arange(80) * 0.02
     pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
-    truth = dragged(pull)
+    truth = sticking_positions(pull)
     correction = DynamicsCorrection(Block().prepare(table(time=time, pull=pull, place=noisy(truth, 0.003))), first=0.3)
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged

@@ -112,7 +112,7 @@ def test_no_flow_without_a_trajectory():
 
 
 @pytest.mark.parametrize("runs", [1, 2])
-def test_an_observer_s_residual_equals_filter_innovations_along_the_open_loop(runs):
+def test_the_residual_of_an_observer_equals_filter_innovations_along_the_open_loop(runs):
     """On a linear system, with innovations too small to be clipped."""
     prepared, theta, _ = disturbed_oscillator(runs=runs, scale=TINY)
     white = Disturbance("speed", True, 0.0, 1.0)

@@ -76,7 +76,7 @@ class TestInputHold:
         back = other.with_input_hold({"force": "linear"})
         torch.testing.assert_close(back.simulated(theta, {}), before)
 
-    def test_a_copy_s_input_hold_equals_a_declared_input_hold(self):
+    def test_the_input_hold_of_a_copy_equals_a_declared_input_hold(self):
         prepared, theta = forced_oscillator()
         declared, _ = forced_oscillator(input_hold="smooth")
         torch.testing.assert_close(
@@ -176,7 +176,7 @@ class TestObserverInterface:
         assert torch.equal(corrected.output_disturbance(states), states[:, [2]])
         assert torch.equal(prepared.output_disturbance(states), torch.zeros(5, 1).double())
 
-    def test_the_sensor_s_contribution_is_subtracted_from_the_recording(self):
+    def test_the_contribution_of_the_sensor_is_subtracted_from_the_recording(self):
         def sensor(self, time, y, p, run):
             return {"position": y["position"] + 0.2 * time + 0.1 * y["position"] ** 2}
 
