@@ -5,7 +5,7 @@ from mkc_torch._support.order_statistic import order_statistic
 
 
 def by_cumulated_share(values, weight, h):
-    """The h-th smallest value of each column by a sum over the sorted weights."""
+    """Return the h-th smallest value of each column by a sum over the sorted weights."""
     ordered, index = values.sort(dim=-2)
     cumulated = weight.expand_as(values).gather(-2, index).cumsum(-2)
     reached = cumulated >= h / values.shape[-2] * cumulated[..., -1:, :] * (1 - 1e-12)

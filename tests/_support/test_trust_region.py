@@ -7,7 +7,7 @@ from mkc_torch._support.trust_region import Quadratic, minimise
 
 
 def batched(f):
-    """A batch of a function with its derivatives by automatic differentiation."""
+    """Return a batch of a function with its derivatives by automatic differentiation."""
 
     def function(point: Tensor, index: Tensor) -> Quadratic:
         return Quadratic(

@@ -26,7 +26,7 @@ def calibration(folder):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A table with two magnetometers, and one with one in nT by its names, both calibrated."""
+    """Return a folder with calibrated tables: of two magnetometers, and of one in nT by its column names."""
     place = tmp_path_factory.mktemp("sensors")
     points, time = noisy_ellipsoid(COUNT), torch.arange(COUNT) / 50.0
     columns = {f"mag0_{a}": points[:, k] for k, a in enumerate("xyz")}

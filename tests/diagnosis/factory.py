@@ -39,7 +39,7 @@ CATALOGUE = (
 
 
 def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candidates=12, **changes):
-    """A diagnosis of a simulated magnetometer; any field can be replaced by name, and advice follows from the rest.
+    """Return a diagnosis of a simulated magnetometer; fields can be replaced by name, and advice follows from the rest.
 
     So can the smooth correction: what it reaches is the ``ceiling``, None for none, along columns that are
     ``remaining``.

@@ -155,7 +155,7 @@ def effects_named(*names):
 
 
 def solved_recording(rate, first, time, noise, **columns):
-    """A recording of the first states of an equation with hidden physics, by names and tolerances."""
+    """Return a recording of the first states of an equation with hidden physics, by names and tolerances."""
     exact = solve_ivp(rate, (0.0, time[-1]), first, t_eval=time, rtol=1e-8, atol=1e-9, max_step=0.02)
     known = {name: contaminated(exact.y[k], noise, k) for k, name in enumerate(columns.pop("seen"))}
     return Recording({name: torch.as_tensor(values) for name, values in {"time": time, **known, **columns}.items()})
@@ -341,7 +341,7 @@ class Fall(Dynamics):
 
 
 def drops_recording(ball):
-    """Both drops of a ball in one table."""
+    """Return both drops of a ball in one table."""
     parts = Recording.read(shared_data("dynamics/falling_balls/ball_drops.csv")).experiments()
     both = [parts[f"{ball}/{k}"] for k in (1, 2)]
     columns = {name: torch.cat([drop[name] for drop in both]) for name in ("time", "height")}

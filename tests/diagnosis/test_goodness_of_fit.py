@@ -179,7 +179,7 @@ def smooth(count, seed):
 
 
 def turning_sensor(*, yaw=False, field=None):
-    """A recorded attitude, and a rotated field of 50 µT; or another field."""
+    """Return a recorded attitude, and a rotated field of 50 µT; or another field."""
     attitude = smooth(4, 1)
     if yaw:
         turns = TIME[:600]

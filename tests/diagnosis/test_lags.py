@@ -45,7 +45,7 @@ class Motor(Dynamics):
 
 
 def integrated_output(rate, start, inputs, step):
-    """Second state of a system of two, (N,), with its input held over each step; by Heun's method."""
+    """Return the second state of a system of two, (N,), with its input held over each step, by Heun's method."""
     state, seen, short = np.array(start, float), [], step / 50
     for value in inputs:
         seen.append(state[1])
@@ -56,7 +56,7 @@ def integrated_output(rate, start, inputs, step):
 
 
 def thermometer():
-    """A block at 5 s; the thermometer follows it with 25 s."""
+    """Return a recording of a heated block, sampled every 5 s by a thermometer with a lag of 25 s."""
     random = np.random.default_rng(3)
     power = np.repeat(random.choice([0.0, 30.0, 60.0, 100.0], 5), 48)
     temp = integrated_output(
@@ -67,7 +67,7 @@ def thermometer():
 
 
 def motor():
-    """A motor behind a driver with a dead zone of 0.8 V, whose current follows with 40 ms."""
+    """Return a recording of a motor behind a driver with a dead zone of 0.8 V and a lag of 40 ms."""
     random = np.random.default_rng(4)
     time = np.arange(300) * 0.02
     voltage = np.round(3.0 * np.sin(2.2 * time) + 1.5 * np.sin(5.7 * time + 1.0), 3)

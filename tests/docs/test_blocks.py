@@ -44,7 +44,7 @@ def examples(tmp_path_factory):
 
 @pytest.fixture
 def folder(examples, tmp_path, monkeypatch):
-    """The working folder of a reader: the tables, and nothing else."""
+    """Return the working folder of a reader: the tables, and nothing else."""
     for table in examples.iterdir():
         (tmp_path / table.name).symlink_to(table)
     monkeypatch.chdir(tmp_path)

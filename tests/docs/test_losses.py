@@ -17,7 +17,7 @@ LOSS, LOSSES = (ROOT / "docs" / f"{name}.md" for name in ("loss", "losses"))
 
 
 def rows(page, first):
-    """The cells of the table rows whose first cell matches, without the asterisks of bold type."""
+    """Return the cells of the table rows whose first cell matches, without the asterisks of bold type."""
     lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
     cells = [[cell.strip().strip("*") for cell in line.strip("|").split("|")] for line in lines]
     return [row for row in cells if re.fullmatch(first, row[0])]
@@ -137,7 +137,7 @@ class TrainerStub:
 
 @pytest.fixture
 def network():
-    """The network of the page with a loss without state, and its ``compute_loss_func``."""
+    """Return the network of the page with a loss without state, and its ``compute_loss_func``."""
     torch.manual_seed(0)
     network = definition_of(LOSSES, "Network", torch=torch, MKCLoss=MKCLoss)()
     network.criterion = MKCLoss(2, sigma=2.0, d=0.5, bound=50.0, reduction="sum")

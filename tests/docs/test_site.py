@@ -24,7 +24,7 @@ LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source
 
 
 def public_packages():
-    """The public packages that the page on architecture names."""
+    """Return the public packages that the page on architecture names."""
     text = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
     sentence = re.search(r"Public names are those of (.+?), without an underscore", text)[1]
     return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", sentence)]
@@ -47,7 +47,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site, built from a copy: the command writes into the folder of its sources."""
+    """Return the site, built from a copy: the command writes into the folder of its sources."""
     if find_spec("zensical") is None or find_spec("mkdocstrings_handlers") is None:
         pytest.skip("the extra `docs` is not installed")
     folder = tmp_path_factory.mktemp("site")

@@ -40,7 +40,7 @@ def cases(effects):
 
 
 def over_all_cases(cases):
-    """A decorator of a class: each of its tests runs over all cases and names the failing case.
+    """Return a decorator of a class: each of its tests runs over all cases and names the failing case.
 
     Args:
         cases: a function that returns the cases, with their arguments and names.

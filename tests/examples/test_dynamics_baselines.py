@@ -23,7 +23,7 @@ def load_module(monkeypatch):
 
 
 def drop(seconds, speed):
-    """A ball with quadratic drag, thrown upwards with this speed: its terminal speed, and height, in closed form."""
+    """Return terminal speed and height, in closed form, of a ball with quadratic drag thrown upwards."""
     terminal = math.sqrt(9.81 / DRAG)
     time = torch.arange(0.0, seconds, 1.0 / 15.0, dtype=torch.float64)
     since_top = 9.81 * (time - time.new_tensor(speed / 9.81)) / terminal

@@ -130,7 +130,7 @@ def _advised(d: Diagnosis, start: str) -> list[str]:
 
 
 def _claimed_and_refused(d: Diagnosis) -> bool:
-    """The advice is to correct for an effect and not to correct for it."""
+    """Whether the advice is both to correct and not to correct for an effect."""
     use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
     corrected = set(re.split(" and | for ", use)[1:])
     refused = [re.sub(r"(Do not correct for|Do not add) (.*?)( yet| to the simulation|, unless|: ).*", r"\2", item)
@@ -139,7 +139,7 @@ def _claimed_and_refused(d: Diagnosis) -> bool:
 
 
 def _two_residuals(d: Diagnosis) -> bool:
-    """The table of held-out blocks and the first finding give different residuals of the baseline."""
+    """Whether the held-out table and the first finding have different residuals of the baseline."""
     held = d.findings[0].held_out if d.findings else None
     if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
         return False
@@ -295,7 +295,7 @@ class _Rows(HTMLParser):
 
 
 def page_rows(page: str) -> list[str]:
-    """The text of a page, one item per table row, paragraph or heading."""
+    """Return the text of a page, one item per table row, paragraph or heading."""
     parser = _Rows()
     parser.feed(page)
     return [text for row in parser.rows if (text := " ".join(row.replace("\u00a0", " ").split()))]

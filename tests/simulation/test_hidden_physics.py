@@ -45,7 +45,7 @@ class Ball(Dynamics):
 
 
 def drive(t):
-    """A force that is linear between the samples, as in the simulation."""
+    """Return a force that is linear between the samples, as in the simulation."""
     return np.interp(t, TIME, np.sin(2.3 * TIME) + np.sin(0.9 * TIME))
 
 
@@ -54,7 +54,7 @@ def spin(t):
 
 
 def drive_behind_play(gap):
-    """The drive behind play, by its definition."""
+    """Return the drive behind play, by its definition."""
     u = drive(TIME)
     y = u.copy()
     for k in range(1, len(u)):
@@ -79,7 +79,7 @@ def hysteretic_mass(gamma, yields):
 
 
 def damped_second_mass(gamma, lag):
-    """A second mass behind a damper: its speed is the third state."""
+    """Return the rate of a mass with a second mass behind a damper, whose speed is the third state."""
 
     def rate(t, y):
         x, v, w = y
@@ -89,7 +89,7 @@ def damped_second_mass(gamma, lag):
 
 
 def sprung_second_mass(share, period, damping):
-    """A second mass on a spring: its position and its speed are the third and fourth state."""
+    """Return the rate of a mass with a second mass on a spring, whose position and speed are the last two states."""
     omega = 2.0 * math.pi / period
 
     def rate(t, y):
@@ -150,7 +150,7 @@ CASES = {
 
 
 def prepared(name, rate, first, **attributes):
-    """The simulation of a recording with the effect, the true states, and the true parameters."""
+    """Return the simulation of a recording with the effect, the true states, and the true parameters."""
     system = Ball if name == "magnus_lift" else Mass
     known = list(system.states[:2])
     truth = runge_kutta(rate, first, TIME)

@@ -80,7 +80,7 @@ def test_clock_offsets_below_a_sample_are_not_findings():
 
 
 def with_effect(prepared, effect, port="output y"):
-    """A joint model with a single effect."""
+    """Return a joint model with a single effect."""
     return JointModel(prepared, (Term(effect, None, {}, port),))
 
 

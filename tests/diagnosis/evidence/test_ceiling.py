@@ -188,7 +188,7 @@ def test_a_diagnosis_has_a_ceiling_and_warns_of_the_remaining_trend_along_a_colu
 
 @pytest.fixture(scope="module", params=range(5))
 def drifting_offset(request):
-    """A drifting offset, and columns that drift in the same way but independently of it."""
+    """Return a drifting offset, and columns that drift in the same way but independently of it."""
     random = np.random.default_rng(100 + request.param)
     offset = 2.0 * NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
     fit, drivers, blocks = fitted_case(offset, seed=request.param, **walks(5, seed=request.param))

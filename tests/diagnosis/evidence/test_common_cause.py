@@ -92,7 +92,7 @@ def test_the_sign_of_the_direction_can_be_flipped():
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """An offset that follows a temperature which was not recorded."""
+    """Return the diagnosis of an offset that follows an unrecorded temperature, and the recording."""
     recording = tumbling(N, noise=0.5, sensor=1.2 * temperature()[:, None] * DIRECTION, aux=walks(8)[:, 0])
     return diagnose(Magnetometer("norm"), recording), recording
 

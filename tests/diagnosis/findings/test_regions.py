@@ -39,7 +39,7 @@ def swings(hidden, first):
 
 @pytest.fixture(scope="module")
 def stiffening_spring():
-    """A spring that stiffens, in one run of large swings and one of small ones."""
+    """Return the fit of a stiffening spring to a run of large swings and a run of small swings."""
     prepared = Pendulum().prepare(swings([lambda x, _: -4.0 * x**3] * 2, [1.2, 0.2]))
     model = JointModel(prepared, (Term(EFFECTS["cubic_stiffness"], None, {}, "rate of speed"),))
     return fitted(model, torch.cat([prepared.start(), prepared.time.new_tensor([3.0])]), graduate=False)

@@ -33,7 +33,7 @@ class Cart(Dynamics):
 
 @functools.cache
 def fit_without_delay(noise=NOISE):
-    """The fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
+    """Return the fit of a cart that responds 0.16 s late to steps of its force, without the delay."""
     generator = torch.Generator().manual_seed(0)
     N = 600
     force = torch.randn(N // 10, generator=generator, dtype=torch.float64).repeat_interleave(10)
@@ -52,7 +52,7 @@ def fit_without_delay(noise=NOISE):
 
 
 def with_effect(name, noise=NOISE, **shape):
-    """The fit with an effect, at this shape."""
+    """Return the fit with an effect, at this shape."""
     effect, alone = next(effect for effect in DYNAMICS if effect.id == name), fit_without_delay(noise)
     term = candidate_terms(alone.model.prepared, (), (effect,))[0]
     model = alone.model.with_term(replace(term, shape={**term.shape, **shape}))
@@ -75,7 +75,7 @@ def test_a_fit_without_a_delay_is_unchanged_by_the_profile():
 
 
 def delay_and_error(noise):
-    """The fit with the delay, and the delay's standard error."""
+    """Return the fit with the delay, and the delay's standard error."""
     fit = with_profiled_shape(shape_fitted(with_effect("input_delay", noise, delay=0.15)))
     (errors,) = estimate(fit, NoiseSettings()).shape_errors
     return fit, errors["delay"]

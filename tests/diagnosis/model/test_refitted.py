@@ -24,7 +24,7 @@ def base():
 
 
 def search_result(base, *gamma):
-    """A stub of a search that estimates these sizes."""
+    """Return a stub of a search that estimates these sizes."""
     estimate = torch.tensor(gamma, dtype=torch.float64)
     return SimpleNamespace(scene=SimpleNamespace(base=base), estimate=lambda _: estimate)
 

@@ -31,7 +31,7 @@ class Lag(Dynamics):
 
 
 def driven(act, seed=0, behind=0.0):
-    """The level of a lag whose drive is distorted by ``act``, seen by a sensor with a lag of ``behind`` s."""
+    """Return the level of a lag whose drive is distorted by ``act``, seen by a sensor with a lag of ``behind`` s."""
     generator = torch.Generator().manual_seed(seed)
     time = 0.05 * torch.arange(N, dtype=torch.float64)
     drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)

@@ -26,7 +26,7 @@ TRUE_ONSET = (FIRST + LAST) / 2.0 / RATE
 
 @pytest.fixture(scope="module")
 def burst():
-    """A step of 2 µT in the middle of a second of outliers."""
+    """Return the baseline fit of a recording with a step of 2 µT in the middle of a second of outliers."""
     sensor = np.zeros((N, 3))
     sensor[(FIRST + LAST) // 2 :] = [2.0, -1.0, 1.0]
     sensor[FIRST:LAST] += 400.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))

@@ -9,7 +9,7 @@ N = 1500
 
 
 def drifting_noise(seed=0):
-    """A random walk plus white noise, (N, 1)."""
+    """Return a random walk plus white noise, (N, 1)."""
     draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return (0.5 * draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]).unsqueeze(-1)
 

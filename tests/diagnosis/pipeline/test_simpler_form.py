@@ -58,7 +58,7 @@ def bodies_recording(exchange=(0.0, 0.0), share=(0.0, 0.0), lag=0.4, seed=0):
 
 
 def fit_of(recording, *effects, start=0.3):
-    """The joint fit with these effects, as a search finds them, and its evidence."""
+    """Return the joint fit with these effects, as a search finds them, and its evidence."""
     prepared = Bodies().prepare(recording)
     terms = [candidate_terms(prepared, (), (effect,))[0] for effect in effects]
     terms = [replace(t, shape={"lag": 0.5}) if t.effect.id == "sensor_lag" else t for t in terms]

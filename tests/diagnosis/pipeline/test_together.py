@@ -90,7 +90,7 @@ class Coast(Dynamics):
 
 
 def coast(seed, name, offset, count=200, parts=100):
-    """A body of quadratic drag that the simulation lacks, its speed read off by an offset."""
+    """Return a recording of a body with hidden quadratic drag, whose speed has an offset."""
     time = torch.arange(count * parts, dtype=torch.float64) * 0.05 / parts
     force = 2.0 * torch.sin(0.7 * time + seed) + 1.5 * torch.sin(2.1 * time) + 1.0
     speed, now = torch.empty_like(time), 1.0 + seed

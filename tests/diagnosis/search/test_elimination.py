@@ -18,7 +18,7 @@ from tests.diagnosis.swing import candidates, fitted_pendulum
 
 @functools.cache
 def with_effects(*names):
-    """A pendulum with hidden quadratic drag, fitted with these effects."""
+    """Return the fit of a pendulum with hidden quadratic drag, with these effects."""
     base = fitted_pendulum("slow", drag=0.4).fit
     terms = candidates(base, DYNAMICS)
     model, start = base.model, base.parameters

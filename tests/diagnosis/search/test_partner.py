@@ -19,7 +19,7 @@ def fit_of_drag(drag=DRAG):
 
 
 def found_effect(name, *rivals, drag=DRAG):
-    """The result of a search that found an effect, with these rivals."""
+    """Return the result of a search that found an effect, with these rivals."""
     terms = all_terms(fit_of_drag(drag))
     numbers = [next(n for n, term in enumerate(terms) if term.effect.id == each) for each in (name, *rivals)]
     term = terms[numbers[0]]

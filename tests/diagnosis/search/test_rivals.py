@@ -31,7 +31,7 @@ def term(key, port=NONLINEAR):
 
 
 def fit_of(own, gain, size=1):
-    """A fit with this gain over the fit without an effect."""
+    """Return a fit with this gain over the fit without an effect."""
     model = SimpleNamespace(terms=[own], sizes=[size], residual=lambda _: torch.zeros(1), prepared=None)
     return SimpleNamespace(model=model, log_likelihood=gain, residual=torch.ones(1), parameters=None)
 

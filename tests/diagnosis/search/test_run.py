@@ -29,7 +29,7 @@ STEPS = tuple(Term(STEP, None, {"onset": onset}, "mixed") for onset in (0.4, 0.9
 
 @pytest.fixture(scope="module")
 def step_search():
-    """The search of a recording with a step of 0.7 µT, at a third of its length, between two onsets of the grid."""
+    """Return the search of a recording with a step of 0.7 µT between two onsets of the grid."""
     sensor = np.zeros((N, 3))
     sensor[671:] = [0.4, -0.4, 0.4]
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))

@@ -20,7 +20,7 @@ def randn(*size, seed):
 
 
 def smooth(seed):
-    """A random course of twelve slow cosines, with mean square 1."""
+    """Return a random course of twelve slow cosines, with mean square 1."""
     power = torch.zeros(N).double()
     power[1:13] = 1.0
     course = randn(N, M, seed=seed) * power.unsqueeze(-1)

@@ -111,7 +111,7 @@ def test_a_candidate_less_likely_than_the_baseline_is_refitted_from_the_noise_of
 
 
 def of_likelihood(value, size, shape=()):
-    """A stub of an open-loop fit of 400 samples, with the fields that penalties need."""
+    """Return a stub of an open-loop fit of 400 samples, with the fields that penalties need."""
     effect = types.SimpleNamespace(fitted_shape=shape)
     term = types.SimpleNamespace(effect=effect, key=("drag", (), "rate"))
     model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=types.SimpleNamespace(observer=None))

@@ -52,7 +52,7 @@ def test_code_equals_the_curve(context, of):
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """A force to one side that grows with the square of the speed, in both directions of the pendulum."""
+    """Return the diagnosis of a pendulum with a hidden force of constant sign, by the square of its speed."""
     recording = pendulum_recording(lambda _, speed: 0.12 * speed**2)
     # a catalogue of forces along the motion only
     effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))

@@ -23,7 +23,7 @@ def arm(**units):
 
 
 def terms(prepared, *names, port=None):
-    """The first candidate of each name, at a port."""
+    """Return the first candidate of each name, at a port."""
     every = candidate_terms(prepared, (), PAIRED)
     return [next(t for t in every if t.effect.id == name and t.port in (port, "all outputs")) for name in names]
 

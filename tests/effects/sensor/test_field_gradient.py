@@ -16,7 +16,7 @@ ONE_POINT = make_context(GRADIENT, N=1, channels=ENU)
 
 
 def field(degree, point):
-    """The basis at a point, (terms, 3)."""
+    """Return the basis at a point, (terms, 3)."""
     shape, context = {"degree": degree}, replace(ONE_POINT, drivers=point.unsqueeze(0))
     return torch.stack(
         [GRADIENT.change(row, shape, context)[0] for row in torch.eye(size_of(GRADIENT, shape, context)).double()]

@@ -66,7 +66,7 @@ def columns(seed=0, N=1500):
 
 
 def recording(source, moment):
-    """A recording of the strength of a field with a pole of this ``moment`` at ``source``."""
+    """Return a recording of the strength of a field with a pole of this ``moment`` at ``source``."""
     time, direction, place, noise = columns()
     away = place - torch.tensor(source, dtype=torch.float64)
     pole = moment * away / (away.square().sum(-1, keepdim=True) + 0.3**2) ** 1.5

@@ -32,7 +32,7 @@ class Pendulum(Dynamics):
 
 
 def instance(system, **attributes):
-    """An instance of a system with other attributes."""
+    """Return an instance of a system with other attributes."""
     return type(system.__name__, (system,), attributes)()
 
 
@@ -532,7 +532,7 @@ class Block(Dynamics):
 
 
 def sticking_positions(pull):
-    """The place of a block that sticks fully, by short steps; the pull is held between samples."""
+    """Return the positions of a block that sticks fully, by short steps; the pull is held between samples."""
     place, speed, places = 0.0, 0.0, []
     for now in pull:
         places.append(place)

@@ -29,7 +29,7 @@ def rate(_, y):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A prepared pendulum that swings for 20 s."""
+    """Return a prepared pendulum that swings for 20 s."""
     angle = runge_kutta(rate, FIRST, 0.05 * np.arange(400), parts=5)[:, 0]
     return Pendulum().prepare(recorded(FLOW, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
 

@@ -15,7 +15,7 @@ TINY = 1e-3
 
 
 def disturbed_oscillator(count=80, runs=1, scale=1.0, **attributes):
-    """A prepared oscillator with white process noise, its parameters, and its exact flow."""
+    """Return a prepared oscillator with white process noise, its parameters, and its exact flow."""
     expected, random = flow(count, runs=runs), np.random.default_rng(0)
     position = disturbed_states(expected, course(random, expected, 0.0, 1.0))[:, 0] + NOISE * random.standard_normal(
         count * runs

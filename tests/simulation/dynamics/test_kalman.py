@@ -18,14 +18,14 @@ TWO_OUTPUTS = ((1.0, 0.0), (0.3, 1.0))
 
 
 def model(white=0.0, place=(), size=(), lasting=(), sensor=(0.1,)):
-    """A noise model of the oscillator, with process noise of its speed."""
+    """Return a noise model of the oscillator, with process noise of its speed."""
     return FilterModels(
         np.array([[white]]), np.array([place], dtype=int), np.array([size]), np.array([lasting]), np.array([sensor])
     )
 
 
 def batch(*models):
-    """A batch of models of the same shape."""
+    """Return a batch of models of the same shape."""
     parts = ((getattr(model, name) for model in models) for name in ("white", "place", "size", "lasting", "sensor"))
     return FilterModels(*(np.concatenate(list(part)) for part in parts))
 
@@ -71,7 +71,7 @@ def dense_covariance(flow, models):
 
 
 def recording(flow, models, seed=0):
-    """The flow with a residual drawn from the model, times ``TINY``, and with masked samples."""
+    """Return the flow with a residual drawn from the model, times ``TINY``, and with masked samples."""
     random = np.random.default_rng(seed)
     covariance, _ = dense_covariance(flow, models)
     new = TINY * (np.linalg.cholesky(covariance) @ random.standard_normal(len(covariance))).reshape(flow.new.shape)

@@ -23,7 +23,7 @@ WAYS = {"machine code": machine_code, "Python": lambda loop: loop, "NumPy": lamb
 
 
 def in_each_way(monkeypatch, module, compute):
-    """The results by machine code, by the loop in Python, and by NumPy."""
+    """Return the results by machine code, by the loop in Python, and by NumPy."""
     found = []
     for way in WAYS.values():
         with monkeypatch.context() as patch:

@@ -15,7 +15,7 @@ DRIFT = Disturbance("position", False, 1.0, 0.1)
 
 
 def disturbed_oscillator(*disturbances, count=300, runs=1, seed=0):
-    """A prepared oscillator under these disturbances, its parameters, and the disturbances over time."""
+    """Return a prepared oscillator under these disturbances, its parameters, and the disturbances over time."""
     along, random = flow(count, runs=runs), np.random.default_rng(seed)
     courses = [course(random, along, disturbance.lasting, disturbance.size) for disturbance in disturbances]
     process_noise = sum(

@@ -31,7 +31,7 @@ SENSOR = Disturbance("position", False, LASTING, DRIFT)
 
 
 def noisy_flow(*disturbances, count=300, seed=0, noise=NOISE, runs=1):
-    """The flow of an oscillator under these disturbances, with white sensor noise."""
+    """Return the flow of an oscillator under these disturbances, with white sensor noise."""
     along, random = flow(count, runs=runs), np.random.default_rng(seed)
     error = noise * random.standard_normal(along.new.shape)
     process_noise = np.zeros(len(along.new))
@@ -54,7 +54,7 @@ def selected(along, *, floor=(NOISE,), known=(False,), least=LEAST, most=2, outp
 
 
 def known(*disturbances, declared=False):
-    """A noise selected elsewhere."""
+    """Return a noise selected elsewhere."""
     return SelectedNoise(disturbances, (), (), tensor(NOISE), 0.0, (declared,))
 
 

@@ -27,7 +27,7 @@ def driven(self, time, x, u, p):
 
 
 def forced_oscillator(random=1.0, **attributes):
-    """A prepared oscillator with a recorded force, and its parameters."""
+    """Return a prepared oscillator with a recorded force, and its parameters."""
     along, draws = flow(N), np.random.default_rng(0)
     force = FORCE + course(draws, along, 0.0, random)
     position = disturbed_states(along, force)[:, 0] + 0.01 * random * draws.standard_normal(N)

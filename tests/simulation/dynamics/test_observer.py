@@ -44,7 +44,7 @@ def random_correction(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
 
 
 def grid_of(samples, end=2.0):
-    """The grid of a single trajectory with this number of samples."""
+    """Return the grid of a single trajectory with this number of samples."""
     time = torch.linspace(0.0, end, INTERVALS_PER_SAMPLE * (samples - 1) + 1, dtype=torch.float64)
     return Grid(time, torch.arange(len(time)) == 0)
 

@@ -19,7 +19,7 @@ def without_machine_code(monkeypatch):
 
 
 def recorded(along, outliers=0.05, seed=0):
-    """A flow with process noise of its speed, outliers, and masked samples."""
+    """Return a flow with process noise of its speed, outliers, and masked samples."""
     random = np.random.default_rng(seed)
     noise = 0.1 * random.standard_normal(along.new.shape)
     noise[random.random(along.new.shape) < outliers] += 5.0
@@ -66,7 +66,7 @@ def test_several_outputs_and_an_undisturbed_state(monkeypatch):
 
 
 def unobserved_flow(count):
-    """A flow without unmasked samples; its states never decay."""
+    """Return a flow without unmasked samples; its states never decay."""
     along = recorded(flow(count))
     return replace(along, counts=np.zeros_like(along.counts), transition=along.transition * 0.0 + np.eye(2))
 

@@ -19,12 +19,12 @@ def van_der_pol(x):
 
 
 def mass_with_friction(x):
-    """A mass on a spring with friction that is nearly a jump."""
+    """Return the rate of a mass on a spring with friction that is nearly a jump."""
     return torch.stack([x[:, 1], -x[:, 0] - 0.2 * torch.tanh(x[:, 1] / 0.001)], -1)
 
 
 def reference(rate, start, time):
-    """The trajectory by scipy at the given times."""
+    """Return the trajectory by scipy at the given times."""
 
     def at(_, y):
         return rate(torch.from_numpy(y).unsqueeze(0))[0].numpy()
@@ -35,13 +35,13 @@ def reference(rate, start, time):
 
 
 def perturbed(states, spread, seed=0):
-    """A guess: the states with normal errors of this share of their size."""
+    """Return a guess: the states with normal errors of this share of their size."""
     generator = torch.Generator().manual_seed(seed)
     return states + spread * states.abs().amax(0) * torch.randn(states.shape, generator=generator, dtype=states.dtype)
 
 
 def grid_of(time):
-    """The grid of a single trajectory."""
+    """Return the grid of a single trajectory."""
     return Grid(time, torch.arange(len(time)) == 0)
 
 
@@ -177,7 +177,7 @@ def damped(theta, guess=None, known=None, time=TIME):
 
 @pytest.fixture(scope="module")
 def solution():
-    """The solution at ``THETA``, from which guesses are made."""
+    """Return the solution at ``THETA``, from which guesses are made."""
 
     def rate(x):
         return torch.stack([x[:, 1], -THETA[0] * torch.sin(x[:, 0]) - THETA[1] * x[:, 1]], -1)

@@ -15,7 +15,7 @@ DIRECTION = FIELD / np.linalg.norm(FIELD)
 
 
 def zero_residual_parameters(view):
-    """The parameters with zero residual, by SciPy from the view's start."""
+    """Return the parameters with zero residual, by SciPy from the view's start."""
     found = least_squares(
         lambda theta: view.residual(torch.from_numpy(theta), {}).numpy().ravel(),
         view.start().numpy(), xtol=1e-15, ftol=1e-15, gtol=1e-15,
@@ -62,7 +62,7 @@ def test_channels_are_orthonormal_and_the_first_is_along_the_field(view, truth):
 
 
 def truth_of(view, changes):
-    """The true parameters; the tilt of the field relative to the view's start is fitted."""
+    """Return the true parameters; the tilt of the field relative to the view's start is fitted."""
 
     def left(tilt):
         return view.residual(full_truth(view.strength, *tilt), changes).numpy().ravel()

@@ -33,7 +33,7 @@ def view_of(attitude, **further):
 
 
 def drifting_rotation(degrees, tau=10.0):
-    """A rotation error with the correlation time of a filter."""
+    """Return a rotation error with the correlation time of a filter."""
     random, decay = np.random.default_rng(0), np.exp(-1.0 / (RATE * tau))
     error = np.zeros((N, 3))
     for k in range(1, N):

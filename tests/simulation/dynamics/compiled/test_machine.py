@@ -21,7 +21,7 @@ LOGICAL = ("logical_and", "logical_or", "logical_not")
 
 
 def outputs_of(program, states, way):
-    """The outputs of a program at states (w, L), by ``way`` of compiling."""
+    """Return the outputs of a program at states (w, L), by ``way`` of compiling."""
     at = program.at([])
     rows = registers(at, len(states))
     loaded(at, rows, states, 0, 0, 0, states.shape[1])
@@ -72,7 +72,7 @@ def test_numbers_columns_and_parameters_are_rows_of_a_program():
 
 @pytest.fixture(params=[(Driven, 1, False), (Driven, 2, True), (Single, 2, False), (Single, 1, True)], ids=str)
 def collocations(request):
-    """The compiled residual, its start, and the collocation there by NumPy and by machine code."""
+    """Return the compiled residual, its start, and the collocation there by NumPy and by machine code."""
     system, runs, observed = request.param
     prepared = system().prepare(recorded(runs))
     compiled = JointModel(with_observer(prepared, 0.7) if observed else prepared)._compiled
