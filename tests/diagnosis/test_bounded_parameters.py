@@ -1,4 +1,4 @@
-"""A parameter with narrow limits does not stand for missing physics."""
+"""A parameter with narrow bounds does not absorb missing physics."""
 
 import numpy as np
 import pytest

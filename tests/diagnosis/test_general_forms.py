@@ -59,7 +59,7 @@ def test_convection_is_named_with_its_exponent():
 
 
 def test_a_wall_that_takes_up_heat_is_named_and_sized():
-    """It has two fifths of the body's capacity, and gives nothing off to the room."""
+    """The wall has two fifths of the body's capacity, and no loss to the room."""
 
     def rate(y, power, room):
         flow = 0.5 * (y[1] - y[0])

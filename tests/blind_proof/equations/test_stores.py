@@ -1,4 +1,4 @@
-"""A second store and a mass on a spring take up what the state loses, and start in equilibrium with it."""
+"""A second store and a mass on a spring receive the losses of the state, and start in equilibrium with it."""
 
 import numpy as np
 import pytest

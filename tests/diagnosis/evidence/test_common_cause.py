@@ -147,7 +147,7 @@ def test_the_saved_model_of_an_unrecorded_cause_subtracts_its_final_offset(diagn
 @pytest.mark.e2e
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_column_that_follows_the_cause_in_part_is_reported_as_a_proxy(whole):
-    """A column that is the cause is not. Neither column needs a name that states what it measures."""
+    """A column equal to the cause is not reported. The names of the columns do not state their quantities."""
     column = temperature() if whole else np.sin(2 * np.pi * TIME / 23.0 + 4)
     recording = tumbling(N, noise=0.5, sensor=1.2 * temperature()[:, None] * DIRECTION, aux=column)
     found = diagnose(Magnetometer("norm"), recording)

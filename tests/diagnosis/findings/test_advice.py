@@ -1,4 +1,4 @@
-"""What to do about a diagnosis."""
+"""Advice on a diagnosis."""
 
 import dataclasses
 

@@ -36,7 +36,7 @@ def test_a_size_of_zero_is_unconfirmed_whatever_held_out_blocks_show(numbers, no
 
 
 def test_a_size_with_a_flat_likelihood_is_not_zero():
-    """A second store ten times as large as the first, or thirty times: the data exclude only that there is none."""
+    """A second store of ten or thirty times the first: the data only exclude a store of size 0."""
     found = dataclasses.replace(finding((8.4, 13.8), (45000.0, None)), clearly_better=True)
     assert not is_zero_within_error(found)
     assert grade_of(found) == "left_out"

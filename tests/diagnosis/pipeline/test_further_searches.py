@@ -128,7 +128,7 @@ def test_an_effect_whose_fit_diverges_is_refitted_from_the_initial_values(record
 
 @pytest.mark.parametrize("refused", [(), ("first",), ("first", "second")])
 def test_a_candidate_that_enlarges_the_open_loop_residual_is_replaced_by_the_next(monkeypatch, refused):
-    """The names are those of the candidates that enlarge it; the search is repeated once."""
+    """``refused`` names the candidates that enlarge it; the search is repeated once."""
     terms = tuple(SimpleNamespace(key=name) for name in ("first", "second", "third"))
     known = SimpleNamespace(fit="without", term=SimpleNamespace(key="known"))
 

@@ -1,4 +1,4 @@
-"""Stopped diagnoses and quick looks: they report what is known and what was not done."""
+"""Stopped diagnoses and quick looks report partial results and the skipped steps."""
 
 import json
 import math

@@ -47,7 +47,7 @@ def held(slope, step):
 
 
 def flow(count, seen=((1.0, 0.0),), runs=1, step=STEP):
-    """Return the flow of the oscillator at 0 with residual 0, disturbed at its speed's rate; ``count`` samples a run."""
+    """Return the flow of the oscillator at 0 with residual 0, disturbed at the rate of its speed."""
     seen = np.atleast_2d(seen)
     A, B = held(SLOPE, step)
     N = count * runs
