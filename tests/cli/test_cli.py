@@ -502,9 +502,9 @@ def test_a_missing_extra_is_reported_in_a_line_with_the_remedy(missing):
     code = f"import sys; sys.modules[{missing!r}] = None; from mkc_torch.cli import main; main()"
     done = run_python("-c", code, "demo")
     assert done.returncode == 1
-    assert done.stderr.strip().splitlines() == [
-        f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.'
-    ]
+    (line,) = done.stderr.strip().splitlines()
+    assert f"{missing} is not installed" in line
+    assert 'pip install "mkc-torch[cli]"' in line
 
 
 def test_a_recording_without_a_name_is_refused(good_table, tmp_path):
@@ -527,7 +527,7 @@ def test_a_full_disk_of_stdout_is_reported_in_a_line(good_table, tmp_path):
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == "mkc: the output could not be written: No space left on device."
+    assert done.stderr.splitlines()[-1].endswith("No space left on device.")
 
 
 def test_invalid_place_date_and_sensor_are_refused_in_a_sentence(good_table, tmp_path):

@@ -40,7 +40,9 @@ def test_an_interrupt_during_the_import_of_torch_prints_a_line(tmp_path):
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
         _, reported = process.communicate(timeout=60)
-    assert reported == "mkc: interrupted; nothing was written.\n"
+    (line,) = reported.splitlines()
+    assert line.startswith("mkc: interrupted")
+    assert "nothing was written" in line
     assert process.returncode == 130
 
 
